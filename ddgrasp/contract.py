@@ -1,0 +1,120 @@
+"""What every stage agrees on: joint order, shapes, units, rates, camera profile.
+
+This module imports the standard library alone, so that the robot side can use it.
+Change a value here and `CONTRACT_VERSION` with it: artefacts of another version are refused.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+CONTRACT_VERSION = 1
+
+# --- time ------------------------------------------------------------------------------------
+CONTROL_HZ = 10.0
+CONTROL_DT_S = 1.0 / CONTROL_HZ
+
+# --- robot (Franka Emika Panda; limits from Franka's published interface specification) -------
+ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
+FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
+JOINT_LOWER_RAD = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)
+JOINT_UPPER_RAD = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
+JOINT_VELOCITY_LIMIT_RAD_S = (2.1750, 2.1750, 2.1750, 2.1750, 2.6100, 2.6100, 2.6100)
+JOINT_ACCELERATION_LIMIT_RAD_S2 = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+GRIPPER_MAX_WIDTH_M = 0.08
+
+OBSERVATION_SIZE = 40
+"""Teacher: q 9, qd 9, hand pose 7, object pose 7, grasp pose 7, log category id 1.
+Poses are position (m) + unit quaternion (w, x, y, z) in the world frame (robot base)."""
+STATE_SIZE = 8
+"""Student: seven arm joint positions (rad) and the gripper's opening width (m)."""
+ACTION_SIZE = 8
+"""a[:7] in [-1, 1] scaled joint deltas, a[7] gripper: > 0 closes, <= 0 opens."""
+ACTION_SCALE_RAD = 0.1
+"""s in q_target = q + s * a[:7]: radians per control step."""
+
+# --- workspace: world frame = robot base, x forward, z up, table top at z = 0 ----------------
+WORKSPACE_CENTER_M = (0.5, 0.0)
+WORKSPACE_SIZE_M = (0.3, 0.4)
+"""x and y extent in which an object's centre starts (the paper's 40 cm x 30 cm)."""
+LIFT_TARGET_M = (0.5, 0.0, 0.4)
+LIFT_TOLERANCE_M = 0.05
+HOLD_STEPS = 5
+"""An episode succeeds if its last HOLD_STEPS steps all had the object within tolerance."""
+
+# --- depth -----------------------------------------------------------------------------------
+DEPTH_FRAMES = 3
+DEPTH_UNIT_M = 0.001
+"""On disk: uint16 millimetres. In memory: float32 planar metres. 0 = invalid in both."""
+
+
+@dataclass(frozen=True)
+class CameraProfile:
+    """Pinhole camera. Pixel (row v, column u) has its centre at (u + 0.5, v + 0.5).
+
+    Camera frame as in OpenCV: x right, y down, z forward; depth is planar (along z).
+    """
+
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    baseline_m: float
+    """Distance from the left to the right infrared imager."""
+    crop_height_px: int
+    crop_width_px: int
+    """The window a policy sees (450 x 580 at scale 1, paper III-C1)."""
+
+    def scaled(self, scale: float) -> "CameraProfile":
+        """The same camera with `scale` times the pixels per side (0.25: 1280 -> 320)."""
+        return replace(
+            self,
+            width_px=round(self.width_px * scale),
+            height_px=round(self.height_px * scale),
+            fx_px=self.fx_px * scale,
+            fy_px=self.fy_px * scale,
+            cx_px=self.cx_px * scale,
+            cy_px=self.cy_px * scale,
+            crop_height_px=round(self.crop_height_px * scale),
+            crop_width_px=round(self.crop_width_px * scale),
+        )
+
+    @property
+    def crop_origin_px(self) -> tuple[int, int]:
+        """(row, column) of the centred crop window's first pixel."""
+        return (
+            (self.height_px - self.crop_height_px) // 2,
+            (self.width_px - self.crop_width_px) // 2,
+        )
+
+
+_D455_FX_PX = 640.0 / math.tan(math.radians(87.0 / 2))
+D455 = CameraProfile(
+    width_px=1280,
+    height_px=720,
+    fx_px=_D455_FX_PX,
+    fy_px=_D455_FX_PX,
+    cx_px=640.0,
+    cy_px=360.0,
+    baseline_m=0.095,
+    crop_height_px=450,
+    crop_width_px=580,
+)
+"""RealSense D455 depth stream: 87 degrees horizontal field of view, 95 mm baseline (datasheet)."""
+
+CAMERA_POSITION_M = (0.94, 0.0, 0.56)
+CAMERA_LOOK_AT_M = (0.48, 0.0, 0.05)
+"""Nominal extrinsics: the camera stands across the table and looks back at the robot."""
+
+# --- exported policy -------------------------------------------------------------------------
+ONNX_INPUT_DEPTH = "depth"
+"""(B, 3, H, W), oldest frame first; float32 metres or uint16 millimetres, as the metadata says."""
+ONNX_INPUT_STATE = "state"
+"""(B, 8) float32."""
+ONNX_INPUT_NOISE = "noise"
+"""(B, chunk, 8) float32, standard normal: the initial sample of the reverse diffusion."""
+ONNX_OUTPUT_ACTION = "action"
+"""(B, chunk, 8) float32 in [-1, 1]; row 0 is to be executed now."""
+ONNX_METADATA_KEY = "ddgrasp"
+"""metadata_props key whose value is a JSON object (see export/metadata.py)."""
