@@ -1,0 +1,393 @@
+"""RGB-D recordings on disk: `color/%06d.jpg`, `depth/%06d.png` (uint16 millimetres), `meta.json`.
+
+The format holds what a camera on a desk can give: no pose, no CAD, no pairing. A recording is
+read frame by frame; a damaged frame is left out and named, the others stay readable. A recording
+whose depth cannot be what it claims (unit, type, size) is refused. NumPy and OpenCV alone.
+"""
+
+import json
+import os
+import shutil
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ddgrasp.contract import DEPTH_UNIT_M
+from ddgrasp.errors import UserError
+
+META_FILE = "meta.json"
+JPEG_QUALITY = 95
+PNG_COMPRESSION = 3
+
+# A D4xx sees from about 0.1 m to 10 m. Medians outside these are another unit, not another scene.
+NEAREST_MEDIAN_M = 0.08
+FARTHEST_MEDIAN_M = 6.0
+UNIT_CHECK_FRAMES = 5
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_GREY = 0
+
+
+@dataclass(frozen=True)
+class SkippedFrame:
+    """A frame that was left out of a recording."""
+
+    file: Path
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.file.name}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One trajectory of RGB-D frames in time order.
+
+    `frames_mm` and `frames_rgb` are read from disk on demand; the object itself is small.
+    """
+
+    path: Path
+    meta: dict[str, Any]
+    depth_files: tuple[Path, ...]
+    color_files: tuple[Path, ...]
+    height_px: int
+    width_px: int
+    skipped: tuple[SkippedFrame, ...] = ()
+
+    @classmethod
+    def open(cls, path: str | os.PathLike) -> "Recording":
+        """Index the recording in `path`.
+
+        Every file's structure is checked (PNG checksums, JPEG markers), a few frames are decoded
+        to check the unit. Damaged frames, frames without colour and frames without a single valid
+        pixel are listed in `skipped`.
+
+        Raises:
+            UserError: no recording there, or depth of another type, size or unit.
+        """
+        path = Path(path)
+        meta = _read_meta(path)
+        depth_files = _depth_files(path)
+        kept, skipped, size = [], [], None
+        for depth_file in depth_files:
+            color_file = _color_file(path, depth_file)
+            reason, frame_size = _inspect(depth_file, color_file)
+            if reason:
+                skipped.append(SkippedFrame(depth_file, reason))
+                continue
+            if size is not None and frame_size != size:
+                raise UserError(
+                    f"{depth_file}: depth is {frame_size[1]}x{frame_size[0]}, the frames before it "
+                    f"{size[1]}x{size[0]}; a recording has one size: split it into one folder per size."
+                )
+            size = frame_size
+            kept.append((depth_file, color_file))
+        if size is None:
+            raise UserError(
+                f"{path}: none of its {len(depth_files)} frames is readable "
+                f"(first: {skipped[0]}); record it again."
+            )
+        recording = cls(
+            path, meta, tuple(d for d, _ in kept), tuple(c for _, c in kept), size[0], size[1], tuple(skipped)
+        )
+        _check_unit(recording)
+        return recording
+
+    def __len__(self) -> int:
+        return len(self.depth_files)
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def fx_px(self) -> float | None:
+        """Focal length of the depth picture in pixels, where known."""
+        return self.meta.get("fx_px")
+
+    @property
+    def consecutive(self) -> bool:
+        """Whether the frames follow each other in time (temporal statistics make sense)."""
+        return bool(self.meta.get("consecutive_frames", False))
+
+    def depth_mm(self, index: int) -> np.ndarray:
+        """(H, W) uint16 planar depth in millimetres, 0 = invalid."""
+        file = self.depth_files[index]
+        raw = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
+        if raw is None:
+            raise UserError(f"{file}: cannot be decoded as PNG; delete it or copy it again.")
+        scale = self.meta["depth_unit_m"] / DEPTH_UNIT_M
+        if scale == 1.0:
+            return raw
+        return np.rint(np.minimum(raw * scale, np.iinfo(np.uint16).max)).astype(np.uint16)
+
+    def depth_m(self, index: int) -> np.ndarray:
+        """(H, W) float32 planar depth in metres, 0 = invalid."""
+        return self.depth_mm(index).astype(np.float32) * np.float32(DEPTH_UNIT_M)
+
+    def rgb(self, index: int) -> np.ndarray:
+        """(h, w, 3) uint8 colour at the colour camera's own size."""
+        file = self.color_files[index]
+        bgr = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise UserError(f"{file}: cannot be decoded as JPEG; delete it or copy it again.")
+        return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+    def frames(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """(rgb uint8 (h, w, 3), depth uint16 mm (H, W)) in time order."""
+        for index in range(len(self)):
+            yield self.rgb(index), self.depth_mm(index)
+
+    def skipped_summary(self) -> str:
+        """One line naming what was left out; empty if nothing was."""
+        if not self.skipped:
+            return ""
+        shown = ", ".join(str(frame) for frame in self.skipped[:3])
+        more = f" and {len(self.skipped) - 3} more" if len(self.skipped) > 3 else ""
+        total = len(self) + len(self.skipped)
+        return f"{self.path}: left out {len(self.skipped)} of {total} frames ({shown}{more})"
+
+
+def is_recording(path: str | os.PathLike) -> bool:
+    """Whether `path` is a finished recording (meta.json and depth/ are there)."""
+    path = Path(path)
+    return (path / META_FILE).is_file() and (path / "depth").is_dir()
+
+
+def find_recordings(root: str | os.PathLike) -> list[Recording]:
+    """All recordings at or directly below `root`, by name.
+
+    Unfinished ones (no meta.json, or a name that starts with a dot) are not recordings yet.
+
+    Raises:
+        UserError: `root` is missing, holds no recording, or one of them is refused.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder; expected a recording or a folder of recordings.")
+    if (root / "depth").is_dir():
+        return [Recording.open(root)]
+    folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and is_recording(p))
+    if not folders:
+        raise UserError(
+            f"{root}: no recording in it (a recording has color/, depth/ and {META_FILE}); "
+            "make some with `ddgrasp record`."
+        )
+    return [Recording.open(folder) for folder in folders]
+
+
+class RecordingWriter:
+    """Writes one recording; it appears under its name only when complete.
+
+    Use as a context manager: frames go to a hidden folder beside the target, `meta.json` is
+    written last, then the folder is renamed. Leaving by an exception (or Ctrl-C) removes the
+    hidden folder, a previous recording of that name stays as it was.
+    """
+
+    def __init__(self, path: str | os.PathLike, meta: dict[str, Any]):
+        self.path = Path(path)
+        self._meta = dict(meta)
+        self._temporary = self.path.parent / f".{self.path.name}.partial"
+        self._size: tuple[int, int] | None = None
+        self._frames = 0
+        self._invalid = 0.0
+
+    def __enter__(self) -> "RecordingWriter":
+        shutil.rmtree(self._temporary, ignore_errors=True)
+        (self._temporary / "color").mkdir(parents=True)
+        (self._temporary / "depth").mkdir()
+        return self
+
+    def __exit__(self, kind, value, traceback) -> None:
+        if kind is None:
+            self._finish()
+        else:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def add(self, rgb: np.ndarray, depth_mm: np.ndarray) -> None:
+        """Append a frame.
+
+        Args:
+            rgb: (h, w, 3) uint8.
+            depth_mm: (H, W) uint16 millimetres, 0 = invalid.
+        """
+        if depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
+            raise UserError(
+                f"depth of a recording is (H, W) uint16 millimetres, got {depth_mm.dtype} "
+                f"{depth_mm.shape}; convert metres with np.rint(depth_m * 1000).astype(np.uint16)."
+            )
+        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+            raise UserError(f"colour of a recording is (h, w, 3) uint8, got {rgb.dtype} {rgb.shape}.")
+        if self._size is not None and depth_mm.shape != self._size:
+            raise UserError(f"a recording has one depth size: {self._size}, got {depth_mm.shape}.")
+        self._size = depth_mm.shape
+        name = f"{self._frames:06d}"
+        _write(
+            self._temporary / "color" / f"{name}.jpg",
+            _encode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]),
+        )
+        _write(
+            self._temporary / "depth" / f"{name}.png",
+            _encode(".png", depth_mm, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]),
+        )
+        self._frames += 1
+        self._invalid += float(np.mean(depth_mm == 0))
+
+    def _finish(self) -> None:
+        if self._size is None:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+            raise UserError(f"{self.path}: a recording needs at least one frame.")
+        meta = {
+            "frames": self._frames,
+            "width": self._size[1],
+            "height": self._size[0],
+            "depth_unit_m": DEPTH_UNIT_M,
+            "invalid_value": 0,
+            "invalid_fraction_mean": round(self._invalid / self._frames, 4),
+        }
+        text = json.dumps({**self._meta, **meta}, indent=1) + "\n"
+        _write(self._temporary / META_FILE, text.encode(), sync=True)
+        old = self.path.parent / f".{self.path.name}.old"
+        if self.path.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            self.path.rename(old)
+        self._temporary.rename(self.path)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _encode(extension: str, image: np.ndarray, options: list[int]) -> bytes:
+    ok, data = cv2.imencode(extension, image, options)
+    if not ok:
+        raise RuntimeError(f"OpenCV could not encode a {image.dtype} {image.shape} image as {extension}")
+    return data.tobytes()
+
+
+def _write(path: Path, data: bytes, sync: bool = False) -> None:
+    # Not cv2.imwrite: it reports a full disk as False, without saying why.
+    with open(path, "wb") as file:
+        file.write(data)
+        if sync:
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    file = path / META_FILE
+    if not path.is_dir():
+        raise UserError(f"{path}: no such recording; expected a folder with color/, depth/ and {META_FILE}.")
+    if not file.is_file():
+        raise UserError(
+            f"{path}: {META_FILE} is missing, so the recording is unfinished or not one; "
+            'if it is complete, add one, at least {"depth_unit_m": 0.001}.'
+        )
+    try:
+        meta = json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{file}: not valid JSON ({error}); repair it or record again.") from error
+    unit = meta.get("depth_unit_m") if isinstance(meta, dict) else None
+    if not isinstance(unit, int | float) or not 1e-5 <= unit <= 1e-2:
+        raise UserError(
+            f"{file}: depth_unit_m is {unit!r}; expected metres per count of a 16-bit depth picture, "
+            "0.001 for millimetres."
+        )
+    return meta
+
+
+def _depth_files(path: Path) -> list[Path]:
+    folder = path / "depth"
+    files = sorted(p for p in folder.iterdir() if p.is_file()) if folder.is_dir() else []
+    for file in files:
+        if file.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".exr", ".pfm"):
+            raise UserError(
+                f"{file}: depth as {file.suffix}; expected 16-bit PNG in millimetres: convert float "
+                "metres with np.rint(depth_m * 1000).astype(np.uint16)."
+            )
+    files = [p for p in files if p.suffix.lower() == ".png"]
+    if not files:
+        raise UserError(f"{folder}: no depth pictures; expected 000000.png, 000001.png, ... (16-bit, mm).")
+    return files
+
+
+def _color_file(path: Path, depth_file: Path) -> Path:
+    png = path / "color" / f"{depth_file.stem}.png"
+    return png if png.is_file() else path / "color" / f"{depth_file.stem}.jpg"
+
+
+def _inspect(depth_file: Path, color_file: Path) -> tuple[str, tuple[int, int]]:
+    """(why the frame must be left out or "", (height, width) of its depth)."""
+    data = depth_file.read_bytes()
+    header = _png_header(data)
+    if header is None:
+        return "depth picture is truncated or corrupt", (0, 0)
+    height, width, bits, kind = header
+    if bits != 16 or kind != _PNG_GREY:
+        channels = "grey" if kind == _PNG_GREY else "colour"
+        raise UserError(
+            f"{depth_file}: depth is a {bits}-bit {channels} PNG; expected 16-bit grey in millimetres "
+            "(a colourised or 8-bit picture has lost the depth: record again)."
+        )
+    if not color_file.is_file():
+        return f"colour picture {color_file.name} is missing", (0, 0)
+    if not _color_complete(color_file):
+        return f"colour picture {color_file.name} is truncated or corrupt", (0, 0)
+    if _all_invalid(data, height, width):
+        return "no valid depth pixel", (0, 0)
+    return "", (height, width)
+
+
+def _png_header(data: bytes) -> tuple[int, int, int, int] | None:
+    """(height, width, bit depth, colour type) of an intact PNG, None if any chunk is damaged."""
+    if data[:8] != _PNG_SIGNATURE:
+        return None
+    offset, header = 8, None
+    while offset + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, offset)
+        end = offset + 8 + length
+        if end + 4 > len(data):
+            return None
+        if zlib.crc32(memoryview(data)[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            return None
+        if kind == b"IHDR":
+            width, height, bits, color = struct.unpack_from(">IIBB", data, offset + 8)
+            header = (height, width, bits, color)
+        if kind == b"IEND":
+            return header
+        offset = end + 4
+    return None
+
+
+def _color_complete(file: Path) -> bool:
+    data = file.read_bytes()
+    if file.suffix == ".png":
+        return _png_header(data) is not None
+    # Some cameras pad after the end-of-image marker; look for it near the end.
+    return data[:2] == b"\xff\xd8" and b"\xff\xd9" in data[-64:]
+
+
+def _all_invalid(data: bytes, height: int, width: int) -> bool:
+    # Only constant pictures shrink this far, so only they need decoding here.
+    if len(data) > 200 + height * width / 50:
+        return False
+    return not cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).any()
+
+
+def _check_unit(recording: Recording) -> None:
+    """Refuse depth whose median cannot be a D4xx's in the declared unit."""
+    indices = np.linspace(0, len(recording) - 1, min(UNIT_CHECK_FRAMES, len(recording))).astype(int)
+    values = np.concatenate([d[d > 0] for d in (recording.depth_mm(i) for i in indices)])
+    median_m = float(np.median(values)) * DEPTH_UNIT_M
+    unit = recording.meta["depth_unit_m"]
+    if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
+        return
+    guess = "metres or centimetres" if median_m < NEAREST_MEDIAN_M else "a finer unit (0.0001 m?)"
+    raise UserError(
+        f"{recording.path}: median depth {median_m:.4g} m with depth_unit_m {unit:g}; expected "
+        f"{NEAREST_MEDIAN_M:g} to {FARTHEST_MEDIAN_M:g} m: the pictures look like {guess}; "
+        f"correct depth_unit_m in {META_FILE} or convert them to millimetres."
+    )

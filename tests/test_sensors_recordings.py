@@ -1,0 +1,191 @@
+"""Recordings: round trip, damaged frames, wrong units, real files."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ddgrasp.errors import UserError
+from sensors.recordings import Recording, RecordingWriter, find_recordings
+
+REAL = Path(__file__).parents[2] / "shared" / "real_depth"
+
+
+def _frame(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    depth_mm = rng.integers(500, 1500, (24, 32)).astype(np.uint16)
+    depth_mm[:3] = 0
+    return np.full((24, 32, 3), 40 * seed, np.uint8), depth_mm
+
+
+def _write(path: Path, frames: int = 4) -> Path:
+    with RecordingWriter(path, {"sensor": "test", "fx_px": 20.0, "consecutive_frames": True}) as writer:
+        for seed in range(frames):
+            writer.add(*_frame(seed))
+    return path
+
+
+def _set_meta(path: Path, **values) -> None:
+    meta = json.loads((path / "meta.json").read_text())
+    (path / "meta.json").write_text(json.dumps({**meta, **values}))
+
+
+def _replace_depth(path: Path, index: int, image: np.ndarray) -> None:
+    assert cv2.imwrite(str(path / "depth" / f"{index:06d}.png"), image)
+
+
+def test_round_trip_is_exact_in_depth(tmp_path):
+    recording = Recording.open(_write(tmp_path / "a"))
+    assert len(recording) == 4 and not recording.skipped
+    assert (recording.height_px, recording.width_px, recording.fx_px) == (24, 32, 20.0)
+    for seed, (rgb, depth_mm) in enumerate(recording.frames()):
+        np.testing.assert_array_equal(depth_mm, _frame(seed)[1])
+        assert depth_mm.dtype == np.uint16 and np.abs(rgb.astype(int) - 40 * seed).max() <= 2
+    assert recording.meta["invalid_fraction_mean"] == 0.125
+    np.testing.assert_allclose(recording.depth_m(0), _frame(0)[1] / 1000.0, atol=1e-6)
+
+
+def test_interrupted_writer_keeps_the_previous_recording(tmp_path):
+    path = _write(tmp_path / "a", frames=2)
+    with pytest.raises(KeyboardInterrupt), RecordingWriter(path, {}) as writer:
+        writer.add(*_frame(0))
+        raise KeyboardInterrupt
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+    assert len(Recording.open(path)) == 2
+
+
+def test_writer_replaces_and_hides_until_complete(tmp_path):
+    path = _write(tmp_path / "a", frames=2)
+    with RecordingWriter(path, {}) as writer:
+        writer.add(*_frame(3))
+        assert [r.name for r in find_recordings(tmp_path)] == ["a"]
+        assert len(find_recordings(tmp_path)[0]) == 2
+    assert len(Recording.open(path)) == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_damaged_frames_are_named_and_the_rest_stays_readable(tmp_path):
+    path = _write(tmp_path / "a", frames=7)
+    truncated = path / "depth" / "000001.png"
+    truncated.write_bytes(truncated.read_bytes()[:-30])
+    flipped = path / "depth" / "000002.png"
+    data = bytearray(flipped.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    flipped.write_bytes(data)
+    (path / "color" / "000003.jpg").unlink()
+    jpeg = path / "color" / "000004.jpg"
+    jpeg.write_bytes(jpeg.read_bytes()[:100])
+    _replace_depth(path, 5, np.zeros((24, 32), np.uint16))
+    recording = Recording.open(path)
+    assert [f.stem for f in recording.depth_files] == ["000000", "000006"]
+    assert [s.file.stem for s in recording.skipped] == ["000001", "000002", "000003", "000004", "000005"]
+    assert [s.reason.split()[-1] for s in recording.skipped] == [
+        "corrupt",
+        "corrupt",
+        "missing",
+        "corrupt",
+        "pixel",
+    ]
+    assert "left out 5 of 7 frames" in recording.skipped_summary()
+    np.testing.assert_array_equal(recording.depth_mm(1), _frame(6)[1])
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.full((24, 32), 200, np.uint8), "000002.png: depth is a 8-bit grey PNG"),
+        (np.full((24, 32, 3), 200, np.uint16), "000002.png: depth is a 16-bit colour PNG"),
+        (np.full((12, 16), 800, np.uint16), "000002.png: depth is 16x12, the frames before it 32x24"),
+    ],
+)
+def test_wrong_type_or_size_is_refused_by_name(tmp_path, image, message):
+    path = _write(tmp_path / "a")
+    _replace_depth(path, 2, image)
+    with pytest.raises(UserError, match=message) as error:
+        Recording.open(path)
+    assert "\n" not in str(error.value)
+
+
+def test_float_depth_is_refused(tmp_path):
+    path = _write(tmp_path / "a")
+    np.save(path / "depth" / "000009.npy", np.ones((24, 32), np.float32))
+    with pytest.raises(UserError, match=r"000009.npy: depth as .npy; expected 16-bit PNG"):
+        Recording.open(path)
+
+
+@pytest.mark.parametrize(("factor", "message"), [(10.0, "finer unit"), (0.001, "metres"), (0.1, None)])
+def test_unit_that_cannot_be_is_refused(tmp_path, factor, message):
+    path = _write(tmp_path / "a")
+    for index in range(4):
+        _replace_depth(path, index, np.rint(_frame(index)[1] * factor).astype(np.uint16))
+    if message is None:  # 0.1: half a metre to 1.5 m would read 5 to 15 cm, which a close-up could be
+        assert len(Recording.open(path)) == 4
+        return
+    with pytest.raises(UserError, match=message):
+        Recording.open(path)
+
+
+def test_declared_unit_is_converted_to_millimetres(tmp_path):
+    path = _write(tmp_path / "a")
+    for index in range(4):
+        _replace_depth(path, index, _frame(index)[1] * 10)
+    _set_meta(path, depth_unit_m=0.0001)
+    np.testing.assert_array_equal(Recording.open(path).depth_mm(1), _frame(1)[1])
+
+
+@pytest.mark.parametrize("value", [None, "mm", 1.0])
+def test_undeclared_unit_is_refused(tmp_path, value):
+    path = _write(tmp_path / "a")
+    _set_meta(path, depth_unit_m=value)
+    with pytest.raises(UserError, match="depth_unit_m is"):
+        Recording.open(path)
+
+
+def test_find_recordings_errors_name_the_folder(tmp_path):
+    with pytest.raises(UserError, match="no such folder"):
+        find_recordings(tmp_path / "missing")
+    with pytest.raises(UserError, match="no recording in it"):
+        find_recordings(tmp_path)
+    path = _write(tmp_path / "a")
+    (path / "meta.json").unlink()
+    with pytest.raises(UserError, match="meta.json is missing"):
+        find_recordings(path)
+
+
+def test_writer_refuses_metres(tmp_path):
+    with pytest.raises(UserError, match="got float32"), RecordingWriter(tmp_path / "a", {}) as writer:
+        writer.add(_frame(0)[0], np.ones((24, 32), np.float32))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="shared/real_depth is not beside this checkout")
+def test_real_recordings_load():
+    recordings = {r.name: r for r in find_recordings(REAL)}
+    assert {name: len(r) for name, r in recordings.items()} == {
+        "d435_boxes": 10,
+        "d435_cleargrasp": 8,
+        "d435_librealsense": 2,
+        "d435_mobile_robot": 120,
+    }
+    for recording in recordings.values():
+        assert not recording.skipped
+        assert (recording.height_px, recording.width_px) == (
+            recording.meta["height"],
+            recording.meta["width"],
+        )
+    robot = recordings["d435_mobile_robot"]
+    invalid = np.mean([np.mean(robot.depth_mm(i) == 0) for i in range(0, 120, 4)])
+    assert abs(invalid - robot.meta["invalid_fraction_mean"]) < 0.01
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="shared/real_depth is not beside this checkout")
+def test_truncated_copy_of_a_real_recording_stays_readable(tmp_path):
+    shutil.copytree(REAL / "d435_boxes", tmp_path / "boxes")
+    for file in ("000002.png", "000005.png"):
+        path = tmp_path / "boxes" / "depth" / file
+        path.write_bytes(path.read_bytes()[:5000])
+    recording = Recording.open(tmp_path / "boxes")
+    assert len(recording) == 8 and len(recording.skipped) == 2
