@@ -1,0 +1,48 @@
+# Needs a Python >= 3.11 and make, nothing else:  make demo   make test
+# The newest Python that runs is taken; choose another with  make setup PYTHON=/path/to/python3.12
+
+ifeq ($(origin PYTHON),undefined)
+PYTHON := $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
+	$$p -c 'import sys, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && { echo $$p; break; }; done)
+endif
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+OUT ?= runs/demo
+
+.PHONY: help setup lock test demo check format clean-venv
+.DEFAULT_GOAL := help
+
+help:  ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
+
+setup: $(STAMP)  ## create .venv and install the locked dependencies
+
+$(STAMP): requirements.lock pyproject.toml
+	@test -n "$(PYTHON)" || { echo "No Python >= 3.11 with venv found: install one, or name it: make setup PYTHON=/path/to/python3" >&2; exit 2; }
+	@$(BIN)/python -c '' 2>/dev/null || { echo "$(PYTHON) -> $(VENV)"; $(PYTHON) -m venv --clear $(VENV); }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+lock:  ## resolve requirements.lock anew (needs uv on PATH)
+	uv pip compile --universal --python-version 3.11 --fork-strategy requires-python --no-emit-index-url \
+		--no-annotate --no-header --upgrade --extra dev pyproject.toml --output-file requirements.lock
+
+test: setup  ## run the tests (trains the debug preset end to end)
+	$(BIN)/python -m pytest $(ARGS)
+
+demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
+	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)
+
+check: setup  ## lint, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: setup  ## rewrite the files as `make check` wants them
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean-venv:  ## remove .venv
+	rm -rf $(VENV)
