@@ -1,0 +1,104 @@
+"""Forward kinematics of the scene and quaternion algebra, for NumPy and JAX alike.
+
+Quaternions are (w, x, y, z). `xp` is the array namespace: numpy or jax.numpy. All functions take
+leading batch dimensions. This module imports NumPy alone.
+"""
+
+from types import ModuleType
+
+import numpy as np
+
+from mjx_envs import scene
+
+
+def quat_mul(a, b, xp: ModuleType = np):
+    """(..., 4) Hamilton product a * b."""
+    aw, ax, ay, az = (a[..., i] for i in range(4))
+    bw, bx, by, bz = (b[..., i] for i in range(4))
+    return xp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quat_conj(q, xp: ModuleType = np):
+    """(..., 4) conjugate = inverse of a unit quaternion."""
+    return xp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+
+
+def rotate(q, v, xp: ModuleType = np):
+    """(..., 3) vector v turned by the unit quaternion q."""
+    u = q[..., 1:]
+    t = 2.0 * xp.cross(u, v)
+    return v + q[..., :1] * t + xp.cross(u, t)
+
+
+def quat_to_mat(q, xp: ModuleType = np):
+    """(..., 3, 3) rotation matrix of a unit quaternion."""
+    columns = [rotate(q, xp.broadcast_to(xp.eye(3)[i], q.shape[:-1] + (3,)), xp) for i in range(3)]
+    return xp.stack(columns, axis=-1)
+
+
+def quat_about_z(angle_rad, xp: ModuleType = np):
+    """(..., 4) rotation about the z axis."""
+    zero = xp.zeros_like(angle_rad)
+    return xp.stack([xp.cos(angle_rad / 2), zero, zero, xp.sin(angle_rad / 2)], axis=-1)
+
+
+def yaw_of(q, xp: ModuleType = np):
+    """(...,) angle about world z of the horizontal projection of the turned x axis."""
+    w, x, y, z = (q[..., i] for i in range(4))
+    return xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def angle_between(a, b, xp: ModuleType = np):
+    """(...,) angle (rad, 0..pi) of the rotation from unit quaternion a to b."""
+    dot = xp.abs(xp.sum(a * b, axis=-1))
+    return 2.0 * xp.arccos(xp.clip(dot, 0.0, 1.0 - 1e-7))
+
+
+def body_poses(qpos, xp: ModuleType = np) -> dict:
+    """World pose of every moving body: name -> ((..., 3) position m, (..., 4) quaternion).
+
+    Args:
+      qpos: (..., 9 or 16) arm 7, fingers 2 and, if given, the object's pose 7.
+    """
+    batch = qpos.shape[:-1]
+    pos = xp.zeros(batch + (3,))
+    quat = xp.broadcast_to(xp.asarray([1.0, 0.0, 0.0, 0.0]), batch + (4,))
+    poses = {"link0": (pos, quat)}
+    for i, link in enumerate(scene.ARM_LINKS):
+        pos, quat = _child(pos, quat, link.pos_m, link.quat, xp)
+        quat = quat_mul(quat, quat_about_z(qpos[..., i], xp), xp)
+        poses[link.name] = (pos, quat)
+    hand = _child(pos, quat, scene.HAND_POS_M, scene.HAND_QUAT, xp)
+    poses["hand"] = hand
+    for name, turn, index in (("left_finger", (1.0, 0, 0, 0), 7), ("right_finger", (0.0, 0, 0, 1), 8)):
+        pos, quat = _child(*hand, scene.FINGER_POS_M, turn, xp)
+        slide = qpos[..., index, None] * xp.asarray([0.0, 1.0, 0.0])
+        poses[name] = (pos + rotate(quat, slide, xp), quat)
+    if qpos.shape[-1] > scene.N_ROBOT:
+        poses["object"] = (qpos[..., 9:12], qpos[..., 12:16])
+    return poses
+
+
+def grip_pose(q_arm, xp: ModuleType = np):
+    """((..., 3) position m, (..., 4) quaternion) of the site between the finger pads.
+
+    Args:
+      q_arm: (..., 7) joint positions, rad.
+    """
+    qpos = xp.concatenate([q_arm, xp.zeros(q_arm.shape[:-1] + (2,))], axis=-1)
+    pos, quat = body_poses(qpos, xp)["hand"]
+    return pos + rotate(quat, xp.asarray(scene.GRIP_POS_M), xp), quat
+
+
+def _child(pos, quat, local_pos, local_quat, xp):
+    local_pos = xp.broadcast_to(xp.asarray(local_pos, dtype=pos.dtype), pos.shape)
+    local_quat = xp.broadcast_to(xp.asarray(local_quat, dtype=quat.dtype), quat.shape)
+    return pos + rotate(quat, local_pos, xp), quat_mul(quat, local_quat, xp)

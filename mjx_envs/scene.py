@@ -1,0 +1,203 @@
+"""The scene: a Franka arm with its parallel gripper, a table, and one object body with slots. JAX-free.
+
+Kinematics and limits: Franka's published Denavit-Hartenberg table and interface specification.
+Link masses, centres of mass and inertias: Gaz, Cognetti, Oliva, Robuffo Giordano, De Luca, "Dynamic
+Identification of the Franka Emika Panda Robot", RA-L 2019. Geometry is our own: primitives only.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import mujoco
+
+from ddgrasp import contract
+from mjx_envs.objects import OBJECTS, SLOT_NAMES
+
+_S = 0.7071067811865476  # cos 45 degrees
+
+
+@dataclass(frozen=True)
+class Link:
+    """A body of the chain: pose in its parent, inertia, rendered geoms (MJCF attributes)."""
+
+    name: str
+    pos_m: tuple[float, float, float]
+    quat: tuple[float, float, float, float]
+    mass_kg: float
+    com_m: tuple[float, float, float]
+    fullinertia_kg_m2: tuple[float, float, float, float, float, float]
+    geoms: tuple[str, ...]
+
+
+ARM_LINKS = (
+    Link("link1", (0, 0, 0.333), (1, 0, 0, 0), 4.970684, (0.003875, 0.002081, -0.04762),
+         (0.70337, 0.70661, 0.0091170, -0.00013900, 0.0067720, 0.019169),
+         ('type="capsule" fromto="0 0 -0.19 0 0 -0.02" size="0.062"',
+          'type="capsule" fromto="0 -0.06 0 0 0.06 0" size="0.062"')),
+    Link("link2", (0, 0, 0), (_S, -_S, 0, 0), 0.646926, (-0.003141, -0.02872, 0.003495),
+         (0.0079620, 0.028110, 0.025995, -0.003925, 0.010254, 0.000704),
+         ('type="capsule" fromto="0 -0.08 0 0 -0.2 0" size="0.06"',)),
+    Link("link3", (0, -0.316, 0), (_S, _S, 0, 0), 3.228604, (0.027518, 0.039252, -0.066502),
+         (0.037242, 0.036155, 0.01083, -0.004761, -0.011396, -0.012805),
+         ('type="capsule" fromto="0 0 -0.1 0.04 0 -0.02" size="0.058"',
+          'type="capsule" fromto="0.0825 -0.04 0 0.0825 0.04 0" size="0.056"')),
+    Link("link4", (0.0825, 0, 0), (_S, _S, 0, 0), 3.587895, (-0.05317, 0.104419, 0.027454),
+         (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641),
+         ('type="capsule" fromto="-0.04 0.04 0 -0.0825 0.12 0" size="0.055"',)),
+    Link("link5", (-0.0825, 0.384, 0), (_S, -_S, 0, 0), 1.225946, (-0.011953, 0.041065, -0.038437),
+         (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229),
+         ('type="capsule" fromto="0 0 -0.25 0 0.03 -0.12" size="0.052"',
+          'type="capsule" fromto="0 0.06 -0.1 0 0.02 0" size="0.045"')),
+    Link("link6", (0, 0, 0), (_S, _S, 0, 0), 1.666555, (0.060149, -0.014117, -0.010517),
+         (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341),
+         ('type="capsule" fromto="0 0 -0.03 0.07 0 0.0" size="0.047"',)),
+    Link("link7", (0.088, 0, 0), (_S, _S, 0, 0), 0.735522, (0.010517, -0.004252, 0.061597),
+         (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741),
+         ('type="cylinder" fromto="0 0 0.03 0 0 0.107" size="0.042"',)),
+)  # fmt: skip
+
+HAND_POS_M = (0.0, 0.0, 0.107)
+HAND_QUAT = (0.9238795325112867, 0.0, 0.0, -0.3826834323650898)
+FINGER_POS_M = (0.0, 0.0, 0.0584)
+GRIP_POS_M = (0.0, 0.0, 0.1034)
+"""Site between the finger pads, in the hand frame; z points out of the hand, fingers open along y."""
+
+HOME_RAD = (0.0, -0.2016, 0.0, -2.4853, 0.0, 2.2836, 0.7854)
+"""Grip 0.26 m above the table over x = 0.45, fingers down, opening along world y."""
+
+ARM_GAIN_NM_RAD = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
+ARM_DAMPING_NMS_RAD = (450.0, 450.0, 350.0, 350.0, 200.0, 200.0, 200.0)
+ARM_TORQUE_LIMIT_NM = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+"""Joint torque limits: Franka's interface specification."""
+FINGER_GAIN_N_M = 800.0
+FINGER_FORCE_LIMIT_N = 20.0
+"""With 30 N and 2 kN/m the solver lost a squeezed sphere in most lifts at 5 ms; with these it held all."""
+PAD_FRICTION = 1.0
+
+N_ARM, N_ROBOT, NQ, NV, NU = 7, 9, 16, 15, 9
+
+
+def _arm_xml(depth: int = 0) -> str:
+    """Nested bodies of the arm, hand and fingers."""
+    if depth == len(ARM_LINKS):
+        return _hand_xml()
+    link = ARM_LINKS[depth]
+    lower, upper = contract.JOINT_LOWER_RAD[depth], contract.JOINT_UPPER_RAD[depth]
+    geoms = "".join(f'<geom class="arm" {g}/>' for g in link.geoms)
+    return f"""
+    <body name="{link.name}" pos="{_fmt(link.pos_m)}" quat="{_fmt(link.quat)}" gravcomp="1">
+      <inertial mass="{link.mass_kg}" pos="{_fmt(link.com_m)}" fullinertia="{_fmt(link.fullinertia_kg_m2)}"/>
+      <joint name="{contract.ARM_JOINTS[depth]}" axis="0 0 1" range="{lower} {upper}" damping="1"
+             armature="0.1"/>
+      {geoms}{_arm_xml(depth + 1)}
+    </body>"""
+
+
+def _hand_xml() -> str:
+    fingers = ""
+    for name, joint, quat in (
+        ("left_finger", contract.FINGER_JOINTS[0], "1 0 0 0"),
+        ("right_finger", contract.FINGER_JOINTS[1], "0 0 0 1"),
+    ):
+        fingers += f"""
+      <body name="{name}" pos="{_fmt(FINGER_POS_M)}" quat="{quat}" gravcomp="1">
+        <inertial mass="0.015" pos="0 0.01 0.025" diaginertia="3e-6 3e-6 1e-6"/>
+        <joint name="{joint}" type="slide" axis="0 1 0" range="0 0.04" damping="10" armature="0.1"/>
+        <geom class="arm" type="box" size="0.009 0.009 0.013" pos="0 0.012 0.013" rgba="0.2 0.2 0.2 1"/>
+        <geom name="{name}_pad" class="pad" type="box" size="0.0105 0.005 0.0155" pos="0 0.005 0.0415"/>
+      </body>"""
+    return f"""
+    <body name="hand" pos="{_fmt(HAND_POS_M)}" quat="{_fmt(HAND_QUAT)}" gravcomp="1">
+      <inertial mass="0.73" pos="-0.01 0 0.03" diaginertia="0.001 0.0025 0.0017"/>
+      <geom class="arm" type="cylinder" fromto="0 0 -0.005 0 0 0.025" size="0.04"/>
+      <geom name="hand_box" class="hand" type="box" size="0.031 0.102 0.02" pos="0 0 0.043"/>
+      <site name="grip" pos="{_fmt(GRIP_POS_M)}"/>{fingers}
+    </body>"""
+
+
+def _object_xml() -> str:
+    size, pos, quat = OBJECTS["cube"].slot_arrays()
+    kinds = ("box",) + ("capsule",) * (len(SLOT_NAMES) - 1)
+    slots = "".join(
+        f'<geom name="{n}" class="slot" type="{k}" size="{_fmt(s)}" pos="{_fmt(p)}" quat="{_fmt(q)}"/>'
+        for n, k, s, p, q in zip(SLOT_NAMES, kinds, size, pos, quat, strict=True)
+    )
+    cube = OBJECTS["cube"]
+    return f"""
+    <body name="object" pos="{contract.WORKSPACE_CENTER_M[0]} 0 {cube.rest_height_m}">
+      <joint name="object" type="free" damping="0.0005"/>
+      <inertial mass="{cube.mass_kg}" pos="0 0 0" diaginertia="{_fmt(cube.inertia_kg_m2())}"/>
+      {slots}
+    </body>"""
+
+
+def _actuators_xml() -> str:
+    arm = "".join(
+        f'<position joint="{j}" kp="{kp}" kv="{kv}" forcerange="-{f} {f}" ctrlrange="{lo} {hi}"/>'
+        for j, kp, kv, f, lo, hi in zip(
+            contract.ARM_JOINTS, ARM_GAIN_NM_RAD, ARM_DAMPING_NMS_RAD, ARM_TORQUE_LIMIT_NM,
+            contract.JOINT_LOWER_RAD, contract.JOINT_UPPER_RAD, strict=True,
+        )
+    )  # fmt: skip
+    fingers = "".join(
+        f'<position joint="{j}" kp="{FINGER_GAIN_N_M}" kv="60" ctrlrange="0 0.04" '
+        f'forcerange="-{FINGER_FORCE_LIMIT_N} {FINGER_FORCE_LIMIT_N}"/>'
+        for j in contract.FINGER_JOINTS
+    )
+    return arm + fingers
+
+
+def scene_xml(sim_dt_s: float = 0.005) -> str:
+    """MJCF of the whole scene."""
+    return f"""
+<mujoco model="franka_table">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="{sim_dt_s}" integrator="implicitfast" cone="elliptic" impratio="10"
+          iterations="20" ls_iterations="20"><flag eulerdamp="disable"/></option>
+  <default>
+    <default class="arm"><geom contype="0" conaffinity="0" group="1" rgba="0.92 0.92 0.92 1"/></default>
+    <default class="hand"><geom contype="1" conaffinity="0" group="1" rgba="0.85 0.85 0.85 1"/></default>
+    <default class="pad">
+      <geom contype="1" conaffinity="0" group="1" condim="4" friction="{PAD_FRICTION} 0.01 0.0001" priority="0"
+            solref="0.01 1" rgba="0.15 0.15 0.15 1"/>
+    </default>
+    <default class="slot">
+      <geom contype="1" conaffinity="1" group="1" condim="4" friction="0.9 0.005 0.0001" solref="0.01 1"/>
+    </default>
+  </default>
+  <visual><global offwidth="1280" offheight="720"/><map znear="0.02" zfar="20"/></visual>
+  <worldbody>
+    <light pos="0.6 -0.6 2" dir="-0.1 0.3 -1" directional="true"/>
+    <geom name="table" type="plane" size="0 0 1" contype="0" conaffinity="1" group="1" condim="4"
+          friction="0.7 0.005 0.0001" rgba="0.55 0.5 0.45 1"/>
+    <body name="link0">
+      <geom class="arm" type="capsule" fromto="-0.05 0 0.05 0.0 0 0.07" size="0.07"/>
+      {_arm_xml()}
+    </body>
+    {_object_xml()}
+  </worldbody>
+  <equality>
+    <joint joint1="{contract.FINGER_JOINTS[0]}" joint2="{contract.FINGER_JOINTS[1]}" solref="0.01 1"
+           solimp="0.95 0.99 0.001"/>
+  </equality>
+  <actuator>{_actuators_xml()}</actuator>
+  <sensor>
+    <contact name="left_touch" geom1="left_finger_pad" body2="object" data="force" reduce="netforce"/>
+    <contact name="right_touch" geom1="right_finger_pad" body2="object" data="force" reduce="netforce"/>
+  </sensor>
+</mujoco>"""
+
+
+def build_model(sim_dt_s: float = 0.005) -> mujoco.MjModel:
+    """A new compiled model; change it freely."""
+    return mujoco.MjModel.from_xml_string(scene_xml(sim_dt_s))
+
+
+@lru_cache
+def shared_model(sim_dt_s: float = 0.005) -> mujoco.MjModel:
+    """The compiled model, built once; treat it as read-only."""
+    return build_model(sim_dt_s)
+
+
+def _fmt(values) -> str:
+    return " ".join(f"{float(v):.9g}" for v in values)
