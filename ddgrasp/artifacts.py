@@ -1,0 +1,328 @@
+"""What a stage leaves on disk: a directory with a manifest, written so that nothing half-done is ever read.
+
+A stage's directory is finished once it holds `manifest.json`, which is written last. Every file goes to a
+temporary name in the same directory, reaches the disk (fsync), then takes its name (os.replace): a crash, a
+full disk or Ctrl-C leaves the previous file as it was. This module imports no JAX; `save_params` and
+`load_params` import it when called.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import contract
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+
+MANIFEST = "manifest.json"
+
+STAGE_FIELDS: dict[str, tuple[str, ...]] = {
+    "teacher": ("seed", "world", "teacher"),
+    "demos": ("seed", "world", "teacher", "demos"),
+    "record": ("seed", "world", "teacher", "record"),
+    "ddg": ("seed", "world", "teacher", "record", "ddg"),
+    "student": ("seed", "world", "teacher", "demos", "record", "ddg", "student"),
+    "export": ("seed", "world", "teacher", "demos", "record", "ddg", "student", "export"),
+    "deploy": (
+        "seed", "world", "teacher", "demos", "record", "ddg", "student", "export", "deploy", "evaluation",
+    ),
+}  # fmt: skip
+"""The parts of `Config` that a stage's result depends on: these are hashed, and must match on --resume."""
+
+_LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
+_PARAMS_MAGIC = b"DDGRASP-PARAMS-1\n"
+
+
+# --- atomic files ------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path | str) -> Iterator[Path]:
+    """Yields a temporary path beside `path`; on success it becomes `path`, on any error it goes away.
+
+    The temporary name keeps the suffix, since some writers (NumPy, ONNX, OpenCV) look at it.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+    try:
+        yield temporary
+        _fsync(temporary)
+        os.replace(temporary, path)
+        _fsync(path.parent)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+
+
+def atomic_write_bytes(path: Path | str, data: bytes) -> None:
+    """Writes `data` to `path`; on an error (full disk, Ctrl-C) the previous file survives."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(data)
+
+
+def atomic_write_text(path: Path | str, text: str) -> None:
+    """`atomic_write_bytes` of `text` in UTF-8."""
+    atomic_write_bytes(path, text.encode())
+
+
+def atomic_write_json(path: Path | str, value: Any) -> None:
+    """Writes `value` (dataclasses, paths and NumPy numbers included) as indented, strictly valid JSON."""
+    atomic_write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path | str) -> Any:
+    """The value in a JSON file; UserError naming the file if it is absent or damaged."""
+    path = Path(path)
+    try:
+        return json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist.") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is not valid JSON ({error}): delete it and make it again.") from None
+
+
+def to_json(value: Any) -> Any:
+    """`value` as plain JSON types: dataclasses become objects, tuples lists, NumPy numbers and arrays plain.
+
+    Not-a-number and infinities become null: JSON has no name for them.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_json(item) for item in value]
+    if hasattr(value, "tolist"):  # NumPy and JAX arrays and scalars
+        return to_json(value.tolist())
+    if isinstance(value, float):
+        return value if value == value and abs(value) != float("inf") else None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def _fsync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+# --- manifests ---------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Manifest:
+    """Where an artefact came from and what was measured on it."""
+
+    stage: str
+    """teacher, demos, record, ddg, student, export or deploy."""
+    config: dict[str, Any]
+    """The whole configuration, as JSON."""
+    config_hash: str
+    """Hash of the parts of the configuration that this stage depends on (`STAGE_FIELDS`)."""
+    contract_version: int
+    versions: dict[str, str]
+    """Python, this project and the libraries."""
+    seed: int
+    parents: dict[str, str]
+    """Stage name -> hash of the manifest this artefact was made from."""
+    seconds: float
+    """Wall time spent, interrupted attempts included."""
+    origin: str
+    """"trained" (made in this run) or "loaded" (a checkpoint made by another run)."""
+    metrics: dict[str, Any]
+    """What the stage measured; goes into report.json. A success rate is {"successes": k, "n": n}."""
+    created: str = ""
+    """UTC time."""
+
+    def __post_init__(self):
+        if self.origin not in ("trained", "loaded"):
+            raise ValueError(f"origin is {self.origin!r}; expected 'trained' or 'loaded'")
+
+
+@dataclasses.dataclass(frozen=True)
+class Artifact:
+    """A finished stage."""
+
+    directory: Path
+    manifest: Manifest
+    hash: str
+    """Identifies this very artefact: children name it among their parents."""
+
+
+def write_manifest(directory: Path | str, manifest: Manifest) -> Artifact:
+    """Finishes a stage: writes manifest.json, the last file of its directory, and returns the artefact."""
+    atomic_write_json(Path(directory) / MANIFEST, manifest)
+    return read_artifact(directory)
+
+
+def read_manifest(directory: Path | str) -> Manifest:
+    """The manifest of a finished stage; UserError if there is none, it is damaged, or of another contract."""
+    path = Path(directory) / MANIFEST
+    if not path.exists():
+        raise UserError(
+            f"{directory} holds no finished artefact ({MANIFEST} is absent): run that stage first."
+        )
+    value = read_json(path)
+    names = {field.name for field in dataclasses.fields(Manifest)}
+    if not isinstance(value, dict) or names - value.keys() - {"created"}:
+        raise UserError(f"{path} is no manifest of this project: delete {directory} and run the stage again.")
+    if value["contract_version"] != contract.CONTRACT_VERSION:
+        raise UserError(
+            f"{path} was made with contract version {value['contract_version']}, this code has "
+            f"{contract.CONTRACT_VERSION}: make it again, or use the release that made it."
+        )
+    return Manifest(**{name: value[name] for name in names & value.keys()})
+
+
+def read_artifact(directory: Path | str) -> Artifact:
+    """The finished stage in `directory`, whatever its configuration (see `read_manifest` for errors)."""
+    manifest = read_manifest(directory)
+    digest = hashlib.sha256((Path(directory) / MANIFEST).read_bytes()).hexdigest()[:16]
+    return Artifact(Path(directory), manifest, digest)
+
+
+def is_finished(directory: Path | str) -> bool:
+    """Whether the stage in `directory` ran to its end."""
+    return (Path(directory) / MANIFEST).exists()
+
+
+def finish(
+    directory: Path | str,
+    stage: str,
+    config: Config,
+    *,
+    seconds: float,
+    metrics: Mapping[str, Any],
+    parents: Iterable[Artifact] = (),
+    origin: str = "trained",
+) -> Artifact:
+    """Writes the manifest of a stage that has just ended.
+
+    Args:
+      seconds: wall time; `progress.seconds` counts interrupted attempts too.
+      metrics: what was measured; a success rate as {"successes": k, "n": n}.
+      parents: the artefacts this one was made from.
+      origin: "trained", or "loaded" if its main content came from a checkpoint of another run.
+    """
+    return write_manifest(
+        directory,
+        Manifest(
+            stage=stage,
+            config=to_json(config),
+            config_hash=config_hash(config, stage),
+            contract_version=contract.CONTRACT_VERSION,
+            versions=library_versions(),
+            seed=config.seed,
+            parents={parent.manifest.stage: parent.hash for parent in parents},
+            seconds=round(float(seconds), 3),
+            origin=origin,
+            metrics=to_json(metrics),
+            created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        ),
+    )
+
+
+def require(run_dir: Path | str, stage: str, config: Config) -> Artifact:
+    """The finished `stage` of the run in `run_dir`, made with this very configuration; UserError otherwise."""
+    directory = Path(run_dir) / stage
+    if not is_finished(directory):
+        raise UserError(f"{run_dir} has no finished stage {stage!r}: run it first, into the same directory.")
+    artifact = read_artifact(directory)
+    check_config(artifact, config)
+    return artifact
+
+
+def config_hash(config: Config, stage: str) -> str:
+    """Hash over the parts of the configuration that `stage` depends on, and nothing else."""
+    relevant = _relevant(to_json(config), stage)
+    return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def check_config(artifact: Artifact, config: Config) -> None:
+    """UserError that names both values if `artifact` was made with another configuration than `config`."""
+    manifest = artifact.manifest
+    expected = config_hash(config, manifest.stage)
+    if manifest.config_hash == expected:
+        return
+    there, here = (_relevant(value, manifest.stage) for value in (manifest.config, to_json(config)))
+    difference = next(_differences(there, here), "a field that no longer exists")
+    raise UserError(
+        f"{artifact.directory} was made with another configuration (hash {manifest.config_hash}, this run has "
+        f"{expected}): {difference}. Use that configuration, another --out, or delete that directory."
+    )
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of Python, this project and the libraries that matter, without importing them."""
+    versions = {"python": platform.python_version()}
+    for name in ("ddgrasp", *_LIBRARIES):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions
+
+
+def _relevant(config: Mapping[str, Any], stage: str) -> dict[str, Any]:
+    return {name: config.get(name) for name in STAGE_FIELDS[stage]}
+
+
+def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
+    """'student.width is 16 there, 32 here' for every differing leaf."""
+    if isinstance(there, Mapping) and isinstance(here, Mapping):
+        for key in sorted({*there, *here}):
+            yield from _differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)
+    elif there != here:
+        yield f"{name} is {there!r} there, {here!r} here"
+
+
+# --- parameters --------------------------------------------------------------------------------
+
+
+def save_params(path: Path | str, pytree: Any) -> None:
+    """Writes a pytree of arrays (nested dicts, Flax or Brax parameters) as checksummed msgpack, atomically."""
+    import jax
+    import numpy as np
+    from flax import serialization
+
+    state = jax.tree.map(np.asarray, serialization.to_state_dict(pytree))
+    payload = serialization.msgpack_serialize(state)
+    atomic_write_bytes(path, _PARAMS_MAGIC + hashlib.sha256(payload).digest() + payload)
+
+
+def load_params(path: Path | str, target: Any = None) -> Any:
+    """What `save_params` wrote: nested dicts of NumPy arrays, or shaped like `target` if one is given.
+
+    Raises UserError if the file is absent, not ours, damaged, or does not fit `target`.
+    """
+    from flax import serialization
+
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise UserError(f"Parameter file {path} does not exist.") from None
+    if not data.startswith(_PARAMS_MAGIC):
+        raise UserError(f"{path} is no parameter file of this project: expected one written by save_params.")
+    digest, payload = data[len(_PARAMS_MAGIC) :][:32], data[len(_PARAMS_MAGIC) + 32 :]
+    if hashlib.sha256(payload).digest() != digest:
+        raise UserError(f"Parameter file {path} is damaged or truncated: make it again, or restore a copy.")
+    state = serialization.msgpack_restore(payload)
+    if target is None:
+        return state
+    try:
+        return serialization.from_state_dict(target, state)
+    except (ValueError, KeyError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{path} does not fit this configuration's network ({reason}).") from None
