@@ -1,0 +1,166 @@
+"""Discrete diffusion: noise schedules and the forward, DDPM and DDIM equations.
+
+One equation, one function; noise is always an argument. Everything is generic over the shape of x, so the
+student's action head uses this module too. Notation: step k in 0..K-1, beta_k, alpha_bar_k = prod (1 - beta),
+x_k the noised sample, eps the noise; `previous` = -1 stands for the clean sample (alpha_bar = 1).
+
+Sources: Ho et al. 2020 (DDPM), Song et al. 2021 (DDIM), Nichol & Dhariwal 2021 (cosine schedule),
+Lin et al. 2024 (trailing steps), Hoogeboom et al. 2023 (shifted schedule).
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ddgrasp.errors import UserError, unknown_name
+
+SPACINGS = ("leading", "trailing", "linspace")
+COSINE_OFFSET = 0.008
+"""s of Nichol & Dhariwal, eq. 17."""
+MAX_BETA = 0.999
+VARIANCE_FLOOR = 1e-20
+
+
+class Schedule(NamedTuple):
+    """betas (K,) and alpha_bars (K,), float32 NumPy: constants for jitted functions."""
+
+    betas: np.ndarray
+    alpha_bars: np.ndarray
+
+    @property
+    def steps(self) -> int:
+        """K, the number of diffusion steps."""
+        return len(self.betas)
+
+
+def linear_betas(steps: int, first: float = 1e-4, last: float = 0.02) -> np.ndarray:
+    """beta_k from `first` to `last` in equal steps, (K,) float64 (Ho et al. 2020, section 4)."""
+    return np.linspace(first, last, steps)
+
+
+def cosine_betas(steps: int) -> np.ndarray:
+    """beta_k = 1 - f((k+1)/K) / f(k/K), f(u) = cos^2(pi/2 (u+s)/(1+s)), (K,) float64 (N. & D. 2021, eq. 17)."""
+    u = np.arange(steps + 1) / steps
+    f = np.cos((u + COSINE_OFFSET) / (1 + COSINE_OFFSET) * math.pi / 2) ** 2
+    return np.minimum(1 - f[1:] / f[:-1], MAX_BETA)
+
+
+def shifted_betas(betas: np.ndarray, log_snr_shift: float) -> np.ndarray:
+    """Betas whose log SNR, log(alpha_bar / (1 - alpha_bar)), is moved by `log_snr_shift` at every step.
+
+    Negative values make every step noisier, which large pictures want (Hoogeboom et al. 2023, eq. 5).
+    """
+    alpha_bars = np.cumprod(1 - betas)
+    moved = 1 / (1 + (1 - alpha_bars) / alpha_bars * math.exp(-log_snr_shift))
+    previous = np.concatenate([[1.0], moved[:-1]])
+    return np.minimum(1 - moved / previous, MAX_BETA)
+
+
+_BETAS = {"linear": linear_betas, "cosine": cosine_betas}
+
+
+def make_schedule(name: str, steps: int, log_snr_shift: float = 0.0) -> Schedule:
+    """Schedule "linear" or "cosine" with `steps` steps; UserError for another name or fewer than 2 steps."""
+    if name not in _BETAS:
+        raise unknown_name("noise schedule", name, _BETAS)
+    if steps < 2:
+        raise UserError(f"A noise schedule needs at least 2 steps, not {steps}.")
+    betas = _BETAS[name](steps)
+    if log_snr_shift:
+        betas = shifted_betas(betas, log_snr_shift)
+    return Schedule(betas.astype(np.float32), np.cumprod(1 - betas).astype(np.float32))
+
+
+def timesteps(steps: int, count: int, spacing: str = "trailing") -> np.ndarray:
+    """`count` of the steps K-1..0 that a few-step sampler visits, descending, (count,) int32.
+
+    "leading" ends at 0 and starts short of K-1; "trailing" starts at K-1, where x is pure noise, and ends
+    short of 0; "linspace" has both ends (Lin et al. 2024, table 2).
+    """
+    if not 1 <= count <= steps:
+        raise UserError(f"Sampling steps must lie in 1..{steps} (the schedule's length), not {count}.")
+    if spacing == "leading":
+        visited = (np.arange(count) * (steps // count))[::-1]
+    elif spacing == "trailing":
+        visited = np.round(steps - np.arange(count) * (steps / count)) - 1
+    elif spacing == "linspace":
+        visited = np.round(np.linspace(0, steps - 1, count))[::-1]
+    else:
+        raise unknown_name("timestep spacing", spacing, SPACINGS)
+    return visited.astype(np.int32)
+
+
+def previous_steps(visited: np.ndarray) -> np.ndarray:
+    """The step each visited step leads to: the next visited one, finally -1. (count,) int32."""
+    return np.append(visited[1:], -1).astype(np.int32)
+
+
+def alpha_bar_at(schedule: Schedule, step: Array, x: Array) -> Array:
+    """alpha_bar at `step` (any leading shape of x; -1 gives 1), with axes added to broadcast against x."""
+    step = jnp.asarray(step)
+    value = jnp.where(step < 0, 1.0, jnp.asarray(schedule.alpha_bars)[jnp.maximum(step, 0)])
+    return value.reshape(value.shape + (1,) * (jnp.ndim(x) - value.ndim))
+
+
+def q_sample(schedule: Schedule, x_0: Array, step: Array, eps: Array) -> Array:
+    """x_k = sqrt(alpha_bar) x_0 + sqrt(1 - alpha_bar) eps (Ho et al. 2020, eq. 4). x_0, eps: (B, ...), step (B,)."""
+    a = alpha_bar_at(schedule, step, x_0)
+    return jnp.sqrt(a) * x_0 + jnp.sqrt(1 - a) * eps
+
+
+def predict_x_0(schedule: Schedule, x_k: Array, step: Array, eps: Array) -> Array:
+    """x_0 = (x_k - sqrt(1 - alpha_bar) eps) / sqrt(alpha_bar): `q_sample` solved for x_0 (eq. 15)."""
+    a = alpha_bar_at(schedule, step, x_k)
+    return (x_k - jnp.sqrt(1 - a) * eps) / jnp.sqrt(a)
+
+
+def posterior_mean(schedule: Schedule, x_k: Array, x_0: Array, step: Array, previous: Array) -> Array:
+    """Mean of q(x_previous | x_k, x_0) (Ho et al. 2020, eq. 7, alpha_k = alpha_bar_k / alpha_bar_previous)."""
+    a, a_prev = alpha_bar_at(schedule, step, x_k), alpha_bar_at(schedule, previous, x_k)
+    alpha = a / a_prev
+    return (jnp.sqrt(a_prev) * (1 - alpha) * x_0 + jnp.sqrt(alpha) * (1 - a_prev) * x_k) / (1 - a)
+
+
+def posterior_variance(schedule: Schedule, step: Array, previous: Array, x: Array) -> Array:
+    """beta~ = (1 - alpha_bar_previous) / (1 - alpha_bar_k) * (1 - alpha_k) (Ho et al. 2020, eq. 7), 0 at the end."""
+    a, a_prev = alpha_bar_at(schedule, step, x), alpha_bar_at(schedule, previous, x)
+    return (1 - a_prev) / (1 - a) * (1 - a / a_prev)
+
+
+def ddpm_step(
+    schedule: Schedule, x_k: Array, step: Array, previous: Array, eps: Array, noise: Array, clip: float | None
+) -> Array:
+    """One ancestral step x_k -> x_previous from predicted `eps` (Ho et al. 2020, algorithm 2).
+
+    `noise` is standard normal, shaped like x_k, unused when previous = -1. `clip`: |x_0| is limited to it.
+    """
+    x_0 = predict_x_0(schedule, x_k, step, eps)
+    x_0 = x_0 if clip is None else jnp.clip(x_0, -clip, clip)
+    variance = jnp.maximum(posterior_variance(schedule, step, previous, x_k), VARIANCE_FLOOR)
+    noise = jnp.where(jnp.asarray(previous) < 0, 0.0, 1.0) * noise
+    return posterior_mean(schedule, x_k, x_0, step, previous) + jnp.sqrt(variance) * noise
+
+
+def ddim_step(
+    schedule: Schedule,
+    x_k: Array,
+    step: Array,
+    previous: Array,
+    eps: Array,
+    clip: float | None,
+    eta: float = 0.0,
+    noise: Array | float = 0.0,
+) -> Array:
+    """One DDIM step x_k -> x_previous from predicted `eps` (Song et al. 2021, eq. 12; sigma by eq. 16).
+
+    eta = 0 is deterministic, eta = 1 injects the DDPM's variance through `noise` (standard normal).
+    `clip`: |x_0| is limited to it; the direction towards x_k keeps the predicted eps.
+    """
+    x_0 = predict_x_0(schedule, x_k, step, eps)
+    x_0 = x_0 if clip is None else jnp.clip(x_0, -clip, clip)
+    a_prev = alpha_bar_at(schedule, previous, x_k)
+    sigma = eta * jnp.sqrt(posterior_variance(schedule, step, previous, x_k))
+    return jnp.sqrt(a_prev) * x_0 + jnp.sqrt(1 - a_prev - sigma**2) * eps + sigma * noise

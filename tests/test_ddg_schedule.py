@@ -1,0 +1,104 @@
+"""Diffusion equations against a reference implementation's recorded values, and by hand."""
+
+import json
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ddg_jax import schedule as s
+from ddgrasp.errors import UserError
+
+PARITY = Path(os.environ.get("PARITY_DIR") or Path(__file__).resolve().parents[1].parent / "shared/parity/public")
+FILE = PARITY / "unit_diffusion_schedule.npz"
+NAMES = {"linear": "linear", "squaredcos_cap_v2": "cosine"}
+
+
+@pytest.fixture(scope="module")
+def reference():
+    if not FILE.exists():
+        pytest.skip(f"no parity file {FILE.name} in {PARITY} (set PARITY_DIR)")
+    with np.load(FILE) as arrays:
+        values = {name: arrays[name] for name in arrays.files}
+    cases = json.loads(bytes(values["meta_json"]).decode())["cases"]
+    return values, cases
+
+
+def stub_model(x, step):
+    return jnp.tanh(0.7 * x + 0.1 * jnp.sin(step))
+
+
+def test_schedule_and_forward_process_match_the_reference(reference):
+    values, cases = reference
+    for i, case in enumerate(cases):
+        made = s.make_schedule(NAMES[case["beta_schedule"]], case["num_train_timesteps"])
+        np.testing.assert_allclose(made.betas, values[f"case{i}/betas"], rtol=2e-4, atol=1e-7)
+        np.testing.assert_allclose(made.alpha_bars, values[f"case{i}/alphas_cumprod"], rtol=1e-3, atol=2e-7)
+        x_k = s.q_sample(made, values[f"case{i}/x0"], values[f"case{i}/t"], values[f"case{i}/eps"])
+        np.testing.assert_allclose(x_k, values[f"case{i}/q_sample"], atol=2e-5)
+
+
+def test_samplers_match_the_reference(reference):
+    values, cases = reference
+    compared = 0
+    for i, case in enumerate(cases):
+        made = s.make_schedule(NAMES[case["beta_schedule"]], case["num_train_timesteps"])
+        clip = 1.0 if case["clip_sample"] else None
+        visited = s.timesteps(made.steps, case["ddim_steps"], case["ddim_timestep_spacing"])
+        np.testing.assert_array_equal(visited, values[f"case{i}/ddim_timesteps"])
+        with jax.enable_x64(True):
+            x = jnp.asarray(values[f"case{i}/xT"])
+            for k, previous in zip(visited, s.previous_steps(visited), strict=True):
+                x = s.ddim_step(made, x, k, previous, stub_model(x, k), clip, case["eta"])
+            np.testing.assert_allclose(x, values[f"case{i}/ddim_out"], rtol=1e-3, atol=2e-4)
+            compared += 1
+            if f"case{i}/ddpm_out" in values:
+                x = jnp.asarray(values[f"case{i}/xT"])
+                for k in range(made.steps - 1, -1, -1):
+                    noise = values[f"case{i}/noise"][k]
+                    x = s.ddpm_step(made, x, k, k - 1, stub_model(x, k), noise, clip)
+                np.testing.assert_allclose(x, values[f"case{i}/ddpm_out"], rtol=1e-3, atol=2e-4)
+                compared += 1
+    assert compared >= len(cases)
+
+
+def test_two_step_schedule_by_hand():
+    made = s.Schedule(np.array([0.5, 0.5], np.float32), np.array([0.5, 0.25], np.float32))
+    x_0, eps = jnp.ones((1, 2)), jnp.full((1, 2), 2.0)
+    x_1 = s.q_sample(made, x_0, jnp.array([1]), eps)
+    np.testing.assert_allclose(x_1, 0.5 + 2 * np.sqrt(0.75), rtol=1e-6)
+    np.testing.assert_allclose(s.predict_x_0(made, x_1, 1, eps), x_0, rtol=1e-6)
+    # q(x_0' | x_1, x_0): a=.25, a_prev=.5, alpha=.5 -> (sqrt(.5) * .5 * x_0 + sqrt(.5) * .5 * x_1) / .75
+    want = np.sqrt(0.5) * 0.5 * (1 + x_1[0, 0]) / 0.75
+    np.testing.assert_allclose(s.posterior_mean(made, x_1, x_0, 1, 0)[0, 0], want, rtol=1e-6)
+    np.testing.assert_allclose(s.posterior_variance(made, 1, 0, x_1)[0], 0.5 / 0.75 * 0.5, rtol=1e-6)
+    np.testing.assert_allclose(s.ddim_step(made, x_1, 1, -1, eps, None), x_0, rtol=1e-6)
+
+
+def test_ddim_with_eta_one_equals_ddpm():
+    made = s.make_schedule("cosine", 50)
+    x = jax.random.normal(jax.random.key(0), (3, 4))
+    eps, noise = jax.random.normal(jax.random.key(1), (2, 3, 4))
+    for k, previous in ((40, 30), (10, 9), (9, -1)):
+        ddim = s.ddim_step(made, x, k, previous, eps, None, eta=1.0, noise=noise)
+        np.testing.assert_allclose(ddim, s.ddpm_step(made, x, k, previous, eps, noise, None), atol=2e-5)
+
+
+def test_shift_moves_log_snr_by_the_amount():
+    plain, moved = s.make_schedule("linear", 100), s.make_schedule("linear", 100, log_snr_shift=-1.5)
+    log_snr = [np.log(a / (1 - a)) for a in (plain.alpha_bars, moved.alpha_bars)]
+    np.testing.assert_allclose(log_snr[1] - log_snr[0], -1.5, atol=1e-3)
+
+
+def test_timestep_spacing():
+    assert s.timesteps(1000, 5, "trailing").tolist() == [999, 799, 599, 399, 199]
+    assert s.timesteps(1000, 5, "leading").tolist() == [800, 600, 400, 200, 0]
+    assert s.timesteps(11, 3, "linspace").tolist() == [10, 5, 0]
+    assert s.previous_steps(np.array([800, 0])).tolist() == [0, -1]
+    with pytest.raises(UserError, match="trailing"):
+        s.timesteps(10, 2, "trailling")
+    with pytest.raises(UserError, match="11"):
+        s.timesteps(10, 11)
