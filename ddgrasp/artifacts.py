@@ -236,7 +236,7 @@ def finish(
 
 
 def require(run_dir: Path | str, stage: str, config: Config) -> Artifact:
-    """The finished `stage` of the run in `run_dir`, made with this very configuration; UserError otherwise."""
+    """The finished `stage` of the run in `run_dir`, made with this configuration; UserError otherwise."""
     directory = Path(run_dir) / stage
     if not is_finished(directory):
         raise UserError(f"{run_dir} has no finished stage {stage!r}: run it first, into the same directory.")
@@ -260,8 +260,8 @@ def check_config(artifact: Artifact, config: Config) -> None:
     there, here = (_relevant(value, manifest.stage) for value in (manifest.config, to_json(config)))
     difference = next(_differences(there, here), "a field that no longer exists")
     raise UserError(
-        f"{artifact.directory} was made with another configuration (hash {manifest.config_hash}, this run has "
-        f"{expected}): {difference}. Use that configuration, another --out, or delete that directory."
+        f"{artifact.directory} was made with another configuration (hash {manifest.config_hash}, "
+        f"this run has {expected}): {difference}. Use that configuration, another --out, or delete that directory."
     )
 
 
@@ -291,7 +291,7 @@ def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
 
 
 def save_params(path: Path | str, pytree: Any) -> None:
-    """Writes a pytree of arrays (nested dicts, Flax or Brax parameters) as checksummed msgpack, atomically."""
+    """Writes a pytree of arrays (nested dicts, Flax or Brax parameters) as checksummed msgpack."""
     import jax
     import numpy as np
     from flax import serialization

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from ddgrasp import artifacts
 
 CURVES = "curves.jsonl"
+PICTURES = "pictures"
 _CLOCK = ".elapsed.json"
 _PLAIN_PERIOD_S = 15.0
 _CLOCK_PERIOD_S = 10.0
@@ -126,6 +127,21 @@ class Progress:
             self._writer = SummaryWriter(str(self.directory / "tb"))
         for name, value in plain.items():
             self._writer.add_scalar(name, value, int(step))
+
+    def picture(self, name: str, **panels: Any) -> None:
+        """Keeps images for the report, to be drawn side by side (see `evaluation/figures.py`).
+
+        Args:
+          name: file name without suffix; the report's title for it.
+          panels: title -> (H, W, 3) RGB, uint8 or in [0, 1]; (H, W) depth, uint16 millimetres or float metres,
+            0 = invalid. One more leading axis makes a film strip: frames from left to right, panels as rows.
+        """
+        if self.directory is None:
+            return
+        import numpy as np
+
+        with artifacts.atomic_path(self.directory / PICTURES / f"{name}.npz") as path:
+            np.savez_compressed(path, **{title: np.asarray(panel) for title, panel in panels.items()})
 
     def close(self) -> None:
         """Flushes the events and keeps the time spent, so that a later attempt adds to it."""

@@ -1,0 +1,147 @@
+"""The whole flow on one page: which stages there are, in which order, and what each is made from.
+
+Every stage is `<package>/stage.py` with
+
+    run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact
+
+It works in `run_dir / <stage>` and ends by writing its manifest (`artifacts.finish`). Packages are imported
+when their turn comes, so that `--help` needs none of them and the robot side never imports JAX.
+"""
+
+import importlib
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One box of the flow picture."""
+
+    name: str
+    """Also its directory under the run."""
+    package: str
+    """Its module is `<package>.stage`."""
+    parents: tuple[str, ...]
+    """Stages it is made from."""
+    makes: str
+    """What it leaves behind, for people."""
+
+
+STAGES = (
+    Stage("teacher", "ppo", (), "PPO policy on the privileged state"),
+    Stage("demos", "demos", ("teacher",), "successful teacher episodes with clean depth"),
+    Stage("record", "sensors", ("teacher",), "RGB-D recordings from the pseudo-real rig"),
+    Stage("ddg", "ddg_jax", ("record",), "diffusion model of the camera's errors"),
+    Stage("student", "student_jax", ("teacher", "demos", "ddg"), "depth-only diffusion policy"),
+    Stage("export", "export", ("student",), "one ONNX file, checked against JAX"),
+    Stage("deploy", "deploy", ("export",), "the exported student in the pseudo-real rig at 10 Hz"),
+)
+
+
+def run(
+    config: Config, run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES, quiet: bool = False
+) -> Path:
+    """Runs every stage that is not finished, then writes the report; returns the path of report.json.
+
+    Raises UserError if `run_dir` holds a run and `resume` is off, or holds one of another configuration.
+    """
+    if not resume:
+        _refuse_occupied(run_dir, [stage.name for stage in stages])
+    artifacts.atomic_write_json(run_dir / "config.json", config)
+    for stage in stages:
+        run_stage(stage, config, run_dir, resume=resume, quiet=quiet)
+    report = importlib.import_module("evaluation.stage")
+    return report.run(config, run_dir)
+
+
+def run_stage(stage: Stage, config: Config, run_dir: Path, *, resume: bool, quiet: bool = False) -> Artifact:
+    """Runs one stage, or returns the finished one if `resume` is on."""
+    directory = run_dir / stage.name
+    if not resume:
+        _refuse_occupied(run_dir, [stage.name])
+    parents = {name: artifacts.require(run_dir, name, config) for name in stage.parents}
+    progress = Progress(directory, stage.name, quiet=quiet)
+    if artifacts.is_finished(directory):
+        artifact = artifacts.read_artifact(directory)
+        artifacts.check_config(artifact, config)
+        _check_parents(artifact, parents)
+        progress.note(f"finished before ({artifact.manifest.seconds:.0f} s, {artifact.manifest.origin})")
+        return artifact
+    progress.note(f"-> {directory}: {stage.makes}")
+    directory.mkdir(parents=True, exist_ok=True)
+    with _interruptible(stage.name):
+        try:
+            module = importlib.import_module(f"{stage.package}.stage")
+            artifact = module.run(config, run_dir, resume=resume, progress=progress)
+        finally:
+            progress.close()
+    progress.note(f"finished in {artifact.manifest.seconds:.0f} s ({artifact.manifest.origin})")
+    return artifact
+
+
+def get_stage(name: str) -> Stage:
+    """The stage of that name."""
+    return next(stage for stage in STAGES if stage.name == name)
+
+
+def _refuse_occupied(run_dir: Path, names: Sequence[str]) -> None:
+    for name in names:
+        directory = run_dir / name
+        if artifacts.is_finished(directory):
+            raise UserError(
+                f"{directory} holds a finished stage: continue with --resume, or choose another --out."
+            )
+        if directory.is_dir() and any(directory.iterdir()):
+            raise UserError(
+                f"{directory} holds an unfinished stage: continue with --resume, or choose another --out."
+            )
+
+
+def _check_parents(artifact: Artifact, parents: dict[str, Artifact]) -> None:
+    for name, parent in parents.items():
+        made_from = artifact.manifest.parents.get(name, parent.hash)
+        if made_from != parent.hash:
+            raise UserError(
+                f"{artifact.directory} was made from another {name} ({made_from}; {parent.directory} is now "
+                f"{parent.hash}): delete {artifact.directory} to make it again, or choose another --out."
+            )
+
+
+@contextmanager
+def _interruptible(name: str) -> Iterator[None]:
+    """Turns Ctrl-C and SIGTERM into KeyboardInterrupt with a message, wherever in the stage they arrive.
+
+    A KeyboardInterrupt raised inside a JAX host callback surfaces as some other error; the flag tells.
+    """
+    arrived = False
+
+    def interrupt(signum, frame):
+        nonlocal arrived
+        arrived = True
+        raise KeyboardInterrupt
+
+    try:
+        previous = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not in the main thread: signals are someone else's
+        previous = {}
+    message = f"Interrupted in stage {name!r}. Finished work is kept: the same command with --resume goes on."
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(message) from None
+    except Exception:
+        if arrived:
+            raise KeyboardInterrupt(message) from None
+        raise
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
