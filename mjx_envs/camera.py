@@ -1,6 +1,7 @@
 """Pinhole cameras: where they stand and what they see. NumPy alone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,25 @@ class Camera:
     width_px: int
     T_world_cam: np.ndarray
     """(4, 4) pose of the camera in the world frame, metres."""
+
+    def cropped(self, row0: int, col0: int, height_px: int, width_px: int) -> "Camera":
+        """The camera that sees only the window whose first pixel is (row0, col0) of this one."""
+        return replace(
+            self, cx_px=self.cx_px - col0, cy_px=self.cy_px - row0, height_px=height_px, width_px=width_px
+        )
+
+
+class Buffers(NamedTuple):
+    """What a renderer returns; NumPy or JAX arrays, a batch may come first."""
+
+    depth_m: Any
+    """(H, W) float32 planar depth, metres; 0 where nothing is hit within the far limit."""
+    rgb: Any
+    """(H, W, 3) float32 in [0, 1], shaded; the background colour where nothing is hit."""
+    segmentation: Any
+    """(H, W) int32 geom id of the model, -1 where nothing is hit (not limited by far)."""
+    normal_w: Any
+    """(H, W, 3) float32 outward unit normal in the world frame, zero where nothing is hit."""
 
 
 def look_at(position_m, target_m) -> np.ndarray:
