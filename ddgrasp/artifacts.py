@@ -14,6 +14,7 @@ import json
 import os
 import platform
 import time
+import typing
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 
 MANIFEST = "manifest.json"
+STARTED = "started.json"
 
 STAGE_FIELDS: dict[str, tuple[str, ...]] = {
     "teacher": ("seed", "world", "teacher"),
@@ -247,22 +249,71 @@ def require(run_dir: Path | str, stage: str, config: Config) -> Artifact:
 
 def config_hash(config: Config, stage: str) -> str:
     """Hash over the parts of the configuration that `stage` depends on, and nothing else."""
-    relevant = _relevant(to_json(config), stage)
-    return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:16]
+    return _hash(_relevant(to_json(config), stage))
 
 
 def check_config(artifact: Artifact, config: Config) -> None:
     """UserError that names both values if `artifact` was made with another configuration than `config`."""
-    manifest = artifact.manifest
-    expected = config_hash(config, manifest.stage)
-    if manifest.config_hash == expected:
+    _check_same_config(artifact.directory, artifact.manifest.stage, artifact.manifest.config, config)
+
+
+def begin(directory: Path | str, stage: str, config: Config) -> None:
+    """Marks `directory` as the place where `stage` is being made with this configuration.
+
+    UserError if an unfinished attempt there used another configuration or contract version: its checkpoints
+    would not fit.
+    """
+    path = Path(directory) / STARTED
+    if path.exists():
+        started = read_json(path)
+        if started.get("contract_version") != contract.CONTRACT_VERSION:
+            raise UserError(
+                f"{directory} was begun with contract version {started.get('contract_version')}, this code "
+                f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
+            )
+        _check_same_config(Path(directory), stage, started.get("config", {}), config)
+    else:
+        atomic_write_json(path, {"contract_version": contract.CONTRACT_VERSION, "config": config})
+
+
+def _check_same_config(directory: Path, stage: str, made_with: Mapping[str, Any], config: Config) -> None:
+    there, here = _relevant(made_with, stage), _relevant(to_json(config), stage)
+    if there == here:
         return
-    there, here = (_relevant(value, manifest.stage) for value in (manifest.config, to_json(config)))
+    before, expected = _hash(there), _hash(here)
     difference = next(_differences(there, here), "a field that no longer exists")
     raise UserError(
-        f"{artifact.directory} was made with another configuration (hash {manifest.config_hash}, "
-        f"this run has {expected}): {difference}. Use that configuration, another --out, or delete that directory."
+        f"{directory} was made with another configuration (hash {before}, "
+        f"this run has {expected}): {difference}. Use that configuration, another --out, or delete the directory."
     )
+
+
+def config_from_json(value: Mapping[str, Any]) -> Config:
+    """The Config whose `to_json` is `value`: what a manifest's `config` holds.
+
+    Raises UserError if it has fields that this code does not know or lacks fields without default.
+    """
+    return _dataclass_from_json(Config, value, "config")
+
+
+def _dataclass_from_json(cls: type, value: Mapping[str, Any], name: str) -> Any:
+    types = typing.get_type_hints(cls)
+    fields = {field.name for field in dataclasses.fields(cls)}
+    if unknown := sorted(value.keys() - fields):
+        raise UserError(
+            f"{name} has no field {unknown[0]!r}: it was made by another version of this project."
+        )
+    arguments = {
+        key: _dataclass_from_json(types[key], item, f"{name}.{key}")
+        if dataclasses.is_dataclass(types[key])
+        else _to_tuple(item)
+        for key, item in value.items()
+    }
+    return cls(**arguments)
+
+
+def _to_tuple(value: Any) -> Any:
+    return tuple(_to_tuple(item) for item in value) if isinstance(value, list) else value
 
 
 def library_versions() -> dict[str, str]:
@@ -276,6 +327,10 @@ def library_versions() -> dict[str, str]:
 
 def _relevant(config: Mapping[str, Any], stage: str) -> dict[str, Any]:
     return {name: config.get(name) for name in STAGE_FIELDS[stage]}
+
+
+def _hash(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
@@ -49,18 +50,16 @@ STAGES = (
 
 def run(
     config: Config, run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES, quiet: bool = False
-) -> Path:
-    """Runs every stage that is not finished, then writes the report; returns the path of report.json.
+) -> dict[str, Any]:
+    """Runs every stage that is not finished, then writes the report; returns what report.json holds.
 
     Raises UserError if `run_dir` holds a run and `resume` is off, or holds one of another configuration.
     """
     if not resume:
         _refuse_occupied(run_dir, [stage.name for stage in stages])
-    artifacts.atomic_write_json(run_dir / "config.json", config)
     for stage in stages:
         run_stage(stage, config, run_dir, resume=resume, quiet=quiet)
-    report = importlib.import_module("evaluation.stage")
-    return report.run(config, run_dir)
+    return importlib.import_module("evaluation.stage").write_report(run_dir)
 
 
 def run_stage(stage: Stage, config: Config, run_dir: Path, *, resume: bool, quiet: bool = False) -> Artifact:
@@ -77,7 +76,7 @@ def run_stage(stage: Stage, config: Config, run_dir: Path, *, resume: bool, quie
         progress.note(f"finished before ({artifact.manifest.seconds:.0f} s, {artifact.manifest.origin})")
         return artifact
     progress.note(f"-> {directory}: {stage.makes}")
-    directory.mkdir(parents=True, exist_ok=True)
+    artifacts.begin(directory, stage.name, config)
     with _interruptible(stage.name):
         try:
             module = importlib.import_module(f"{stage.package}.stage")

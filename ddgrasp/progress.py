@@ -133,8 +133,8 @@ class Progress:
 
         Args:
           name: file name without suffix; the report's title for it.
-          panels: title -> (H, W, 3) RGB, uint8 or in [0, 1]; (H, W) depth, uint16 millimetres or float metres,
-            0 = invalid. One more leading axis makes a film strip: frames from left to right, panels as rows.
+          panels: title -> (H, W, 3) RGB, uint8 or in [0, 1]; (H, W) depth, uint16 millimetres or float
+            metres, 0 = invalid. One more leading axis makes a film strip: frames from left to right, panels as rows.
         """
         if self.directory is None:
             return

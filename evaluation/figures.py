@@ -1,0 +1,120 @@
+"""Pictures of a run, drawn with Matplotlib into PNG bytes. Depth has one colour map, invalid pixels a colour
+that is not in it."""
+
+import io
+from collections.abc import Mapping, Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from ddgrasp import contract
+
+DEPTH_COLORS = "viridis_r"
+INVALID_RGB = (1.0, 0.0, 1.0)
+"""Magenta: no depth is drawn in it."""
+
+
+def depth_to_metres(depth: np.ndarray) -> np.ndarray:
+    """Depth as float32 metres, 0 = invalid; integer input is millimetres, float input metres."""
+    metres = depth * contract.DEPTH_UNIT_M if np.issubdtype(depth.dtype, np.integer) else depth
+    return np.where(np.isfinite(metres), metres, 0.0).astype(np.float32)
+
+
+def depth_range_m(depths: Sequence[np.ndarray]) -> tuple[float, float]:
+    """(near, far) that shows most valid pixels of all `depths` (metres): 1st and 99th percentile."""
+    valid = np.concatenate([depth[depth > 0].ravel() for depth in depths]) if depths else np.empty(0)
+    if valid.size == 0:
+        return 0.0, 1.0
+    near, far = np.percentile(valid, (1, 99))
+    return float(near), float(max(far, near + 0.01))
+
+
+def color_depth(depth_m: np.ndarray, near_m: float, far_m: float) -> np.ndarray:
+    """(..., H, W) metres to (..., H, W, 3) RGB in [0, 1]; invalid pixels take INVALID_RGB."""
+    scaled = np.clip((depth_m - near_m) / (far_m - near_m), 0.0, 1.0)
+    rgb = matplotlib.colormaps[DEPTH_COLORS](scaled)[..., :3]
+    rgb[depth_m <= 0] = INVALID_RGB
+    return rgb
+
+
+def draw_panels(panels: Mapping[str, np.ndarray]) -> bytes:
+    """PNG of images side by side, all depth on one scale; see `Progress.picture` for what a panel may be."""
+    frames = {title: _as_frames(panel) for title, panel in panels.items()}
+    depths = [depth_to_metres(frame) for frame in frames.values() if frame.ndim == 3]
+    near, far = depth_range_m(depths)
+    strips = {
+        title: _to_rgb(frame) if frame.ndim == 4 else color_depth(depth_to_metres(frame), near, far)
+        for title, frame in frames.items()
+    }
+    longest = max(len(strip) for strip in strips.values())
+    if longest == 1:
+        figure = _grid([[strip[0] for strip in strips.values()]], list(strips), [""])
+    else:
+        figure = _grid([list(strip) for strip in strips.values()], [""] * longest, list(strips))
+    if depths:
+        _depth_legend(figure, near, far)
+    return _png(figure)
+
+
+def draw_curves(curves: Mapping[str, Sequence[tuple[int, float]]], columns: int = 4) -> bytes:
+    """PNG of small multiples, one per named curve of (step, value) points."""
+    rows = -(-len(curves) // columns)
+    figure = Figure(figsize=(3.1 * columns, 2.1 * rows), layout="constrained")
+    for index, (name, points) in enumerate(curves.items()):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        steps, values = zip(*points, strict=True)
+        axes.plot(steps, values, linewidth=1.3, marker="." if len(points) < 3 else "")
+        axes.set_title(name, fontsize=9)
+        axes.tick_params(labelsize=7)
+        axes.grid(alpha=0.3)
+    return _png(figure)
+
+
+def _as_frames(panel: np.ndarray) -> np.ndarray:
+    """(T, H, W, 3) RGB or (T, H, W) depth."""
+    panel = np.asarray(panel)
+    is_rgb = panel.ndim >= 3 and panel.shape[-1] == 3
+    if panel.ndim not in ((3, 4) if is_rgb else (2, 3)):
+        raise ValueError(f"picture panel of shape {panel.shape}; expected (T,) (H, W) depth or (H, W, 3) RGB")
+    single = 3 if is_rgb else 2
+    return panel[None] if panel.ndim == single else panel
+
+
+def _to_rgb(frames: np.ndarray) -> np.ndarray:
+    return frames / 255.0 if frames.dtype == np.uint8 else np.clip(frames, 0.0, 1.0)
+
+
+def _grid(rows: list[list[np.ndarray]], titles: list[str], labels: list[str]) -> Figure:
+    columns = max(len(row) for row in rows)
+    height, width = rows[0][0].shape[:2]
+    panel_in = max(1.3, min(3.4, 13.0 / columns))
+    figure = Figure(
+        figsize=(panel_in * columns, (panel_in * height / width + 0.25) * len(rows) + 0.5),
+        layout="constrained",
+    )
+    for r, row in enumerate(rows):
+        for c, image in enumerate(row):
+            axes = figure.add_subplot(len(rows), columns, r * columns + c + 1)
+            axes.imshow(image, interpolation="nearest")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            axes.set_title(titles[c] if r == 0 else "", fontsize=9)
+            axes.set_ylabel(labels[r] if c == 0 else "", fontsize=9)
+    return figure
+
+
+def _depth_legend(figure: Figure, near_m: float, far_m: float) -> None:
+    scale = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(near_m, far_m), DEPTH_COLORS)
+    bar = figure.colorbar(scale, ax=figure.axes, fraction=0.02, pad=0.01)
+    bar.set_label("depth (m)", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+    patch = Patch(color=INVALID_RGB, label="no depth")
+    figure.legend(handles=[patch], loc="outside lower right", fontsize=8, frameon=False)
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    return buffer.getvalue()
