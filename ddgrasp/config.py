@@ -6,6 +6,60 @@ from ddgrasp import contract
 
 
 @dataclass(frozen=True)
+class RewardConfig:
+    """Weights of the reward terms (paper Eq. 2 and its terms; `ours` marks what the paper lacks)."""
+
+    reach: float = 5.0
+    """w1, per metre."""
+    lift: float = 10.0
+    """w2, per metre."""
+    orient: float = 0.5
+    """w3, per radian, once lifted."""
+    accel: float = 3e-4
+    """w4, per (rad/s^2)^2."""
+    bonus_base: float = 1.1
+    """c1 > 1."""
+    bonus_growth: float = 1.08
+    """c2 > 1."""
+    bonus_max_count: int = 10
+    """N_success is capped here, which keeps the bonus finite."""
+    align: float = 0.5
+    """Ours: per radian of misalignment with the grasp pose removed before the lift."""
+    saturation: float = 0.05
+    """Ours: penalty on the squared part of an action beyond 0.8 of its range."""
+    toggle: float = 0.05
+    """Ours: penalty on each change of the gripper's command."""
+
+
+@dataclass(frozen=True)
+class RandomConfig:
+    """Half-ranges of the randomisation, uniform, drawn once per episode (paper III-C1)."""
+
+    joint_rad: float = 0.1
+    """Initial arm joints around home."""
+    size: float = 0.05
+    """Relative size of the object."""
+    object_mass: float = 0.3
+    """Relative."""
+    object_friction: float = 0.2
+    """Relative."""
+    link_mass: float = 0.1
+    """Relative, each link."""
+    damping: float = 0.3
+    """Relative joint damping, each joint."""
+    friction_nm: float = 0.3
+    """Joint dry friction in [0, friction_nm], each joint."""
+    stiffness: float = 0.1
+    """Relative gain of the joint position controllers, each joint."""
+    camera_position_m: float = 0.01
+    """Each axis."""
+    camera_angle_rad: float = 0.015
+    """Each axis."""
+    crop_px: int = 24
+    """Shift of the crop window at scale 1, each axis."""
+
+
+@dataclass(frozen=True)
 class WorldConfig:
     """Scene, objects, randomisation."""
 
@@ -19,6 +73,8 @@ class WorldConfig:
     """Physics time step."""
     camera_scale: float = 0.25
     """Size of the depth camera's picture relative to 1280 x 720."""
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    random: RandomConfig = field(default_factory=RandomConfig)
 
     @property
     def profile(self) -> contract.CameraProfile:
@@ -30,6 +86,36 @@ class WorldConfig:
 class TeacherConfig:
     """PPO on the privileged state."""
 
+    total_steps: int = 4_000_000
+    """Control steps of experience."""
+    num_envs: int = 512
+    """Environments stepped together."""
+    unroll_steps: int = 20
+    """Control steps between updates."""
+    minibatches: int = 8
+    """Gradient steps per epoch; must divide num_envs."""
+    epochs: int = 4
+    """Passes over each batch of experience."""
+    learning_rate: float = 1e-3
+    """Adam's step size at the start; decays linearly to a tenth."""
+    discount: float = 0.97
+    gae_lambda: float = 0.95
+    entropy_cost: float = 2e-3
+    clip: float = 0.2
+    """PPO's clipping range."""
+    reward_scaling: float = 0.1
+    max_grad_norm: float = 1.0
+    hidden: tuple[int, ...] = (256, 128)
+    """Layers of policy and value networks."""
+    eval_every: int = 20
+    """Updates between deterministic evaluations."""
+    checkpoint_every: int = 20
+    """Updates between whole-state checkpoints."""
+    stop_at: float = 1.0
+    """End early once two evaluations in a row reach this success rate."""
+    init_from: str = ""
+    """Run directory or pretrained folder whose teacher to load instead of training; empty trains."""
+
 
 @dataclass(frozen=True)
 class DemosConfig:
@@ -37,8 +123,68 @@ class DemosConfig:
 
 
 @dataclass(frozen=True)
+class StereoConfig:
+    """The rig's active-stereo camera: projector, imagers, matcher (sensors/active_stereo.py)."""
+
+    # --- projector ---
+    projector_position: float = 0.6
+    """Where the projector sits between the left (0) and the right (1) imager."""
+    dots: int = 7000
+    """Dots of the pattern in the imager's field of view."""
+    dot_radius_px: float = 0.55
+    """Gaussian radius of a dot in pixels of the imager, its own blur included."""
+    projector_power: float = 1.8
+    """Irradiance of a dot's centre at one metre, relative to the ambient light's."""
+    pattern_seed: int = 455
+    """The pattern belongs to the device: the same in every frame."""
+    # --- imagers ---
+    exposure_target: float = 0.35
+    """Mean grey level the automatic exposure aims at, as a fraction of full scale."""
+    full_well_electrons: float = 8000.0
+    """Electrons at full scale: shot noise."""
+    read_noise: float = 0.005
+    """Standard deviation of read noise as a fraction of full scale."""
+    lens_blur_px: float = 0.45
+    """Gaussian blur of the lens, pixels."""
+    # --- matcher ---
+    min_range_m: float = 0.35
+    """Nearer surfaces exceed the disparity search and are invalid."""
+    max_range_m: float = 6.0
+    """Farther depth is reported as invalid."""
+    block_px: int = 3
+    """Matching window of the semi-global matcher."""
+    smoothness: float = 1.0
+    """Scales the semi-global matcher's two penalties (8 and 32 per pixel of the window)."""
+    uniqueness_percent: int = 8
+    """The best match must beat the second by this margin."""
+    left_right_px: int = 1
+    """Largest disagreement of the left-right check, pixels."""
+    speckle_px: int = 16
+    """Smaller islands of disparity are removed."""
+    residual_limit: float = 0.8
+    """Largest matching residual relative to the local contrast of both images; 1.4 is pure noise."""
+    refine_window_px: int = 5
+    """Window of the sub-pixel step."""
+    subpixel_steps: int = 32
+    """Disparity is reported in 1/32 of a pixel, as D4xx cameras do."""
+
+
+@dataclass(frozen=True)
 class RecordConfig:
     """RGB-D recordings from the pseudo-real rig, and the rig's stereo camera."""
+
+    trajectories: int = 24
+    """Recorded episodes of the teacher, objects in turn."""
+    frames: int = 60
+    """Frames per trajectory, at the control rate."""
+    camera_position_jitter_m: float = 0.05
+    """Half width of the camera's uniform displacement per trajectory."""
+    camera_aim_jitter_m: float = 0.04
+    """Half width of the uniform displacement of the point it looks at."""
+    camera_roll_jitter_rad: float = 0.05
+    """Half width of its uniform roll."""
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    """The camera itself."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,349 @@
+"""An active-stereo depth camera (D4xx kind): two infrared pictures, a dot projector, a matcher.
+
+Infrared pictures are shaded from rendered depth, normals and materials under the projector's
+pattern (with its own shadow test) and ambient light; OpenCV's semi-global matcher turns them into
+disparity. Holes, edge fattening and range-dependent noise come out of the matching; no noise is
+ever added to depth. NumPy and OpenCV alone.
+
+Frames: camera = left imager (a D4xx's depth frame); the right imager and the projector stand
+beside it along +x with parallel axes. Depth is planar.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ddgrasp.config import StereoConfig
+from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
+from mjx_envs.camera import Buffers, Camera
+
+Render = Callable[[Camera], Buffers]
+RenderDepth = Callable[[Camera], np.ndarray]
+
+LAMP_POSITION_W_M = (0.3, -0.8, 2.2)
+"""Centre of the room's lamp, world frame."""
+LAMP_SHARE = 0.35
+"""Share of the ambient light that comes from the lamp; the rest comes evenly from everywhere."""
+SHININESS_DOUBLINGS = 6
+"""Blinn-Phong exponent 2**6 = 64, so that the highlight is a few squarings."""
+SHADOW_BIAS_M = 0.012
+"""A point this much behind the projector's own depth map lies in shadow."""
+PROJECTOR_MARGIN = 1.1
+"""The projector lights a field this much wider than the imagers'."""
+PROJECTOR_FALLOFF = 1.5
+"""Exponent of the cosine by which the projector dims towards its edges."""
+VIGNETTING = 2.5
+"""Exponent of the cosine by which a lens dims towards its edges (4 for a simple one)."""
+TEXELS_PER_PX = 3
+"""Resolution of the stored pattern."""
+TEXTURE_PX, TEXTURE_PX_PER_M = 512, 400.0
+"""Size and scale of the albedo texture that `Material.texture` weighs (a 1.3 m tile)."""
+CONTRAST_WINDOW_PX = 9
+
+
+@dataclass(frozen=True)
+class Material:
+    """How a surface looks in the near infrared."""
+
+    albedo: float
+    """Diffuse reflectance, 0 to 1."""
+    specular: float = 0.05
+    """Strength of the highlight relative to a white diffuse surface."""
+    texture: float = 0.0
+    """Relative contrast of its albedo texture (for geoms that do not move)."""
+
+    @classmethod
+    def from_rgb(cls, rgb, specular: float = 0.05, texture: float = 0.0) -> "Material":
+        """Near-infrared reflectance follows red more than green and blue."""
+        red, green, blue = (float(c) for c in rgb[:3])
+        return cls(0.05 + 0.9 * (0.7 * red + 0.2 * green + 0.1 * blue), specular, texture)
+
+
+class ActiveStereo:
+    """Depth as an active-stereo camera reports it, at any scale of a camera profile.
+
+    The pattern and the matcher are made once; frames differ by the generator given to `sense`.
+    """
+
+    def __init__(self, config: StereoConfig, profile: CameraProfile):
+        self.config = config
+        self.profile = profile
+        p = profile
+        self._x = ((np.arange(p.width_px) + 0.5 - p.cx_px) / p.fx_px).astype(np.float32)[None, :]
+        self._y = ((np.arange(p.height_px) + 0.5 - p.cy_px) / p.fy_px).astype(np.float32)[:, None]
+        # The ray's z is 1, so cos = 1 / |ray|.
+        self._vignetting = (1.0 + self._x**2 + self._y**2) ** np.float32(-VIGNETTING / 2)
+        self._projector = _projector_profile(profile)
+        self._pattern = _dot_pattern(config, profile, self._projector)
+        self._texture = _albedo_texture(config.pattern_seed)
+        self._fb_px_m = p.fx_px * p.baseline_m
+        self._disparities = 16 * math.ceil(self._fb_px_m / config.min_range_m / 16)
+        self._matcher = _matcher(config, self._disparities)
+
+    def sense(
+        self,
+        render: Render,
+        T_world_cam: np.ndarray,
+        rng: np.random.Generator,
+        materials: Mapping[int, Material] | None = None,
+        render_depth: RenderDepth | None = None,
+    ) -> np.ndarray:
+        """(H, W) uint16 planar depth in millimetres, 0 = invalid, in the left imager's frame.
+
+        Args:
+            render: draws the scene as it stands for a pinhole camera; called for both imagers.
+            T_world_cam: (4, 4) pose of the left imager.
+            rng: sensor noise.
+            materials: by geom id; others are guessed from the rendered colour.
+            render_depth: depth alone, for the projector's shadow map (default: from `render`).
+        """
+        left, right = self.infrared(render, T_world_cam, rng, materials, render_depth)
+        return self.depth_mm(self.disparity(left, right))
+
+    def camera(self, T_world_cam: np.ndarray) -> Camera:
+        """The left imager, in whose frame depth is reported."""
+        return _camera(self.profile, T_world_cam, 0.0)
+
+    def infrared(
+        self,
+        render: Render,
+        T_world_cam: np.ndarray,
+        rng: np.random.Generator,
+        materials: Mapping[int, Material] | None = None,
+        render_depth: RenderDepth | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Left and right infrared pictures, (H, W) uint8."""
+        baseline = self.profile.baseline_m
+        projector_m = self.config.projector_position * baseline
+        projector = _camera(self._projector, T_world_cam, projector_m)
+        lit_m = render_depth(projector) if render_depth else render(projector).depth_m
+        lit_m = np.where(lit_m > 0, lit_m, np.float32(1e3)).astype(np.float32)
+        images = []
+        for imager_m in (0.0, baseline):
+            buffers = render(_camera(self.profile, T_world_cam, imager_m))
+            images.append(
+                self._radiance(buffers, T_world_cam, imager_m, projector_m - imager_m, lit_m, materials)
+            )
+        exposure = self.config.exposure_target / max(float(images[0].mean()), 1e-6)
+        return tuple(self._expose(image, exposure, rng) for image in images)
+
+    def disparity(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """(H, W) float32 disparity of the left picture in pixels, 0 = no match."""
+        pad = self._disparities
+        padded = [cv2.copyMakeBorder(i, 0, 0, pad, 0, cv2.BORDER_REFLECT) for i in (left, right)]
+        coarse = self._matcher.compute(*padded)[:, pad:].astype(np.float32) / 16.0
+        columns = np.arange(self.profile.width_px, dtype=np.float32)[None, :]
+        # The left band has no counterpart in the right picture.
+        valid = (coarse > 0) & (columns - coarse >= 0)
+        fine, residual = _refine(
+            left.astype(np.float32), right.astype(np.float32), coarse, self.config.refine_window_px
+        )
+        valid &= residual < self.config.residual_limit
+        steps = self.config.subpixel_steps
+        return np.where(valid, np.rint(fine * steps) / steps, 0).astype(np.float32)
+
+    def depth_mm(self, disparity_px: np.ndarray) -> np.ndarray:
+        """(H, W) uint16 millimetres from disparity; out-of-range becomes 0."""
+        depth_m = self._fb_px_m / np.maximum(disparity_px, 1e-3)
+        valid = (
+            (disparity_px > 0) & (depth_m >= self.config.min_range_m) & (depth_m <= self.config.max_range_m)
+        )
+        return np.where(valid, np.rint(depth_m / DEPTH_UNIT_M), 0).astype(np.uint16)
+
+    def _radiance(
+        self,
+        buffers: Buffers,
+        T_world_cam: np.ndarray,
+        imager_m: float,
+        projector_m: float,
+        lit_m: np.ndarray,
+        materials: Mapping[int, Material] | None,
+    ) -> np.ndarray:
+        """(H, W) radiance of one imager, arbitrary units. Points and normals in that imager's frame.
+
+        `projector_m` is the projector's x in the imager's frame.
+        """
+        z = buffers.depth_m
+        x_z, y_z = self._x * z, self._y * z
+        R_world_cam = T_world_cam[:3, :3].astype(np.float32)
+        normal = np.moveaxis(buffers.normal_w @ R_world_cam, -1, 0)
+        T_world_imager = _beside(T_world_cam, imager_m)
+        lamp = R_world_cam.T @ (
+            np.array(LAMP_POSITION_W_M, np.float32) - T_world_imager[:3, 3].astype(np.float32)
+        )
+        albedo, specular = self._surface(buffers, x_z, y_z, z, T_world_imager, materials)
+        view = _unit(-x_z, -y_z, -z)[0]
+
+        to_projector, range_m = _unit(projector_m - x_z, -y_z, -z)
+        dots = self._dots(x_z - projector_m, y_z, z, lit_m)
+        dots *= self.config.projector_power / np.maximum(range_m, 0.1) ** 2
+        diffuse, highlight = _reflect(normal, to_projector, view)
+        radiance = dots * (albedo * diffuse + specular * highlight)
+
+        to_lamp, _ = _unit(lamp[0] - x_z, lamp[1] - y_z, lamp[2] - z)
+        diffuse, highlight = _reflect(normal, to_lamp, view)
+        radiance += LAMP_SHARE * (albedo * diffuse + specular * highlight)
+        radiance += (1.0 - LAMP_SHARE) * albedo
+        return np.where(z > 0, radiance, np.float32(0.05)) * self._vignetting
+
+    def _surface(self, buffers, x_z, y_z, z, T_world_imager, materials) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W) albedo and specular strength per pixel."""
+        rgb = buffers.rgb
+        default = Material.from_rgb((0.5, 0.5, 0.5))
+        ids = buffers.segmentation
+        count = max(int(ids.max()), max(materials or (0,))) + 2
+        table = np.tile(np.float32([-1.0, default.specular, 0.0]), (count, 1))
+        for geom, material in (materials or {}).items():
+            table[geom + 1] = material.albedo, material.specular, material.texture
+        albedo, specular, texture = (column[ids + 1] for column in table.T.copy())
+        unknown = albedo < 0
+        if unknown.any():
+            albedo[unknown] = 0.05 + 0.9 * (rgb[unknown] @ np.float32([0.7, 0.2, 0.1]))
+        if table[:, 2].any():
+            T = (T_world_imager * TEXTURE_PX_PER_M).astype(np.float32)
+            u, v = (T[i, 0] * x_z + T[i, 1] * y_z + T[i, 2] * z + T[i, 3] for i in (0, 1))
+            albedo *= 1.0 + texture * cv2.remap(
+                self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+            )
+        return np.clip(albedo, 0.0, 1.0), specular
+
+    def _dots(self, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, lit_m: np.ndarray) -> np.ndarray:
+        """(H, W) brightness of the pattern on points given in the projector's frame; 0 in shadow."""
+        p = self._projector
+        inverse = 1.0 / np.maximum(z_m, np.float32(1e-3))
+        u = x_m * inverse * np.float32(p.fx_px) + np.float32(p.cx_px - 0.5)
+        v = y_m * inverse * np.float32(p.fy_px) + np.float32(p.cy_px - 0.5)
+        nearest_m = cv2.remap(lit_m, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        t = np.float32(TEXELS_PER_PX)
+        shift = np.float32((TEXELS_PER_PX - 1) / 2)
+        dots = cv2.remap(self._pattern, u * t + shift, v * t + shift, cv2.INTER_LINEAR)
+        return np.where(z_m > nearest_m + SHADOW_BIAS_M, np.float32(0), dots)
+
+    def _expose(self, radiance: np.ndarray, exposure: float, rng: np.random.Generator) -> np.ndarray:
+        """(H, W) uint8: blur of the lens, shot and read noise, saturation, quantisation."""
+        c = self.config
+        if c.lens_blur_px > 0:
+            radiance = cv2.GaussianBlur(radiance, (5, 5), c.lens_blur_px)
+        signal = np.minimum(radiance * np.float32(exposure), 1.0)
+        sigma = np.sqrt(signal / np.float32(c.full_well_electrons) + np.float32(c.read_noise**2))
+        noise = rng.standard_normal(signal.shape, dtype=np.float32)
+        return np.clip(255.0 * (signal + sigma * noise) + 0.5, 0, 255).astype(np.uint8)
+
+
+def _beside(T_world_cam: np.ndarray, x_m: float) -> np.ndarray:
+    T = np.array(T_world_cam, float)
+    T[:3, 3] += x_m * T[:3, 0]
+    return T
+
+
+def _camera(profile: CameraProfile, T_world_cam: np.ndarray, x_m: float) -> Camera:
+    """The pinhole `x_m` to the right of T_world_cam, axes parallel."""
+    p = profile
+    T = _beside(T_world_cam, x_m)
+    return Camera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.height_px, p.width_px, T)
+
+
+def _projector_profile(profile: CameraProfile) -> CameraProfile:
+    """A pinhole with the imager's focal length and a wider picture."""
+    width = 2 * round(profile.width_px * PROJECTOR_MARGIN / 2)
+    height = 2 * round(profile.height_px * PROJECTOR_MARGIN / 2)
+    return replace(profile, width_px=width, height_px=height, cx_px=width / 2, cy_px=height / 2)
+
+
+def _dot_pattern(config: StereoConfig, profile: CameraProfile, projector: CameraProfile) -> np.ndarray:
+    """(h, w) float32 pattern, 1 at the centre of a lone dot, dimming towards the edges.
+
+    Dots are Gaussians as wide as the imager resolves, so sampling the texture does not alias.
+    """
+    rng = np.random.default_rng(config.pattern_seed)
+    area = projector.width_px * projector.height_px / (profile.width_px * profile.height_px)
+    count = round(config.dots * area)
+    height, width = projector.height_px * TEXELS_PER_PX, projector.width_px * TEXELS_PER_PX
+    texture = np.zeros((height, width), np.float32)
+    rows, columns = rng.integers(0, height, count), rng.integers(0, width, count)
+    np.add.at(texture, (rows, columns), rng.uniform(0.6, 1.0, count).astype(np.float32))
+    sigma = config.dot_radius_px * TEXELS_PER_PX
+    texture = cv2.GaussianBlur(texture, (0, 0), sigma) * (2 * math.pi * sigma**2)
+    x = ((np.arange(width) + 0.5) / TEXELS_PER_PX - projector.cx_px) / projector.fx_px
+    y = ((np.arange(height) + 0.5) / TEXELS_PER_PX - projector.cy_px) / projector.fy_px
+    cosine = 1.0 / np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
+    return (np.minimum(texture, 2.0) * cosine**PROJECTOR_FALLOFF).astype(np.float32)
+
+
+def _albedo_texture(seed: int) -> np.ndarray:
+    """(T, T) float32 noise of unit variance over several octaves, seamless."""
+    rng = np.random.default_rng(seed)
+    frequency = np.hypot(*np.meshgrid(*[np.fft.fftfreq(TEXTURE_PX)] * 2))
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.fft2(rng.standard_normal((TEXTURE_PX, TEXTURE_PX))) / frequency
+    noise = np.fft.ifft2(spectrum).real
+    return (noise / noise.std()).astype(np.float32)
+
+
+def _matcher(config: StereoConfig, disparities: int) -> cv2.StereoSGBM:
+    area = config.block_px**2
+    return cv2.StereoSGBM_create(
+        minDisparity=0,
+        numDisparities=disparities,
+        blockSize=config.block_px,
+        P1=round(8 * area * config.smoothness),
+        P2=round(32 * area * config.smoothness),
+        disp12MaxDiff=config.left_right_px,
+        preFilterCap=31,
+        uniquenessRatio=config.uniqueness_percent,
+        speckleWindowSize=config.speckle_px,
+        speckleRange=1,
+        mode=cv2.STEREO_SGBM_MODE_SGBM,
+    )
+
+
+def _unit(x, y, z) -> tuple[np.ndarray, np.ndarray]:
+    """((3, H, W) unit vectors, (H, W) lengths)."""
+    vector = np.stack([x, y, z])
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    return vector / np.maximum(length, np.float32(1e-6)), length
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _reflect(normal, to_light, to_view) -> tuple[np.ndarray, np.ndarray]:
+    """Lambert's cosine and the Blinn-Phong highlight, (H, W) each."""
+    diffuse = np.maximum(_dot(normal, to_light), 0)
+    half = to_light + to_view
+    squared = np.maximum(_dot(normal, half), 0) ** 2 / np.maximum(_dot(half, half), np.float32(1e-6))
+    for _ in range(SHININESS_DOUBLINGS - 1):
+        squared = squared * squared
+    return diffuse, squared * (diffuse > 0)
+
+
+def _refine(
+    left: np.ndarray, right: np.ndarray, coarse_px: np.ndarray, window_px: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """One Gauss-Newton step on the windowed squared difference (Lucas and Kanade 1981).
+
+    The semi-global matcher interpolates its cost by a parabola in 1/16 px, which pulls towards
+    whole pixels; this step measures the remainder on the pictures themselves.
+
+    Returns:
+        (H, W) disparity in pixels, moved by at most half a pixel; (H, W) residual relative to the
+        local contrast: near 0 for a perfect match, 1.4 for unrelated pictures.
+    """
+    left = left - cv2.blur(left, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX))
+    right = right - cv2.blur(right, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX))
+    gradient = cv2.Sobel(right, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+    rows, columns = np.indices(left.shape, dtype=np.float32)
+    at = columns - coarse_px
+    matched = cv2.remap(right, at, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    slope = cv2.remap(gradient, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    window = (window_px, window_px)
+    difference = left - matched
+    # d(matched)/d(disparity) = -slope, hence the sign.
+    step = -cv2.blur(slope * difference, window) / (cv2.blur(slope * slope, window) + 1e-3)
+    energy = 0.5 * cv2.blur(left * left + matched * matched, window) + 1e-3
+    residual = np.sqrt(cv2.blur(difference * difference, window) / energy)
+    return coarse_px + np.clip(step, -0.5, 0.5), residual

@@ -1,0 +1,100 @@
+"""What a depth stream's defects measure: holes, their sizes, temporal noise, flicker. NumPy and OpenCV.
+
+All functions take (T, H, W) or (H, W) uint16 millimetres with 0 = invalid.
+"""
+
+from dataclasses import asdict, dataclass
+
+import cv2
+import numpy as np
+
+RANGE_TOLERANCE = 0.1
+"""A pixel belongs to a range if its median depth is within 10 % of it."""
+STEADY_FRACTION = 0.8
+"""Temporal deviation is taken over pixels valid in at least this share of the frames."""
+
+
+@dataclass(frozen=True)
+class DepthStatistics:
+    """Defects of a depth stream, averaged over its frames."""
+
+    frames: int
+    invalid_fraction: float
+    """Share of invalid pixels."""
+    hole_components: float
+    """8-connected invalid regions per frame."""
+    hole_median_px: float
+    """Median region size."""
+    left_band_px: float
+    """Width of the left band in which most rows are invalid."""
+    temporal_deviation_mm: float
+    """Median over pixels of the standard deviation over time, at `temporal_range_mm` (static scene)."""
+    flicker_fraction: float
+    """Share of pixels that change validity between consecutive frames."""
+    temporal_range_mm: float = 750.0
+
+    def as_dict(self) -> dict[str, float]:
+        return asdict(self)
+
+
+def measure(depth_mm: np.ndarray, range_mm: float = 750.0) -> DepthStatistics:
+    """Statistics of a (T, H, W) stream; the temporal ones assume a static scene and camera."""
+    sizes = [hole_sizes_px(frame) for frame in depth_mm]
+    every = np.concatenate(sizes) if sizes else np.zeros(0)
+    return DepthStatistics(
+        frames=len(depth_mm),
+        invalid_fraction=float(np.mean(depth_mm == 0)),
+        hole_components=float(np.mean([len(s) for s in sizes])),
+        hole_median_px=float(np.median(every)) if len(every) else 0.0,
+        left_band_px=float(np.mean([left_band_px(frame) for frame in depth_mm])),
+        temporal_deviation_mm=temporal_deviation_mm(depth_mm, range_mm),
+        flicker_fraction=flicker_fraction(depth_mm),
+        temporal_range_mm=range_mm,
+    )
+
+
+def hole_sizes_px(depth_mm: np.ndarray, connectivity: int = 8) -> np.ndarray:
+    """(n,) pixel counts of the connected invalid regions of one (H, W) frame."""
+    holes = (depth_mm == 0).astype(np.uint8)
+    _, _, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=connectivity)
+    return stats[1:, cv2.CC_STAT_AREA]
+
+
+def left_band_px(depth_mm: np.ndarray) -> int:
+    """Leading columns of one (H, W) frame of which more than half the pixels are invalid."""
+    valid_columns = np.flatnonzero(np.mean(depth_mm == 0, axis=0) <= 0.5)
+    return int(valid_columns[0]) if len(valid_columns) else depth_mm.shape[1]
+
+
+def flicker_fraction(depth_mm: np.ndarray) -> float:
+    """Share of pixels of a (T, H, W) stream that change validity from one frame to the next."""
+    valid = depth_mm > 0
+    return float(np.mean(valid[1:] != valid[:-1])) if len(depth_mm) > 1 else float("nan")
+
+
+def temporal_deviation_mm(depth_mm: np.ndarray, range_mm: float = 750.0) -> float:
+    """Median over pixels near `range_mm` of the deviation over time; nan if there are none."""
+    if len(depth_mm) < 2:
+        return float("nan")
+    values = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float32)
+    steady = np.mean(depth_mm > 0, axis=0) >= STEADY_FRACTION
+    values = values[:, steady]
+    middle = np.nanmedian(values, axis=0)
+    near = np.abs(middle - range_mm) <= RANGE_TOLERANCE * range_mm
+    if not near.any():
+        return float("nan")
+    return float(np.median(np.nanstd(values[:, near], axis=0, ddof=1)))
+
+
+def decimated(depth_mm: np.ndarray, factor: int) -> np.ndarray:
+    """(H / factor, W / factor) median of the valid pixels per cell, as a D4xx's decimation filter.
+
+    A cell without valid pixels is invalid. Rows and columns that do not fill a cell are dropped.
+    """
+    height, width = (size // factor * factor for size in depth_mm.shape)
+    cells = depth_mm[:height, :width].reshape(height // factor, factor, width // factor, factor)
+    cells = np.sort(cells.transpose(0, 2, 1, 3).reshape(height // factor, width // factor, -1), axis=-1)
+    valid = np.count_nonzero(cells, axis=-1)
+    index = cells.shape[-1] - valid + (valid - 1) // 2
+    picked = np.take_along_axis(cells, np.minimum(index, cells.shape[-1] - 1)[..., None], axis=-1)[..., 0]
+    return np.where(valid > 0, picked, 0).astype(np.uint16)
