@@ -1,0 +1,83 @@
+"""Joint-state stream and the network that predicts the noise in an action chunk (Ho et al., 2020, eq. 14)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+
+from ddgrasp import contract
+from ddgrasp.config import StudentConfig
+from ddgrasp.errors import unknown_name
+
+CONDITIONINGS = ("film", "concat")
+MAX_PERIOD = 10_000.0
+STATE_LOWER = np.array([*contract.JOINT_LOWER_RAD, 0.0], np.float32)
+STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M], np.float32)
+
+
+def normalise_state(state: jax.Array) -> jax.Array:
+    """(B, 8) seven joints (rad) and gripper width (m) to [-1, 1] between their limits."""
+    return 2.0 * (state - STATE_LOWER) / (STATE_UPPER - STATE_LOWER) - 1.0
+
+
+def time_frequencies(features: int) -> np.ndarray:
+    """(features / 2,) float32 angular frequencies of the sinusoidal embedding (Vaswani et al., 2017, 3.5)."""
+    half = features // 2
+    return np.exp(-np.log(MAX_PERIOD) * np.arange(half) / half).astype(np.float32)
+
+
+def embed_time(k: jax.Array, features: int) -> jax.Array:
+    """(B,) diffusion steps to (B, features): sines, then cosines."""
+    angles = k.astype(jnp.float32)[:, None] * time_frequencies(features)
+    return jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], axis=-1)
+
+
+class StateStream(nn.Module):
+    """(B, 8) joint state to (B, state_features)."""
+
+    config: StudentConfig
+
+    @nn.compact
+    def __call__(self, state: jax.Array) -> jax.Array:
+        x = nn.relu(nn.Dense(self.config.state_features, name="first")(normalise_state(state)))
+        return nn.relu(nn.Dense(self.config.state_features, name="second")(x))
+
+
+class DenoiserBlock(nn.Module):
+    """x + W2 silu(film(W1 layernorm(x)))."""
+
+    width: int
+    film: bool
+
+    @nn.compact
+    def __call__(self, x: jax.Array, condition: jax.Array) -> jax.Array:
+        y = nn.Dense(self.width, name="first")(nn.LayerNorm(epsilon=1e-5, name="norm")(x))
+        if self.film:
+            scale, shift = jnp.split(nn.Dense(2 * self.width, name="film")(condition), 2, axis=-1)
+            y = y * (1.0 + scale) + shift
+        return x + nn.Dense(self.width, name="second")(nn.silu(y))
+
+
+class Denoiser(nn.Module):
+    """Predicted noise of a chunk of actions, given the diffusion step and what the policy sees."""
+
+    config: StudentConfig
+
+    @nn.compact
+    def __call__(self, noisy_action: jax.Array, k: jax.Array, cond: jax.Array) -> jax.Array:
+        """(B, chunk, 8), (B,) int, (B, D) -> (B, chunk, 8)."""
+        config = self.config
+        if config.conditioning not in CONDITIONINGS:
+            raise unknown_name("student conditioning", config.conditioning, CONDITIONINGS)
+        film = config.conditioning == "film"
+        embedded = nn.Dense(config.time_features, name="time_first")(embed_time(k, config.time_features))
+        embedded = nn.Dense(config.time_features, name="time_second")(nn.silu(embedded))
+        condition = jnp.concatenate([cond, embedded], axis=-1)
+        x = noisy_action.reshape(noisy_action.shape[0], -1)
+        x = x if film else jnp.concatenate([x, condition], axis=-1)
+        x = nn.Dense(config.denoiser_width, name="input")(x)
+        for index in range(config.denoiser_blocks):
+            x = DenoiserBlock(config.denoiser_width, film, name=f"block{index}")(x, condition)
+        x = nn.silu(nn.LayerNorm(epsilon=1e-5, name="norm")(x))
+        x = nn.Dense(config.chunk * contract.ACTION_SIZE, name="output", kernel_init=nn.initializers.zeros)(x)
+        return x.reshape(noisy_action.shape)

@@ -1,0 +1,64 @@
+"""Action diffusion: forward process and deterministic sampler, one equation per function.
+
+`alpha_bar` is the cumulative product of (1 - beta); steps are counted k = 0 .. K-1.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def cosine_alpha_bar(steps: int) -> np.ndarray:
+    """(K,) float32 squared-cosine schedule (Nichol and Dhariwal, 2021, eq. 17; beta <= 0.999)."""
+    f = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * np.pi / 2) ** 2
+    beta = np.minimum(1.0 - f[1:] / f[:-1], 0.999)
+    return np.cumprod(1.0 - beta).astype(np.float32)
+
+
+def q_sample(x0: jax.Array, noise: jax.Array, k: jax.Array, alpha_bar: jax.Array) -> jax.Array:
+    """x_k = sqrt(alpha_bar_k) x_0 + sqrt(1 - alpha_bar_k) noise (Ho et al., 2020, eq. 4). k: (B,) int."""
+    a = jnp.asarray(alpha_bar)[k].reshape((-1,) + (1,) * (x0.ndim - 1))
+    return jnp.sqrt(a) * x0 + jnp.sqrt(1.0 - a) * noise
+
+
+def ddim_timesteps(steps: int, iterations: int) -> np.ndarray:
+    """(iterations,) int32 descending steps from K-1 to 0, evenly spaced."""
+    return np.round(np.linspace(steps - 1, 0, iterations)).astype(np.int32)
+
+
+def ddim_coefficients(alpha_bar: np.ndarray, iterations: int) -> np.ndarray:
+    """(iterations, 4) float32 rows [1/sqrt(a), sqrt(1-a)/sqrt(a), sqrt(a'), sqrt(1-a')]; a' = 1 at the end.
+
+    a and a' are alpha_bar at a step and at the next (less noisy) one.
+    """
+    a = alpha_bar.astype(np.float64)[ddim_timesteps(len(alpha_bar), iterations)]
+    after = np.append(a[1:], 1.0)
+    return np.stack(
+        [1 / np.sqrt(a), np.sqrt(1 - a) / np.sqrt(a), np.sqrt(after), np.sqrt(1 - after)], axis=1
+    ).astype(np.float32)
+
+
+def ddim_step(x: jax.Array, eps: jax.Array, row: jax.Array) -> jax.Array:
+    """x_k' = sqrt(a') x0 + sqrt(1 - a') eps' (Song et al., 2021, eq. 12, sigma = 0), x0 clipped to [-1, 1].
+
+    eps' is the noise that agrees with the clipped x0, so that the pair still explains x.
+    """
+    x0 = jnp.clip(row[0] * x - row[1] * eps, -1.0, 1.0)
+    eps = (row[0] * x - x0) / row[1]
+    return row[2] * x0 + row[3] * eps
+
+
+def ddim_sample(
+    predict: Callable[[jax.Array, jax.Array], jax.Array], noise: jax.Array, alpha_bar: np.ndarray, iterations: int
+) -> jax.Array:
+    """Noise (B, ...) to samples in [-1, 1]; `predict(x, k (B,)) -> eps`."""
+    rows = jnp.asarray(ddim_coefficients(alpha_bar, iterations))
+    ks = jnp.asarray(ddim_timesteps(len(alpha_bar), iterations))
+
+    def body(x: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        k, row = step
+        return ddim_step(x, predict(x, jnp.full((x.shape[0],), k)), row), None
+
+    return jax.lax.scan(body, noise, (ks, rows))[0]

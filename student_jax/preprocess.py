@@ -1,0 +1,197 @@
+"""Raw depth frames to the encoder's picture: clean, crop, resize, subtract the empty table.
+
+Every constant the exported graph needs (crop window, resize matrices, table depth) is computed here in
+NumPy, so that training and export share the numbers. Nothing is inpainted: invalid pixels stay invalid.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ddgrasp import contract
+from ddgrasp.config import StudentConfig
+from ddgrasp.contract import CameraProfile
+from ddgrasp.errors import UserError, unknown_name
+from mjx_envs.camera import nominal_camera
+
+CHANNELS = ("relief", "valid", "depth")
+RELIEF_SCALE_M = 0.1
+"""One unit of the relief channel: how much nearer than the empty table, along the optical axis."""
+RELIEF_MIN, RELIEF_MAX = -1.0, 4.0
+SNAP_FRACTION = 0.02
+"""A crop this close to the input size is trimmed to it instead of being resampled."""
+COVERAGE_MIN = 0.5
+"""A resized pixel is valid when at least this share of its footprint is."""
+
+
+class Axis(NamedTuple):
+    """How one image axis goes from the crop window to the encoder's picture."""
+
+    start: int
+    """First crop pixel used."""
+    length: int
+    """Crop pixels used."""
+    matrix: np.ndarray | None
+    """(out, length) resize matrix; None if the pixels are taken as they are."""
+
+
+class Window(NamedTuple):
+    """The pixels of the full frame that the encoder sees, and how they are resized."""
+
+    rows: Axis
+    columns: Axis
+
+
+def resize_matrix(length: int, out: int) -> np.ndarray:
+    """(out, length) float32: linear resize with a triangle filter widened when shrinking; rows sum to 1.
+
+    Same numbers as `jax.image.resize(..., "linear", antialias=True)`.
+    """
+    scale = length / out
+    support = max(scale, 1.0)
+    centres = (np.arange(out) + 0.5) * scale
+    distance = np.abs(centres[:, None] - (np.arange(length) + 0.5)[None, :]) / support
+    weight = np.maximum(0.0, 1.0 - distance)
+    return (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def plan_axis(crop: int, out: int) -> Axis:
+    """Trim when the sizes nearly agree (pixels stay sharp), otherwise resize the whole crop."""
+    if 0 <= crop - out <= SNAP_FRACTION * crop:
+        return Axis((crop - out) // 2, out, None)
+    return Axis(0, crop, resize_matrix(crop, out))
+
+
+def plan_window(profile: CameraProfile, config: StudentConfig) -> Window:
+    """The window of `profile` that becomes an input of `config`'s size."""
+    return Window(
+        plan_axis(profile.crop_height_px, config.input_height_px),
+        plan_axis(profile.crop_width_px, config.input_width_px),
+    )
+
+
+def check_channels(config: StudentConfig) -> None:
+    """UserError for an unknown or empty channel selection."""
+    if not config.channels:
+        raise UserError(f"student.channels is empty; expected some of {', '.join(CHANNELS)}.")
+    for name in config.channels:
+        if name not in CHANNELS:
+            raise unknown_name("student channel", name, CHANNELS)
+
+
+def table_depth(profile: CameraProfile, max_depth_m: float) -> np.ndarray:
+    """(H, W) float32 planar depth of the empty table from the nominal camera, at most `max_depth_m`."""
+    camera = nominal_camera(profile)
+    rotation, height_m = camera.T_world_cam[:3, :3], camera.T_world_cam[2, 3]
+    x = (np.arange(profile.width_px) + 0.5 - profile.cx_px) / profile.fx_px
+    y = (np.arange(profile.height_px) + 0.5 - profile.cy_px) / profile.fy_px
+    fall = -(rotation[2, 0] * x[None, :] + rotation[2, 1] * y[:, None] + rotation[2, 2])
+    depth = np.where(fall > 1e-6, height_m / np.maximum(fall, 1e-6), max_depth_m)
+    return np.minimum(depth, max_depth_m).astype(np.float32)
+
+
+def clean_depth(depth_m: jax.Array, config: StudentConfig) -> jax.Array:
+    """Non-finite, too near and too far readings become 0 = invalid. Any shape, metres."""
+    usable = (depth_m >= config.min_depth_m) & (depth_m <= config.max_depth_m)  # False for NaN
+    return jnp.where(usable, depth_m, 0.0).astype(jnp.float32)
+
+
+def clip_crop(crop_rc: jax.Array, profile: CameraProfile) -> jax.Array:
+    """(B, 2) crop origins moved to where the whole window fits into the frame."""
+    highest = jnp.array(
+        [profile.height_px - profile.crop_height_px, profile.width_px - profile.crop_width_px]
+    )
+    return jnp.clip(crop_rc, 0, highest)
+
+
+def crop_origin(crop_rc: jax.Array | None, batch: int, profile: CameraProfile) -> jax.Array:
+    """(B, 2) int32 crop origins (row, column) in the full frame; None is the centred window."""
+    if crop_rc is None:
+        return jnp.broadcast_to(jnp.array(profile.crop_origin_px, jnp.int32), (batch, 2))
+    return clip_crop(crop_rc, profile).astype(jnp.int32)
+
+
+def pixel_coordinates(window: Window, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """Crop pixel coordinates (rows (h,), columns (w,)) of the centres of `stride`-sized cells of the input."""
+
+    def centres(axis: Axis) -> np.ndarray:
+        out = axis.length if axis.matrix is None else axis.matrix.shape[0]
+        cells = (np.arange(-(-out // stride)) + 0.5) * stride
+        return (axis.start + cells * (axis.length / out)).astype(np.float32)
+
+    return centres(window.rows), centres(window.columns)
+
+
+def prepare_depth(
+    depth_m: jax.Array, crop_rc: jax.Array | None, profile: CameraProfile, config: StudentConfig
+) -> jax.Array:
+    """Depth frames as the encoder's picture.
+
+    Args:
+        depth_m: (B, 3, H, W) planar metres, 0 or non-finite where invalid, oldest frame first.
+        crop_rc: (B, 2) integer (row, column) of each sample's crop window, clipped into the frame;
+            None takes the centred window (what the exported policy does).
+        profile: the camera that took the frames; H and W must be its own.
+        config: input size, channels and depth limits.
+
+    Returns:
+        (B, h, w, 3 * channels) float32, channels of the oldest frame first. relief is in
+        [RELIEF_MIN, RELIEF_MAX] and 0 where invalid; valid is 0 or 1; depth is in metres, 0 where invalid.
+    """
+    check_channels(config)
+    expected = (contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
+    if depth_m.shape[1:] != expected:
+        raise UserError(f"Depth has shape {tuple(depth_m.shape)}; expected (B, {', '.join(map(str, expected))}).")
+    window = plan_window(profile, config)
+    table = jnp.asarray(table_depth(profile, config.max_depth_m))
+    depth, table = _cut(clean_depth(depth_m, config), table, crop_rc, profile, window)
+    valid = (depth > 0).astype(jnp.float32)
+    relief = (table[:, None] - depth) / RELIEF_SCALE_M
+    relief, depth, valid = _resize_masked(relief, depth, valid, window, "depth" in config.channels)
+    planes = {"relief": jnp.clip(relief, RELIEF_MIN, RELIEF_MAX) * valid, "valid": valid, "depth": depth}
+    stacked = jnp.stack([planes[name] for name in config.channels], axis=-1)  # (B, 3, h, w, C)
+    picture = jnp.moveaxis(stacked, 1, 3)
+    return picture.reshape(*picture.shape[:3], -1)
+
+
+def _cut(
+    depth: jax.Array, table: jax.Array, crop_rc: jax.Array | None, profile: CameraProfile, window: Window
+) -> tuple[jax.Array, jax.Array]:
+    """Window of the frames (B, 3, r, c) and the same window of the table's depth (B or 1, r, c)."""
+    rows, columns = window
+    if crop_rc is None:
+        row, column = profile.crop_origin_px[0] + rows.start, profile.crop_origin_px[1] + columns.start
+        part = np.s_[..., row : row + rows.length, column : column + columns.length]
+        return depth[part], table[part][None]
+    first = clip_crop(crop_rc, profile) + jnp.array([rows.start, columns.start])
+
+    def cut_one(frames: jax.Array, start: jax.Array) -> jax.Array:
+        size = (frames.shape[0], rows.length, columns.length)
+        return jax.lax.dynamic_slice(frames, (0, start[0], start[1]), size)
+
+    frames = jax.vmap(cut_one)(depth, first)
+    return frames, jax.vmap(lambda start: cut_one(table[None], start)[0])(first)
+
+
+def _resize_masked(
+    relief: jax.Array, depth: jax.Array, valid: jax.Array, window: Window, need_depth: bool
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """resize(x * valid) / resize(valid): what is invalid never bleeds into what is valid."""
+
+    def resize(image: jax.Array) -> jax.Array:
+        if window.rows.matrix is not None:
+            image = jnp.einsum("or,bfrc->bfoc", window.rows.matrix, image)
+        if window.columns.matrix is not None:
+            image = jnp.einsum("pc,bfoc->bfop", window.columns.matrix, image)
+        return image
+
+    if window.rows.matrix is None and window.columns.matrix is None:
+        return relief * valid, depth, valid
+    coverage = resize(valid)
+    resized_valid = (coverage >= COVERAGE_MIN).astype(jnp.float32)
+    weight = resized_valid / jnp.maximum(coverage, COVERAGE_MIN)
+    # COVERAGE_MIN as a bound keeps the quotient finite; below it the weight is 0 anyway.
+    resized_depth = resize(depth) * weight if need_depth else depth
+    return resize(relief * valid) * weight, resized_depth, resized_valid
