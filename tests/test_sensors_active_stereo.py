@@ -1,0 +1,181 @@
+"""The active-stereo camera: geometry of its depth, defects that follow from stereo, not from formulas."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from ddgrasp import contract
+from ddgrasp.config import RecordConfig, StereoConfig
+from mjx_envs.camera import Buffers, Camera, nominal_camera
+from sensors import stats
+from sensors.active_stereo import ActiveStereo, Material
+from sensors.rig_camera import RigCamera, jittered_pose
+
+PROFILE = contract.D455.scaled(0.25)
+FB_PX_M = PROFILE.fx_px * PROFILE.baseline_m
+GREY = {0: Material(0.5, texture=0.1), 1: Material(0.5, texture=0.1)}
+T_WORLD_CAM = np.eye(4)
+
+
+def wall(range_m: float, square_range_m: float = 0.0, half_m: float = 0.1):
+    """Render function of a wall facing the camera (geom 0), optionally with a square before it (geom 1)."""
+
+    def render(camera: Camera) -> Buffers:
+        shape = (camera.height_px, camera.width_px)
+        depth = np.full(shape, range_m, np.float32)
+        ids = np.zeros(shape, np.int32)
+        if square_range_m:
+            x = (
+                np.arange(shape[1]) + 0.5 - camera.cx_px
+            ) / camera.fx_px * square_range_m + camera.T_world_cam[0, 3]
+            y = (np.arange(shape[0]) + 0.5 - camera.cy_px) / camera.fy_px * square_range_m
+            square = (np.abs(y)[:, None] < half_m) & (np.abs(x)[None, :] < half_m)
+            depth[square], ids[square] = square_range_m, 1
+        normal = np.zeros((*shape, 3), np.float32)
+        normal[..., 2] = -1.0
+        return Buffers(depth, np.full((*shape, 3), 0.5, np.float32), ids, normal)
+
+    return render
+
+
+def sense(render, seed: int = 0, materials=GREY, **config) -> np.ndarray:
+    camera = ActiveStereo(replace(StereoConfig(), **config), PROFILE)
+    return camera.sense(render, T_WORLD_CAM, np.random.default_rng(seed), materials)
+
+
+@pytest.mark.parametrize("range_m", [0.5, 0.8, 1.2])
+def test_wall_is_measured_where_it_stands(range_m):
+    depth_mm = sense(wall(range_m))
+    band = int(np.ceil(FB_PX_M / range_m))
+    assert depth_mm.dtype == np.uint16 and depth_mm.shape == (180, 320)
+    # No counterpart in the right picture: the band is as wide as the disparity.
+    assert np.mean(depth_mm[:, : band - 1] > 0) < 0.03
+    inner = depth_mm[10:-10, band + 8 : -8]
+    assert np.mean(inner > 0) > 0.97
+    # A tenth of a pixel of disparity.
+    assert abs(np.median(inner[inner > 0]) / 1000 - range_m) < 0.1 * range_m**2 / FB_PX_M
+
+
+def test_disparity_is_quantised_in_32nds():
+    depth_mm = sense(wall(0.6))
+    values = np.unique(depth_mm[depth_mm > 0])
+    steps = np.rint(32 * FB_PX_M * 1000 / values)
+    np.testing.assert_allclose(32 * FB_PX_M * 1000 / steps, values, atol=0.51)
+    # Neighbouring steps are z^2 / (32 f B) = 0.7 mm apart here, so not every millimetre occurs.
+    assert len(values) < 200
+
+
+def test_occlusion_shadow_lies_on_the_left_of_an_object():
+    near_m, far_m, half_m = 0.6, 1.2, 0.1
+    depth_mm = sense(wall(far_m, near_m, half_m))
+    left = round(PROFILE.cx_px - half_m / near_m * PROFILE.fx_px)
+    right = round(PROFILE.cx_px + half_m / near_m * PROFILE.fx_px)
+    shadow_px = round(FB_PX_M * (1 / near_m - 1 / far_m))
+    assert shadow_px == 13
+    rows = slice(80, 100)
+    on_left = np.mean(depth_mm[rows, left - shadow_px + 2 : left - 2] == 0)
+    on_right = np.mean(depth_mm[rows, right + 3 : right + shadow_px] == 0)
+    assert on_left > 0.8 and on_right < 0.2
+    middle = depth_mm[rows, left + 6 : right - 6]
+    assert np.mean(np.abs(middle.astype(int) - 600) < 15) > 0.95
+
+
+def test_holes_come_from_matching_without_texture_there_is_no_depth():
+    blank = {0: Material(0.5)}
+    assert np.mean(sense(wall(0.8), materials=blank, projector_power=0.0) > 0) < 0.05
+    assert np.mean(sense(wall(0.8), materials=blank) > 0) > 0.85
+
+
+def test_dark_surfaces_lose_pixels():
+    def lost(albedo: float) -> float:
+        depth_mm = sense(wall(1.2, 0.7), materials={0: GREY[0], 1: Material(albedo, specular=0.0)})
+        return float(np.mean(depth_mm[75:105, 142:178] == 0))
+
+    assert lost(0.5) < 0.1 and lost(0.004) > 0.5
+
+
+def test_out_of_range_is_invalid():
+    assert np.mean(sense(wall(0.25)) > 0) < 0.1
+    assert not sense(wall(0.8), max_range_m=0.7).any()
+    assert not sense(wall(0.0)).any()
+
+
+def test_noise_grows_with_the_square_of_range():
+    def deviation_mm(range_m: float) -> float:
+        camera, rng = ActiveStereo(StereoConfig(), PROFILE), np.random.default_rng(1)
+        frames = np.stack([camera.sense(wall(range_m), T_WORLD_CAM, rng, GREY) for _ in range(6)])
+        return stats.temporal_deviation_mm(frames[:, :, 60:260], 1000 * range_m)
+
+    # Disparity noise is alike (slightly larger where dots are dimmer), z = fB / d squares it.
+    assert 3.0 < deviation_mm(1.2) / deviation_mm(0.6) < 9.0
+
+
+def test_frames_are_reproducible_and_differ_by_seed():
+    first, again, other = (sense(wall(0.8), seed) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert np.mean(first != other) > 0.2
+
+
+def test_rig_is_near_the_measured_d455(rig_frames):
+    """A D455 at 640x360: 10.7 % invalid, 188 holes (half at 320x180), 2.0 mm at .75 m, 2.7 % flicker."""
+    measured = stats.measure(rig_frames)
+    assert 0.08 < measured.invalid_fraction < 0.16
+    assert 60 < measured.hole_components < 170
+    assert 1.3 < measured.temporal_deviation_mm < 2.8
+    assert 0.015 < measured.flicker_fraction < 0.045
+    assert 15 <= measured.left_band_px <= 32
+
+
+def test_cube_stands_out_of_the_table(rig_frames):
+    """Height over the table, from depth alone, at the cube's top (0.05 m) and beside it (0)."""
+    camera = nominal_camera(PROFILE)
+    T_cam_world = np.linalg.inv(camera.T_world_cam)
+    depth_m = np.median(rig_frames, axis=0) / 1000
+
+    def height_m(point_w) -> float:
+        x, y, z = (T_cam_world @ np.array([*point_w, 1.0]))[:3]
+        u, v = camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px
+        window = depth_m[int(v) - 1 : int(v) + 2, int(u) - 1 : int(u) + 2]
+        z_seen = np.median(window[window > 0])
+        return float((camera.T_world_cam @ np.array([x / z * z_seen, y / z * z_seen, z_seen, 1.0]))[2])
+
+    assert abs(height_m((0.5, 0.0, 0.05)) - 0.05) < 0.012
+    assert abs(height_m((0.5, 0.12, 0.0))) < 0.012
+
+
+@pytest.fixture(scope="module")
+def rig_frames() -> np.ndarray:
+    from mjx_envs import scene
+
+    model = scene.build_model()
+    data = mujoco.MjData(model)
+    data.qpos[:7], data.qpos[7:9] = scene.HOME_RAD, 0.04
+    data.qpos[9:16] = 0.5, 0.0, 0.025, 1, 0, 0, 0
+    mujoco.mj_forward(model, data)
+    camera = RigCamera(model, StereoConfig(), PROFILE)
+    rng = np.random.default_rng(0)
+    T_world_cam = nominal_camera(PROFILE).T_world_cam
+    return np.stack([camera.depth_mm(data, T_world_cam, rng, "cube") for _ in range(6)])
+
+
+def test_jittered_pose_stays_near_the_nominal_one():
+    config = RecordConfig()
+    nominal = nominal_camera(PROFILE).T_world_cam
+    for seed in range(20):
+        T = jittered_pose(config, np.random.default_rng(seed))
+        assert np.abs(T[:3, 3] - nominal[:3, 3]).max() <= config.camera_position_jitter_m
+        np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
+        assert np.arccos(T[:3, 2] @ nominal[:3, 2]) < 0.25
+
+
+def test_sensors_need_no_jax():
+    code = (
+        "import sys, sensors.rig_camera, sensors.stage, sensors.procedural, sensors.recordings; "
+        "assert 'jax' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])
