@@ -69,8 +69,8 @@ class WorldConfig:
     """Physics: cpu (MuJoCo's C engine on all cores) or jax (MJX)."""
     episode_steps: int = 60
     """Control steps in an episode (10 Hz)."""
-    sim_dt_s: float = 0.005
-    """Physics time step."""
+    sim_dt_s: float = 0.01
+    """Physics time step; the pseudo-real rig steps at half of it."""
     camera_scale: float = 0.25
     """Size of the depth camera's picture relative to 1280 x 720."""
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -209,15 +209,15 @@ class StudentConfig:
     """Farther readings are treated as invalid."""
     # --- encoder (student_jax/encoder.py) ---
     stem: str = "space_to_depth"
-    """conv7 (the paper's ResNet: 7x7 stride 2 and max pooling) or space_to_depth (4x4 patches; cheap on CPU)."""
+    """conv7 (the paper's: 7x7 stride 2, max pooling) or space_to_depth (4x4 patches; cheap on CPU)."""
     width: int = 16
     """Channels of the first stage; the paper's ResNet-18 has 64."""
-    stage_blocks: tuple[int, ...] = (2, 2, 2, 2)
+    stage_blocks: tuple[int, ...] = (2, 2, 2)
     """Basic blocks per stage; each stage doubles the channels. (2, 2, 2, 2) is ResNet-18."""
     max_channels: int = 512
     """Channels never exceed this, whatever the stage."""
     output_stride: int = 8
-    """Pixels per cell of the encoder's last map: 4, 8, 16 or 32 (ResNet's own). Later stages keep the resolution."""
+    """Pixels per cell of the last feature map: 4, 8, 16 or 32 (ResNet's own); later stages keep it."""
     norm: str = "group"
     """group (GroupNorm) or none."""
     pooling: str = "spatial_softmax"

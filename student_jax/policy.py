@@ -87,7 +87,11 @@ class StudentPolicy(nn.Module):
         return self.denoiser(noisy_action, k, cond)
 
     def __call__(
-        self, depth_m: jax.Array, state: jax.Array, noisy_action: jax.Array, k: jax.Array,
+        self,
+        depth_m: jax.Array,
+        state: jax.Array,
+        noisy_action: jax.Array,
+        k: jax.Array,
         crop_rc: jax.Array | None = None,
     ) -> tuple[jax.Array, Aux]:
         """Predicted noise and auxiliary predictions: everything a training step needs."""
@@ -105,7 +109,9 @@ def init_params(key: jax.Array, config: StudentConfig, profile: CameraProfile) -
     depth = jnp.zeros((1, contract.DEPTH_FRAMES, profile.height_px, profile.width_px))
     action = jnp.zeros((1, config.chunk, contract.ACTION_SIZE))
     policy = StudentPolicy(config, profile)
-    return policy.init(key, depth, jnp.zeros((1, contract.STATE_SIZE)), action, jnp.zeros((1,), jnp.int32))["params"]
+    return policy.init(key, depth, jnp.zeros((1, contract.STATE_SIZE)), action, jnp.zeros((1,), jnp.int32))[
+        "params"
+    ]
 
 
 def count_params(params: dict) -> int:
@@ -114,7 +120,12 @@ def count_params(params: dict) -> int:
 
 
 def sample_from_cond(
-    params: dict, cond: jax.Array, noise: jax.Array, config: StudentConfig, profile: CameraProfile, steps: int = 0
+    params: dict,
+    cond: jax.Array,
+    noise: jax.Array,
+    config: StudentConfig,
+    profile: CameraProfile,
+    steps: int = 0,
 ) -> jax.Array:
     """DDIM from (B, chunk, 8) standard normal noise to actions in [-1, 1]; steps 0 means the config's."""
     policy = StudentPolicy(config, profile)

@@ -114,7 +114,7 @@ def crop_origin(crop_rc: jax.Array | None, batch: int, profile: CameraProfile) -
 
 
 def pixel_coordinates(window: Window, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """Crop pixel coordinates (rows (h,), columns (w,)) of the centres of `stride`-sized cells of the input."""
+    """Crop pixel coordinates, rows (h,) and columns (w,), of the centres of `stride`-sized input cells."""
 
     def centres(axis: Axis) -> np.ndarray:
         out = axis.length if axis.matrix is None else axis.matrix.shape[0]
@@ -143,7 +143,8 @@ def prepare_depth(
     check_channels(config)
     expected = (contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
     if depth_m.shape[1:] != expected:
-        raise UserError(f"Depth has shape {tuple(depth_m.shape)}; expected (B, {', '.join(map(str, expected))}).")
+        wanted = ", ".join(map(str, expected))
+        raise UserError(f"Depth has shape {tuple(depth_m.shape)}; expected (B, {wanted}).")
     window = plan_window(profile, config)
     table = jnp.asarray(table_depth(profile, config.max_depth_m))
     depth, table = _cut(clean_depth(depth_m, config), table, crop_rc, profile, window)
