@@ -104,8 +104,8 @@ def to_json(value: Any) -> Any:
         return {str(key): to_json(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [to_json(item) for item in value]
-    if hasattr(value, "tolist"):  # NumPy and JAX arrays and scalars
-        return to_json(value.tolist())
+    if (tolist := getattr(value, "tolist", None)) is not None:  # NumPy and JAX arrays and scalars
+        return to_json(tolist())
     if isinstance(value, float):
         return value if value == value and abs(value) != float("inf") else None
     if isinstance(value, Path):
@@ -284,7 +284,8 @@ def _check_same_config(directory: Path, stage: str, made_with: Mapping[str, Any]
     difference = next(_differences(there, here), "a field that no longer exists")
     raise UserError(
         f"{directory} was made with another configuration (hash {before}, "
-        f"this run has {expected}): {difference}. Use that configuration, another --out, or delete the directory."
+        f"this run has {expected}): {difference}. "
+        "Use that configuration, another --out, or delete the directory."
     )
 
 
@@ -373,7 +374,7 @@ def load_params(path: Path | str, target: Any = None) -> Any:
     digest, payload = data[len(_PARAMS_MAGIC) :][:32], data[len(_PARAMS_MAGIC) + 32 :]
     if hashlib.sha256(payload).digest() != digest:
         raise UserError(f"Parameter file {path} is damaged or truncated: make it again, or restore a copy.")
-    state = serialization.msgpack_restore(payload)
+    state: Any = serialization.msgpack_restore(payload)
     if target is None:
         return state
     try:

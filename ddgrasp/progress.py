@@ -134,14 +134,16 @@ class Progress:
         Args:
           name: file name without suffix; the report's title for it.
           panels: title -> (H, W, 3) RGB, uint8 or in [0, 1]; (H, W) depth, uint16 millimetres or float
-            metres, 0 = invalid. One more leading axis makes a film strip: frames from left to right, panels as rows.
+            metres, 0 = invalid. One more leading axis makes a film strip: frames from left to right, panels
+            as rows.
         """
         if self.directory is None:
             return
         import numpy as np
 
         with artifacts.atomic_path(self.directory / PICTURES / f"{name}.npz") as path:
-            np.savez_compressed(path, **{title: np.asarray(panel) for title, panel in panels.items()})
+            arrays: dict[str, Any] = {title: np.asarray(panel) for title, panel in panels.items()}
+            np.savez_compressed(path, **arrays)
 
     def close(self) -> None:
         """Flushes the events and keeps the time spent, so that a later attempt adds to it."""

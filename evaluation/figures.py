@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -106,7 +108,7 @@ def _grid(rows: list[list[np.ndarray]], titles: list[str], labels: list[str]) ->
 
 
 def _depth_legend(figure: Figure, near_m: float, far_m: float) -> None:
-    scale = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(near_m, far_m), DEPTH_COLORS)
+    scale = ScalarMappable(Normalize(near_m, far_m), DEPTH_COLORS)
     bar = figure.colorbar(scale, ax=figure.axes, fraction=0.02, pad=0.01)
     bar.set_label("depth (m)", fontsize=8)
     bar.ax.tick_params(labelsize=7)

@@ -38,8 +38,9 @@ def render_html(report: Mapping[str, Any], run_dir: Path) -> str:
     made = f"{report['created']}, {machine['processor']}, {machine['cores']} cores."
     body = [
         f"<h1>DiffuDepGrasp-JAX: run <code>{escape(run_dir.name)}</code>, preset {preset}</h1>",
-        f"<p class=note>{escape(made)} Success: rate of n trials, Wilson 95 % interval. The pseudo-real rig is a "
-        "Franka in MuJoCo's C engine seen by a simulated active-stereo camera; no real robot was used.</p>",
+        f"<p class=note>{escape(made)} Success: rate of n trials, Wilson 95 % interval. The pseudo-real "
+        "rig is a Franka in MuJoCo's C engine seen by a simulated active-stereo camera; no real robot was "
+        "used.</p>",
         _table(("Stage", "From", "Time", "Measured"), summary_rows(report), last_bold=True),
     ]
     for stage in STAGES:

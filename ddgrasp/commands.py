@@ -1,0 +1,172 @@
+"""The commands of `ddgrasp`, one dataclass each: its fields are the options, `run` does the work.
+
+Stages are imported inside `run`, so that `--help` starts without JAX.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import tyro
+
+from ddgrasp import artifacts, pipeline
+from ddgrasp.config import Config
+from ddgrasp.presets import get_preset
+
+DEFAULT_PRESET = "demo"
+
+
+class Command(Protocol):
+    """What a parsed command line is."""
+
+    def run(self) -> None:
+        """Does the work; raises UserError for wrong input."""
+        ...
+
+
+@dataclass(frozen=True)
+class _FromPreset:
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    """Values of the preset; any of them can be given on its own, for example --seed 1."""
+    out: Path
+    """Directory of the run."""
+    resume: bool = False
+    """Continue what is there; finished stages are not redone."""
+
+
+@dataclass(frozen=True)
+class Run(_FromPreset):
+    """The whole flow: teacher, demos, record, ddg, student, export, deploy, report."""
+
+    def run(self) -> None:
+        from evaluation.report import print_summary
+
+        report = pipeline.run(check_config_values(self.config), self.out, resume=self.resume)
+        print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
+        print_summary(report)
+
+
+class _OneStage(_FromPreset):
+    stage: str
+
+    def run(self) -> None:
+        stage = pipeline.get_stage(self.stage)
+        pipeline.run_stage(stage, check_config_values(self.config), self.out, resume=self.resume)
+
+
+@dataclass(frozen=True)
+class TeacherTrain(_OneStage):
+    """Train the privileged teacher by PPO."""
+
+    stage = "teacher"
+
+
+@dataclass(frozen=True)
+class DemosCollect(_OneStage):
+    """Collect successful teacher episodes with clean depth."""
+
+    stage = "demos"
+
+
+@dataclass(frozen=True)
+class Record(_OneStage):
+    """Record RGB-D from the pseudo-real rig, moved by the teacher."""
+
+    stage = "record"
+
+
+@dataclass(frozen=True)
+class StudentTrain(_OneStage):
+    """Train the depth-only student on noisy demonstrations."""
+
+    stage = "student"
+
+
+@dataclass(frozen=True)
+class Export(_OneStage):
+    """Write the student as one ONNX file and check it against JAX."""
+
+    stage = "export"
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write report.json and report.html of a run anew, and print the table."""
+
+    out: tyro.conf.Positional[Path]
+    """Directory of the run."""
+
+    def run(self) -> None:
+        from evaluation.report import print_summary
+        from evaluation.stage import write_report
+
+        report = write_report(self.out)
+        print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
+        print_summary(report)
+
+
+COMMANDS: dict[str, type] = {
+    "run": Run,
+    "teacher train": TeacherTrain,
+    "demos collect": DemosCollect,
+    "record": Record,
+    "student train": StudentTrain,
+    "export": Export,
+    "report": Report,
+}
+
+
+def parse(name: str, args: Sequence[str]) -> Command:
+    """The command `name` with its options; prints help or usage and raises SystemExit as tyro does."""
+    cls = COMMANDS[name]
+    options: dict[str, Any] = {}
+    if issubclass(cls, _FromPreset):
+        preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
+        options["default"] = cls(config=preset, out=Path("runs") / preset.preset)
+    return tyro.cli(
+        cls,
+        prog=f"ddgrasp {name}",
+        args=list(args),
+        config=(tyro.conf.FlagCreatePairsOff,),
+        **options,
+    )
+
+
+def describe_commands(group: str = "") -> str:
+    """The list that `ddgrasp --help` (or `ddgrasp teacher`) prints."""
+    names = [name for name in COMMANDS if not group or name.split()[0] == group]
+    lines = [f"  {name:<15} {(COMMANDS[name].__doc__ or '').splitlines()[0]}" for name in names]
+    return "\n".join(
+        ["usage: ddgrasp COMMAND [options]   (each command has --help)", "", *lines, "", *_PRESET_HELP]
+    )
+
+
+_PRESET_HELP = (
+    "Presets (--preset): debug (tests), demo (a real result on two cores), laptop (an evening on two cores),",
+    "paper (one GPU). Any value of a preset can be given on its own, for example --teacher.num-envs 64.",
+)
+
+
+def check_config_values(config: Config) -> Config:
+    """`config` if the names in it exist; UserError that suggests the nearest right name otherwise."""
+    from mjx_envs.objects import get_object
+
+    for name in config.world.objects:
+        get_object(name)
+    return config
+
+
+def load_config(run_dir: Path, stage: str) -> Config:
+    """The configuration that made the finished `stage` of a run."""
+    return artifacts.config_from_json(artifacts.read_manifest(run_dir / stage).config)
+
+
+def _option(args: Sequence[str], name: str) -> str | None:
+    """Value of `--name value` or `--name=value` among `args`."""
+    for index, arg in enumerate(args):
+        if arg == name and index + 1 < len(args):
+            return args[index + 1]
+        if arg.startswith(f"{name}="):
+            return arg.split("=", 1)[1]
+    return None

@@ -1,0 +1,133 @@
+"""report.json and report.html from manifests on disk."""
+
+import base64
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from ddgrasp import artifacts
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from evaluation import figures
+from evaluation.report import build_report, print_summary, summary_rows
+from evaluation.stage import write_report
+
+CONFIG = Config(preset="debug")
+METRICS = {
+    "teacher": {"success": {"successes": 9, "n": 10}, "per_object": {"cube": {"successes": 4, "n": 5}}},
+    "demos": {"episodes": 120},
+    "record": {"frames": 300, "invalid_fraction": 0.107},
+    "ddg": {"loss": 0.02},
+    "student": {
+        "student_clean": {"success": {"successes": 7, "n": 10}},
+        "student_ddg": {"success": {"successes": 6, "n": 10}},
+        "tried": [{"encoder": "mean", "success": 0.1}, {"encoder": "keypoints", "success": 0.6}],
+    },
+    "export": {"max_abs_diff": 3e-6},
+    "deploy": {
+        "student_rig": {"success": {"successes": 5, "n": 10}},
+        "latency_ms": {"p50": 12.0, "p99": 20.25},
+    },
+}
+
+
+@pytest.fixture
+def run_dir(tmp_path):
+    for name, metrics in METRICS.items():
+        origin = "loaded" if name == "student" else "trained"
+        artifacts.finish(tmp_path / name, name, CONFIG, seconds=10, metrics=metrics, origin=origin)
+    return tmp_path
+
+
+def test_the_report_has_the_promised_keys(run_dir):
+    write_report(run_dir)
+    report = json.loads((run_dir / "report.json").read_text())
+    half = {"rate": 0.5, "n": 10, "successes": 5, "low": pytest.approx(0.23659, abs=1e-5)}
+    assert half.items() <= report["student_rig"]["success"].items()
+    assert report["teacher"]["success"]["rate"] == 0.9
+    assert report["teacher"]["per_object"]["cube"]["rate"] == 0.8
+    assert report["student_clean"]["success"]["high"] > 0.7 > report["student_clean"]["success"]["low"]
+    assert report["student_ddg"]["success"]["n"] == 10
+    assert report["export"]["max_abs_diff"] == 3e-6
+    assert report["deploy"]["latency_ms"] == {"p50": 12.0, "p99": 20.25}
+    assert report["stages"]["teacher"] == {
+        **report["stages"]["teacher"],
+        "seconds": 10,
+        "trained": True,
+        "loaded": False,
+    }
+    assert report["stages"]["student"]["loaded"] is True
+    assert report["machine"]["cores"] >= 1
+
+
+def test_the_table_ends_with_the_student_in_the_rig(run_dir, capsys):
+    print_summary(build_report(run_dir))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].split() == (
+        "deploy exported student in the pseudo-real rig: success 50.0 % of 10 (23.7 to 76.3)".split()
+    )
+    assert any("success 90.0 % of 10" in line and "this run" in line for line in lines)
+    assert any("clean depth: success 70.0 % of 10" in line and "loaded" in line for line in lines)
+
+
+def test_an_incomplete_run_says_what_was_not_run(tmp_path):
+    artifacts.finish(tmp_path / "teacher", "teacher", CONFIG, seconds=1, metrics=METRICS["teacher"])
+    rows = summary_rows(build_report(tmp_path))
+    assert rows[-1] == ("deploy", "", "", "not run")
+    assert "student_rig" not in build_report(tmp_path)
+
+
+def test_an_empty_directory_is_refused(tmp_path):
+    with pytest.raises(UserError, match="holds no finished stage"):
+        build_report(tmp_path)
+
+
+def test_the_page_is_self_contained_and_shows_curves_and_pictures(run_dir):
+    progress = Progress(run_dir / "ddg", quiet=True)
+    progress.scalars(1, loss=1.0)
+    progress.scalars(2, loss=0.5)
+    depth = np.full((20, 30), 800, np.uint16)
+    depth[5:9] = 0
+    progress.picture(
+        "grafting", rgb=np.zeros((20, 30, 3), np.uint8), clean=depth / np.float32(1000), grafted=depth
+    )
+    progress.close()
+    write_report(run_dir)
+    page = (run_dir / "report.html").read_text()
+    images = re.findall(r'<img alt="([^"]*)" src="data:image/png;base64,([^"]*)"', page)
+    assert [alt for alt, _ in images] == ["curves of stage ddg", "grafting"]
+    for _, data in images:
+        png = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        assert png.shape[0] > 50 and png.std() > 5
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    assert "<td>keypoints</td><td>0.6</td>" in page
+
+
+def test_invalid_depth_has_a_colour_that_no_depth_has():
+    depth = np.linspace(0.5, 2.0, 1000, dtype=np.float32).reshape(20, 50)
+    depth[3, 4] = 0.0
+    rgb = figures.color_depth(depth, 0.5, 2.0)
+    np.testing.assert_array_equal(rgb[3, 4], figures.INVALID_RGB)
+    rgb[3, 4] = rgb[3, 5]
+    assert np.abs(rgb - figures.INVALID_RGB).max(axis=-1).min() > 0.3
+
+
+def test_millimetres_and_metres_look_alike():
+    metres = np.array([[0.0, 0.75], [1.25, 2.0]], np.float32)
+    np.testing.assert_allclose(figures.depth_to_metres((metres * 1000).astype(np.uint16)), metres, atol=1e-6)
+    np.testing.assert_array_equal(figures.depth_to_metres(np.array([[np.nan, np.inf]])), [[0.0, 0.0]])
+
+
+def test_film_strips_have_a_row_per_panel():
+    strip = figures.draw_panels(
+        {"clean": np.full((3, 18, 32), 0.8), "noisy": np.full((3, 18, 32), 800, np.uint16)}
+    )
+    single = figures.draw_panels({"clean": np.full((18, 32), 0.8)})
+    sizes = [cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR).shape for png in (strip, single)]
+    assert sizes[0][0] > sizes[1][0] and sizes[0][1] > sizes[1][1]
+    with pytest.raises(ValueError, match="picture panel of shape"):
+        figures.draw_panels({"bad": np.zeros(3)})

@@ -1,0 +1,171 @@
+"""Artefacts survive a full disk and an interruption, and refuse what does not fit."""
+
+import dataclasses
+import json
+import resource
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+
+from ddgrasp import artifacts, contract
+from ddgrasp.config import Config, ExportConfig, WorldConfig
+from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
+
+CONFIG = Config(preset="debug")
+
+
+def _finish(directory, config=CONFIG, **kwargs):
+    return artifacts.finish(directory, "export", config, seconds=1.5, metrics={"x": 1}, **kwargs)
+
+
+def test_a_failing_write_leaves_the_previous_file_and_no_litter(tmp_path):
+    path = tmp_path / "params.bin"
+    artifacts.atomic_write_bytes(path, b"old")
+    with pytest.raises(KeyboardInterrupt), artifacts.atomic_path(path) as temporary:
+        temporary.write_bytes(b"half of the n")
+        raise KeyboardInterrupt
+    assert path.read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["params.bin"]
+
+
+def test_a_disk_that_fills_up_mid_write_leaves_the_previous_artefact(tmp_path):
+    """The limit on file size makes the operating system itself refuse the write half-way."""
+    path = tmp_path / "params.bin"
+    artifacts.atomic_write_bytes(path, b"old")
+    code = f"""
+        import resource, sys
+        from ddgrasp import artifacts
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, {resource.getrlimit(resource.RLIMIT_FSIZE)[1]}))
+        try:
+            artifacts.atomic_write_bytes({str(path)!r}, bytes(100_000))
+        except OSError as error:
+            sys.exit(error.errno)
+    """
+    result = subprocess.run([sys.executable, "-c", textwrap.dedent(code)])
+    assert result.returncode == 27  # EFBIG
+    assert path.read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["params.bin"]
+
+
+def test_a_manifest_round_trips_and_names_its_parents(tmp_path):
+    parent = artifacts.finish(tmp_path / "student", "student", CONFIG, seconds=2, metrics={})
+    child = _finish(tmp_path / "export", parents=[parent], origin="loaded")
+    read = artifacts.read_artifact(tmp_path / "export")
+    assert read == child
+    assert read.manifest.parents == {"student": parent.hash}
+    assert (read.manifest.origin, read.manifest.seconds, read.manifest.metrics) == ("loaded", 1.5, {"x": 1})
+    assert read.manifest.versions["ddgrasp"] == "0.1.0"
+    assert read.manifest.versions["mujoco"].startswith("3.17.")
+
+
+def test_every_finish_has_its_own_hash(tmp_path):
+    first = artifacts.finish(tmp_path / "a", "teacher", CONFIG, seconds=1, metrics={"loss": 0.1})
+    second = artifacts.finish(tmp_path / "b", "teacher", CONFIG, seconds=1, metrics={"loss": 0.2})
+    assert first.hash != second.hash
+
+
+def test_the_config_hash_covers_a_stage_and_what_it_is_made_from_only():
+    changed = dataclasses.replace(CONFIG, export=dataclasses.replace(CONFIG.export, latency_runs=7))
+    assert artifacts.config_hash(changed, "export") != artifacts.config_hash(CONFIG, "export")
+    assert artifacts.config_hash(changed, "teacher") == artifacts.config_hash(CONFIG, "teacher")
+    renamed = dataclasses.replace(CONFIG, preset="mine")
+    assert artifacts.config_hash(renamed, "export") == artifacts.config_hash(CONFIG, "export")
+    reseeded = dataclasses.replace(CONFIG, seed=1)
+    assert artifacts.config_hash(reseeded, "teacher") != artifacts.config_hash(CONFIG, "teacher")
+
+
+def test_an_artefact_of_another_config_is_refused_naming_both_values(tmp_path):
+    _finish(tmp_path / "export")
+    other = dataclasses.replace(CONFIG, export=ExportConfig(latency_runs=7))
+    with pytest.raises(UserError, match=r"export\.latency_runs is 200 there, 7 here") as error:
+        artifacts.require(tmp_path, "export", other)
+    assert artifacts.config_hash(CONFIG, "export") in str(error.value)
+    assert artifacts.config_hash(other, "export") in str(error.value)
+    assert "\n" not in str(error.value)
+    artifacts.require(tmp_path, "export", CONFIG)
+
+
+def test_an_unfinished_attempt_of_another_config_is_refused(tmp_path):
+    artifacts.begin(tmp_path / "teacher", "teacher", CONFIG)
+    artifacts.begin(tmp_path / "teacher", "teacher", CONFIG)
+    other = dataclasses.replace(CONFIG, world=WorldConfig(episode_steps=7))
+    with pytest.raises(UserError, match=r"world\.episode_steps is 60 there, 7 here"):
+        artifacts.begin(tmp_path / "teacher", "teacher", other)
+
+
+def test_an_artefact_of_another_contract_version_is_refused(tmp_path):
+    _finish(tmp_path / "export")
+    path = tmp_path / "export" / artifacts.MANIFEST
+    value = json.loads(path.read_text())
+    value["contract_version"] = 99
+    path.write_text(json.dumps(value))
+    with pytest.raises(UserError, match=f"contract version 99, this code has {contract.CONTRACT_VERSION}"):
+        artifacts.read_manifest(tmp_path / "export")
+
+
+@pytest.mark.parametrize("text", ['{"stage": "exp', "[]", '{"stage": "export"}', "\xff"])
+def test_a_damaged_manifest_is_named(tmp_path, text):
+    _finish(tmp_path / "export")
+    (tmp_path / "export" / artifacts.MANIFEST).write_text(text, encoding="latin-1")
+    with pytest.raises(UserError, match=r"manifest\.json"):
+        artifacts.read_manifest(tmp_path / "export")
+
+
+def test_an_absent_stage_is_named_with_the_remedy(tmp_path):
+    with pytest.raises(UserError, match="has no finished stage 'teacher': run it first"):
+        artifacts.require(tmp_path, "teacher", CONFIG)
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_config_survives_its_journey_through_json(name):
+    value = json.loads(json.dumps(artifacts.to_json(PRESETS[name])))
+    assert artifacts.config_from_json(value) == PRESETS[name]
+
+
+def test_a_config_with_an_unknown_field_is_refused():
+    value = artifacts.to_json(CONFIG)
+    value["world"]["gravity"] = 3
+    with pytest.raises(UserError, match=r"config\.world has no field 'gravity'"):
+        artifacts.config_from_json(value)
+
+
+def test_json_is_strict_and_plain(tmp_path):
+    value = {"nan": float("nan"), "array": np.arange(3), "number": np.float32(0.5), "path": tmp_path, 1: (2,)}
+    artifacts.atomic_write_json(tmp_path / "a.json", value)
+    assert artifacts.read_json(tmp_path / "a.json") == {
+        "nan": None, "array": [0, 1, 2], "number": 0.5, "path": str(tmp_path), "1": [2],
+    }  # fmt: skip
+
+
+def test_parameters_round_trip_bit_for_bit(tmp_path):
+    tree = {
+        "dense": {"kernel": np.random.default_rng(0).normal(size=(3, 2)).astype(np.float32)},
+        "step": np.int32(7),
+    }
+    artifacts.save_params(tmp_path / "p.msgpack", tree)
+    read = artifacts.load_params(tmp_path / "p.msgpack")
+    np.testing.assert_array_equal(read["dense"]["kernel"], tree["dense"]["kernel"])
+    assert read["step"] == 7
+    shaped = artifacts.load_params(tmp_path / "p.msgpack", target=tree)
+    np.testing.assert_array_equal(shaped["dense"]["kernel"], tree["dense"]["kernel"])
+    with pytest.raises(UserError, match="does not fit"):
+        artifacts.load_params(tmp_path / "p.msgpack", target={"dense": {"other": np.zeros(3)}, "step": 0})
+
+
+def test_damaged_truncated_or_foreign_parameters_are_refused(tmp_path):
+    path = tmp_path / "p.msgpack"
+    artifacts.save_params(path, {"a": np.zeros(100)})
+    data = path.read_bytes()
+    for damaged in (data[:-10], data[:-1] + bytes([data[-1] ^ 1]), data[:20]):
+        path.write_bytes(damaged)
+        with pytest.raises(UserError, match=r"p\.msgpack is damaged or truncated"):
+            artifacts.load_params(path)
+    path.write_bytes(b"PK\x03\x04 something else")
+    with pytest.raises(UserError, match="is no parameter file of this project"):
+        artifacts.load_params(path)
+    with pytest.raises(UserError, match="does not exist"):
+        artifacts.load_params(tmp_path / "absent")

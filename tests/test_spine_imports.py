@@ -1,0 +1,179 @@
+"""The dependency rule: imports go down the list of packages, and the robot side never imports JAX."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ORDER = (
+    "ddgrasp", "mjx_envs", "ppo", "demos", "sensors", "ddg_jax", "student_jax", "export", "deploy",
+    "evaluation",
+)  # fmt: skip
+"""A package imports itself and those before it."""
+LAZY = {"ddgrasp.pipeline", "ddgrasp.commands", "ddgrasp.cli"}
+"""They name the flow, and import stages inside functions only."""
+JAX = {"jax", "jaxlib", "flax", "optax", "brax", "orbax", "mujoco.mjx", "mujoco_playground"}
+JAX_FREE = (
+    "ddgrasp", "deploy", "evaluation", "export.metadata", "mjx_envs.scene", "mjx_envs.objects",
+    "mjx_envs.ray_geometry", "mjx_envs.raycast_numpy", "mjx_envs.camera", "mjx_envs.rig",
+    "sensors.active_stereo", "sensors.recordings",
+)  # fmt: skip
+"""Packages and modules whose module-level imports must not reach JAX, however indirectly."""
+
+
+def test_imports_go_down_the_list():
+    assert upward_imports(ROOT) == []
+
+
+def test_module_level_imports_of_the_robot_side_never_reach_jax():
+    graph = module_graph(ROOT)
+    wrong = {
+        name: path for name in sorted(graph) if _under(name, JAX_FREE) and (path := _path_to_jax(name, graph))
+    }
+    assert wrong == {}
+
+
+def test_deploy_names_jax_nowhere_not_even_inside_functions():
+    named = {
+        f"{module}: {name}"
+        for module, file in modules(ROOT).items()
+        if module.split(".")[0] == "deploy"
+        for name, _ in imports(file, module)
+        if _under(name, JAX)
+    }
+    assert named == set()
+
+
+def test_importing_every_deploy_module_loads_no_jax():
+    names = [name for name in modules(ROOT) if name.split(".")[0] == "deploy"]
+    loaded = "sorted({'jax', 'jaxlib', 'flax'} & set(sys.modules))"
+    code = f"import sys\nfor name in {names}: __import__(name)\nprint({loaded})"
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_every_package_with_code_is_installed():
+    import tomllib
+
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    nested = [
+        str(path.parent.relative_to(ROOT)) for name in ORDER for path in (ROOT / name).rglob("__init__.py")
+    ]
+    assert sorted(listed) == sorted(path.replace("/", ".") for path in nested)
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        ({"ppo/a.py": "from student_jax import b\n"}, ["ppo.a imports student_jax"]),
+        ({"ppo/a.py": "def f():\n    import evaluation.html\n"}, ["ppo.a imports evaluation"]),
+        ({"ddgrasp/x.py": "import ppo.a\n"}, ["ddgrasp.x imports ppo"]),
+        ({"ddgrasp/pipeline.py": "import ppo.a\n"}, ["ddgrasp.pipeline imports ppo"]),
+        ({"ddgrasp/pipeline.py": "def f():\n    import ppo.a\n"}, []),
+        ({"student_jax/a.py": "from ddgrasp import errors\nimport mjx_envs.scene\n"}, []),
+    ],
+)
+def test_the_rule_finds_violations(tmp_path, files, expected):
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert upward_imports(tmp_path) == expected
+
+
+def test_the_jax_rule_finds_an_indirect_import(tmp_path):
+    files = {
+        "deploy/loop.py": "from sensors import cam\n",
+        "sensors/cam.py": "import numpy\nfrom mjx_envs.ray import x\n",
+        "mjx_envs/ray.py": "import jax.numpy as jnp\n",
+        "mjx_envs/lazy.py": "def f():\n    import jax\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    graph = module_graph(tmp_path)
+    assert _path_to_jax("deploy.loop", graph) == ["deploy.loop", "sensors.cam", "mjx_envs.ray", "jax.numpy"]
+    assert _path_to_jax("mjx_envs.lazy", graph) is None
+
+
+# --- the parser ----------------------------------------------------------------------------------
+
+
+def modules(root: Path) -> dict[str, Path]:
+    """Dotted name -> file of every module under the packages of ORDER."""
+    found = {}
+    for package in ORDER:
+        for file in sorted((root / package).rglob("*.py")):
+            parts = file.relative_to(root).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    return found
+
+
+def imports(file: Path, module: str) -> Iterator[tuple[str, bool]]:
+    """(imported name, whether at module level) of every import; `from a import b` names a.b."""
+    package = module if file.name == "__init__.py" else module.rpartition(".")[0]
+
+    def visit(node: ast.AST, top: bool) -> Iterator[tuple[str, bool]]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+                continue
+            if isinstance(child, ast.Import):
+                yield from ((alias.name, top) for alias in child.names)
+            elif isinstance(child, ast.ImportFrom):
+                base = child.module or ""
+                if child.level:
+                    base = ".".join([*package.split(".")[: len(package.split(".")) - child.level + 1], base])
+                yield from ((f"{base}.{alias.name}".replace("..", "."), top) for alias in child.names)
+            inside = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+            yield from visit(child, top and not inside)
+
+    yield from visit(ast.parse(file.read_text()), True)
+
+
+def upward_imports(root: Path) -> list[str]:
+    """Every import that breaks the order, inside functions too except in LAZY modules."""
+    wrong = []
+    for module, file in modules(root).items():
+        package = module.split(".")[0]
+        for name, top in imports(file, module):
+            target = name.split(".")[0]
+            allowed = target not in ORDER or ORDER.index(target) <= ORDER.index(package)
+            if not allowed and (top or module not in LAZY):
+                wrong.append(f"{module} imports {target}")
+    return wrong
+
+
+def module_graph(root: Path) -> dict[str, list[str]]:
+    """Module -> names it imports at module level; project names are resolved to modules."""
+    files = modules(root)
+    graph = {}
+    for module, file in files.items():
+        targets = [parent] if (parent := module.rpartition(".")[0]) in files else []
+        for name, top in imports(file, module):
+            if not top:
+                continue
+            resolved = name if name in files else name.rpartition(".")[0]
+            targets.append(resolved if resolved in files else name)
+        graph[module] = targets
+    return graph
+
+
+def _path_to_jax(module: str, graph: dict[str, list[str]]) -> list[str] | None:
+    """Chain of imports from `module` to JAX, None if there is none."""
+    seen, queue = {module}, [[module]]
+    while queue:
+        path = queue.pop(0)
+        for name in graph.get(path[-1], []):
+            if _under(name, JAX):
+                return [*path, name]
+            if name in graph and name not in seen:
+                seen.add(name)
+                queue.append([*path, name])
+    return None
+
+
+def _under(name: str, prefixes) -> bool:
+    return any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes)

@@ -1,0 +1,196 @@
+"""The pipeline with two small stages of its own: order, resume, refusals, interruption, time."""
+
+import dataclasses
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from ddgrasp import artifacts, pipeline
+from ddgrasp.config import Config, WorldConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress, read_curves
+
+CONFIG = Config(preset="debug")
+ROOT = Path(__file__).parents[1]
+
+STAGE = """
+from ddgrasp import artifacts
+
+def run(config, run_dir, *, resume, progress):
+    directory = run_dir / NAME
+    with open(run_dir / "log.txt", "a") as log:
+        log.write(f"{NAME} resume={resume}\\n")
+    if (run_dir / f"fail_{NAME}").exists():
+        raise OSError(28, "No space left on device")
+    parents = [artifacts.require(run_dir, name, config) for name in PARENTS]
+    return artifacts.finish(directory, NAME, config, seconds=progress.seconds, metrics={}, parents=parents)
+"""
+
+
+@pytest.fixture
+def stages(tmp_path, monkeypatch):
+    """Real stage packages on disk, named as the first and third of the flow."""
+    monkeypatch.syspath_prepend(str(tmp_path / "code"))
+    made = []
+    for name, package, parents in (("teacher", "stage_a_pkg", ()), ("record", "stage_b_pkg", ("teacher",))):
+        folder = tmp_path / "code" / package
+        folder.mkdir(parents=True)
+        (folder / "__init__.py").write_text("")
+        (folder / "stage.py").write_text(f"NAME = {name!r}\nPARENTS = {parents!r}\n{STAGE}")
+        made.append(pipeline.Stage(name, package, parents, f"makes {name}"))
+    yield made
+    for name in [name for name in sys.modules if name.startswith(("stage_a_pkg", "stage_b_pkg"))]:
+        del sys.modules[name]
+
+
+def _run(stages, run_dir, config=CONFIG, resume=False):
+    return pipeline.run(config, run_dir, resume=resume, stages=stages, quiet=True)
+
+
+def _log(run_dir):
+    return (run_dir / "log.txt").read_text().splitlines()
+
+
+def test_stages_run_in_order_and_the_report_has_them(stages, tmp_path):
+    report = _run(stages, tmp_path / "run")
+    assert _log(tmp_path / "run") == ["teacher resume=False", "record resume=False"]
+    assert set(report["stages"]) == {"teacher", "record"}
+    assert report["stages"]["record"]["trained"] is True
+    assert (tmp_path / "run" / "report.html").stat().st_size > 1000
+
+
+def test_the_flow_lists_every_stage_after_its_parents():
+    names = [stage.name for stage in pipeline.STAGES]
+    assert names == ["teacher", "demos", "record", "ddg", "student", "export", "deploy"]
+    for index, stage in enumerate(pipeline.STAGES):
+        assert set(stage.parents) <= set(names[:index])
+        assert stage.name in artifacts.STAGE_FIELDS
+
+
+def test_resume_does_only_what_is_left(stages, tmp_path):
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    (run_dir / "fail_record").touch()
+    with pytest.raises(OSError, match="No space left"):
+        _run(stages, run_dir)
+    (run_dir / "fail_record").unlink()
+    teacher = artifacts.read_artifact(run_dir / "teacher")
+    _run(stages, run_dir, resume=True)
+    assert _log(run_dir) == ["teacher resume=False", "record resume=False", "record resume=True"]
+    assert artifacts.read_artifact(run_dir / "teacher") == teacher
+    _run(stages, run_dir, resume=True)
+    assert len(_log(run_dir)) == 3
+
+
+def test_resume_in_an_empty_place_just_starts(stages, tmp_path):
+    _run(stages, tmp_path / "new", resume=True)
+    assert len(_log(tmp_path / "new")) == 2
+
+
+def test_a_run_is_not_overwritten_without_resume(stages, tmp_path):
+    run_dir = tmp_path / "run"
+    _run(stages, run_dir)
+    before = artifacts.read_artifact(run_dir / "teacher")
+    with pytest.raises(UserError, match="holds a finished stage: continue with --resume, or choose another"):
+        _run(stages, run_dir)
+    assert artifacts.read_artifact(run_dir / "teacher") == before
+    (run_dir / "teacher" / artifacts.MANIFEST).unlink()
+    with pytest.raises(UserError, match="holds an unfinished stage"):
+        _run(stages, run_dir)
+
+
+def test_resume_with_another_config_is_refused_and_loses_nothing(stages, tmp_path):
+    run_dir = tmp_path / "run"
+    _run(stages, run_dir)
+    before = artifacts.read_artifact(run_dir / "record")
+    other = dataclasses.replace(CONFIG, world=WorldConfig(episode_steps=7))
+    with pytest.raises(UserError, match=r"world\.episode_steps is 60 there, 7 here"):
+        _run(stages, run_dir, other, resume=True)
+    assert artifacts.read_artifact(run_dir / "record") == before
+
+
+def test_a_child_of_a_replaced_parent_is_refused(stages, tmp_path):
+    run_dir = tmp_path / "run"
+    _run(stages, run_dir)
+    (run_dir / "teacher" / artifacts.MANIFEST).unlink()
+    with pytest.raises(UserError, match=r"record was made from another teacher .* delete"):
+        _run(stages, run_dir, resume=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_says_how_to_go_on_and_keeps_the_time_spent(tmp_path, number):
+    """A real process gets a real signal while its stage works, as after Ctrl-C."""
+    code = f"""
+        import sys, time, types
+        from pathlib import Path
+        from ddgrasp import cli, commands, pipeline
+        from ddgrasp.config import Config
+
+        def work(config, run_dir, *, resume, progress):
+            print("working", flush=True)
+            try:
+                time.sleep(60)
+            except KeyboardInterrupt:
+                raise RuntimeError("a host callback wraps the interrupt")
+
+        module = types.ModuleType("slow_pkg.stage")
+        module.run = work
+        sys.modules["slow_pkg"] = types.ModuleType("slow_pkg")
+        sys.modules["slow_pkg.stage"] = module
+        stage = pipeline.Stage("teacher", "slow_pkg", (), "nothing")
+
+        RUN_DIR = Path({str(tmp_path)!r})
+
+        class Slow:
+            def run(self):
+                pipeline.run_stage(stage, Config(preset="debug"), RUN_DIR, resume=True, quiet=True)
+
+        commands.parse = lambda name, args: Slow()
+        sys.exit(cli.main(["teacher", "train"]))
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout and process.stdout.readline() == "working\n"
+    time.sleep(0.3)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert errors.strip() == (
+        "ddgrasp: Interrupted in stage 'teacher'. Finished work is kept: "
+        "the same command with --resume goes on."
+    )
+    assert Progress(tmp_path / "teacher").seconds >= 0.3
+
+
+def test_curves_count_a_repeated_step_once_and_skip_a_torn_line(tmp_path):
+    progress = Progress(tmp_path, quiet=True)
+    progress.scalars(1, loss=3.0)
+    progress.scalars(2, loss=2.0, success=0.5)
+    progress.close()
+    resumed = Progress(tmp_path, quiet=True)
+    resumed.scalars(2, loss=1.5)
+    resumed.close()
+    with open(tmp_path / "curves.jsonl", "a") as file:
+        file.write('{"step": 3, "lo')
+    assert read_curves(tmp_path) == {"loss": [(1, 3.0), (2, 1.5)], "success": [(2, 0.5)]}
+    assert list((tmp_path / "tb").glob("events*"))
+
+
+def test_progress_prints_plain_lines_with_an_estimate_outside_a_terminal(capsys):
+    progress = Progress(None, "teacher")
+    with progress.task("PPO", 4) as task:
+        for _ in range(4):
+            time.sleep(0.01)
+            task.advance(success=0.9312)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("[teacher] PPO 1/4  0 s left  success 0.931")
+    assert lines[-1] == "[teacher] PPO 4/4  success 0.931"
