@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from ddgrasp import contract
+from ddgrasp.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -191,6 +192,73 @@ class RecordConfig:
 class DDGConfig:
     """Diffusion Depth Generator."""
 
+    # --- depth as the diffusion model sees it (ddg_jax/normalise.py) ---
+    height_px: int = 180
+    """Rows of the generated map."""
+    width_px: int = 320
+    """Columns of the generated map."""
+    near_m: float = 0.25
+    """Nearest depth that is told apart."""
+    far_m: float = 10.0
+    """Farthest depth that is told apart."""
+    noise_threshold: float = -0.5
+    """The paper's noise_threshold: below it a generated pixel is a hole (holes are -1, surfaces 0 to 1)."""
+    # --- geometric prior c (ddg_jax/prior.py) ---
+    prior: str = "inverse_depth"
+    """Where c comes from: inverse_depth (built in)."""
+    prior_blur_px: float = 1.0
+    """Gaussian blur of c in pixels: hides where a recording's holes were filled."""
+    prior_noise: float = 0.03
+    """Standard deviation of noise added to c in training and sampling, for the same reason."""
+    prior_jitter: float = 0.1
+    """Relative scale and shift of c varied in training, so that it need not match to the last percent."""
+    decoy_holes: float = 0.5
+    """Share of training frames whose prior is filled under another frame's holes as well."""
+    # --- U-Net (ddg_jax/unet.py) ---
+    space_to_depth: int = 4
+    """Pixels per side folded into channels before the U-Net."""
+    widths: tuple[int, ...] = (32, 48, 96)
+    """Channels per level; every level halves height and width."""
+    blocks: tuple[int, ...] = (0, 1, 0)
+    """Residual blocks per level, in the encoder and again in the decoder; two more sit in the middle."""
+    attention_heads: int = 4
+    """Attention heads in the middle; 0 turns attention off."""
+    # --- diffusion (ddg_jax/schedule.py) ---
+    diffusion_steps: int = 1000
+    """Steps K of the forward process."""
+    schedule: str = "cosine"
+    """Noise schedule: cosine or linear."""
+    log_snr_shift: float = 0.0
+    """Moves the schedule's log signal-to-noise ratio; negative is noisier."""
+    # --- training (ddg_jax/train.py) ---
+    train_steps: int = 1500
+    """Optimiser steps."""
+    batch_size: int = 16
+    """Frames per step."""
+    learning_rate: float = 1e-3
+    """AdamW's step size after the warm-up; falls to a twentieth along a cosine."""
+    weight_decay: float = 1e-4
+    """AdamW's weight decay."""
+    ema_decay: float = 0.995
+    """Decay of the averaged parameters, which are the ones used."""
+    checkpoint_every: int = 250
+    """Steps between whole-state checkpoints."""
+    holdout_fraction: float = 0.1
+    """Share of the frames, the last ones, kept out of training for the statistics and pictures."""
+    init_from: str = ""
+    """Folder with a fitted generator to use instead of fitting one; empty fits."""
+    # --- sampling (ddg_jax/sample.py) ---
+    sampler: str = "ddim"
+    """ddim (few steps) or ddpm (ancestral)."""
+    sample_steps: int = 5
+    """Network evaluations per map."""
+    eta: float = 0.0
+    """Fresh noise in DDIM: 0 none, 1 as much as DDPM."""
+    frame_correlation: float = 0.9
+    """Share of the initial noise's variance that the frames of an episode have in common."""
+    sample_batch: int = 16
+    """Frames generated together."""
+
 
 @dataclass(frozen=True)
 class StudentConfig:
@@ -268,6 +336,48 @@ class ExportConfig:
 @dataclass(frozen=True)
 class DeployConfig:
     """Control loop on the robot side."""
+
+    noise: str = "zero"
+    """Start of the reverse diffusion: zero (deterministic) or normal (seeded)."""
+    execute_steps: int = 0
+    """Actions played from a chunk before the network runs again; 0 takes the exported file's own."""
+    stale_periods: float = 2.0
+    """A frame older than this many control periods makes the robot hold position."""
+    acceleration_scale: float = 2.0
+    """Largest change between two steps, relative to Franka's acceleration limit. Targets lead the arm, so
+    they may change faster than the arm itself; from 2.8 on, a full reversal of any joint passes."""
+    workspace_lower_m: tuple[float, float, float] = (0.15, -0.45, 0.012)
+    """Where the point between the finger pads may go, robot base frame; 12 mm = fingertips on the table."""
+    workspace_upper_m: tuple[float, float, float] = (0.80, 0.45, 0.80)
+    """The box's other corner."""
+    realtime_trials: int = 3
+    """Trials on the machine's own clock, which time keeping is measured on (success on evaluation.rig_trials)."""
+    workers: int = 2
+    """Processes that run simulated-clock trials."""
+    film_every: int = 6
+    """Steps between two columns of a trial's film strip."""
+    franka_host: str = "172.16.0.2"
+    """Address of the robot's control unit."""
+    franka_dynamics: float = 0.2
+    """Share of the arm's velocity, acceleration and jerk limits that a real robot uses."""
+    franka_grip_force_n: float = 20.0
+    """Force of a real gripper."""
+    realsense_serial: str = ""
+    """Serial number of the camera; empty takes the first one found."""
+
+    def __post_init__(self) -> None:
+        if self.noise not in ("zero", "normal"):
+            raise UserError(f"deploy.noise is {self.noise!r}; expected zero or normal.")
+        if self.realtime_trials < 1 or self.film_every < 1:
+            raise UserError(
+                f"deploy.realtime_trials is {self.realtime_trials}, deploy.film_every {self.film_every}; "
+                "expected at least 1."
+            )
+        if any(low >= high for low, high in zip(self.workspace_lower_m, self.workspace_upper_m, strict=True)):
+            raise UserError(
+                f"deploy.workspace is {self.workspace_lower_m} to {self.workspace_upper_m}; expected the lower "
+                "corner below the upper one in x, y and z."
+            )
 
 
 @dataclass(frozen=True)
