@@ -301,6 +301,8 @@ class StudentConfig:
     # --- action head (student_jax/denoiser.py) ---
     chunk: int = 4
     """Actions predicted at once."""
+    execute_steps: int = 2
+    """Actions of a chunk that are executed before the policy looks again."""
     state_features: int = 64
     """Width of the joint-state stream."""
     denoiser_width: int = 256
