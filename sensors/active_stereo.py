@@ -41,6 +41,8 @@ TEXELS_PER_PX = 3
 """Resolution of the stored pattern."""
 TEXTURE_PX, TEXTURE_PX_PER_M = 512, 400.0
 """Size and scale of the albedo texture that `Material.texture` weighs (a 1.3 m tile)."""
+NEAR_INFRARED_RGB = (0.7, 0.2, 0.1)
+"""Weights by which a guess of the near-infrared reflectance follows the visible colour."""
 CONTRAST_WINDOW_PX = 9
 
 
@@ -57,9 +59,10 @@ class Material:
 
     @classmethod
     def from_rgb(cls, rgb, specular: float = 0.05, texture: float = 0.0) -> "Material":
-        """Near-infrared reflectance follows red more than green and blue."""
+        """A guess: near-infrared reflectance follows red more than green and blue."""
         red, green, blue = (float(c) for c in rgb[:3])
-        return cls(0.05 + 0.9 * (0.7 * red + 0.2 * green + 0.1 * blue), specular, texture)
+        r, g, b = NEAR_INFRARED_RGB
+        return cls(0.05 + 0.9 * (r * red + g * green + b * blue), specular, texture)
 
 
 class ActiveStereo:
@@ -128,7 +131,8 @@ class ActiveStereo:
                 self._radiance(buffers, T_world_cam, imager_m, projector_m - imager_m, lit_m, materials)
             )
         exposure = self.config.exposure_target / max(float(images[0].mean()), 1e-6)
-        return tuple(self._expose(image, exposure, rng) for image in images)
+        left, right = (self._expose(image, exposure, rng) for image in images)
+        return left, right
 
     def disparity(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """(H, W) float32 disparity of the left picture in pixels, 0 = no match."""
@@ -195,13 +199,13 @@ class ActiveStereo:
         default = Material.from_rgb((0.5, 0.5, 0.5))
         ids = buffers.segmentation
         count = max(int(ids.max()), max(materials or (0,))) + 2
-        table = np.tile(np.float32([-1.0, default.specular, 0.0]), (count, 1))
+        table = np.tile(np.array([-1.0, default.specular, 0.0], np.float32), (count, 1))
         for geom, material in (materials or {}).items():
             table[geom + 1] = material.albedo, material.specular, material.texture
         albedo, specular, texture = (column[ids + 1] for column in table.T.copy())
         unknown = albedo < 0
         if unknown.any():
-            albedo[unknown] = 0.05 + 0.9 * (rgb[unknown] @ np.float32([0.7, 0.2, 0.1]))
+            albedo[unknown] = 0.05 + 0.9 * (rgb[unknown] @ np.array(NEAR_INFRARED_RGB, np.float32))
         if table[:, 2].any():
             T = (T_world_imager * TEXTURE_PX_PER_M).astype(np.float32)
             u, v = (T[i, 0] * x_z + T[i, 1] * y_z + T[i, 2] * z + T[i, 3] for i in (0, 1))
@@ -285,7 +289,7 @@ def _albedo_texture(seed: int) -> np.ndarray:
 
 def _matcher(config: StereoConfig, disparities: int) -> cv2.StereoSGBM:
     area = config.block_px**2
-    return cv2.StereoSGBM_create(
+    return cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=disparities,
         blockSize=config.block_px,
@@ -336,8 +340,8 @@ def _refine(
     left = left - cv2.blur(left, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX))
     right = right - cv2.blur(right, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX))
     gradient = cv2.Sobel(right, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-    rows, columns = np.indices(left.shape, dtype=np.float32)
-    at = columns - coarse_px
+    grid = np.indices(left.shape, dtype=np.float32)
+    rows, at = grid[0], grid[1] - coarse_px
     matched = cv2.remap(right, at, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     slope = cv2.remap(gradient, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     window = (window_px, window_px)

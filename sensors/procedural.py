@@ -77,10 +77,10 @@ def _smooth(shape: tuple[int, ...], scale_px: int, rng: np.random.Generator) -> 
 
 def _shifted(depth_m: np.ndarray, rng: np.random.Generator, config: ProceduralConfig) -> np.ndarray:
     """Each pixel looks up its depth a little beside itself: edges become ragged."""
-    rows, columns = np.indices(depth_m.shape, dtype=np.float32)
-    for axis in (rows, columns):
+    grid = np.indices(depth_m.shape, dtype=np.float32)
+    for axis in grid:
         axis += config.shift_px * _smooth(depth_m.shape, config.shift_scale_px, rng)
-    return cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(depth_m, grid[1], grid[0], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _draw_sticks(depth_m: np.ndarray, rng: np.random.Generator, config: ProceduralConfig) -> None:

@@ -374,7 +374,8 @@ def _all_invalid(data: bytes, height: int, width: int) -> bool:
     # Only constant pictures shrink this far, so only they need decoding here.
     if len(data) > 200 + height * width / 50:
         return False
-    return not cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).any()
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return image is None or not image.any()
 
 
 def _check_unit(recording: Recording) -> None:

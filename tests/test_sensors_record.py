@@ -1,0 +1,66 @@
+"""Recording on the rig: what is kept, what is not, and that it can be repeated."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ddgrasp import contract
+from ddgrasp.presets import get_preset
+from sensors.recordings import Recording
+from sensors.rig_camera import RigCamera
+from sensors.stage import act, record_trajectory
+
+rig = pytest.importorskip("mjx_envs.rig", reason="the rig is not there")
+
+
+@pytest.fixture(scope="module")
+def config():
+    config = get_preset("debug")
+    return dataclasses.replace(config, record=dataclasses.replace(config.record, frames=4))
+
+
+def _record(config, path, index=0) -> Recording:
+    world = rig.RigWorld(objects=config.world.objects, randomise=True)
+    camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+
+    def reach_down(observation: np.ndarray) -> np.ndarray:
+        assert observation.shape == (contract.OBSERVATION_SIZE,)
+        return np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.5, 0.0, -1.0])
+
+    record_trajectory(config, index, path, world, camera, reach_down)
+    return Recording.open(path)
+
+
+def test_trajectory_is_rgbd_and_nothing_else(config, tmp_path):
+    recording = _record(config, tmp_path / "rig_0000")
+    assert len(recording) == 4 and recording.consecutive
+    assert (recording.height_px, recording.width_px) == (180, 320)
+    assert sorted(p.name for p in recording.path.iterdir()) == ["color", "depth", "meta.json"]
+    assert not any("pose" in key or "T_" in key or "position" in key for key in recording.meta)
+    first, last = recording.depth_mm(0), recording.depth_mm(3)
+    assert 0.05 < np.mean(first == 0) < 0.3
+    # The robot moved: some pixels changed by centimetres, most only by noise.
+    both = (first > 0) & (last > 0)
+    change = np.abs(first.astype(int) - last)[both]
+    assert np.mean(change > 50) > 0.003 and np.median(change) < 10
+
+
+def test_same_index_gives_the_same_recording_another_index_another_view(config, tmp_path):
+    one, two = (_record(config, tmp_path / name) for name in ("a", "b"))
+    other = _record(config, tmp_path / "c", index=1)
+    np.testing.assert_array_equal(one.depth_mm(2), two.depth_mm(2))
+    assert np.mean(one.depth_mm(2) != other.depth_mm(2)) > 0.5
+
+
+def test_action_is_scaled_and_clipped_to_the_joint_limits(config):
+    world = rig.RigWorld(objects=config.world.objects, randomise=False)
+    world.reset(0, "cube")
+    before, _ = world.state()
+    for _ in range(10):
+        act(world, np.array([1.0, 0, 0, 0, 0, 0, 0, 1.0]))
+    after, width_m = world.state()
+    # Ten steps of 0.1 rad, less the lag of the first, give or take an overshoot.
+    assert 0.5 < after[0] - before[0] <= 10 * contract.ACTION_SCALE_RAD * 1.05
+    assert np.all(after <= np.array(contract.JOINT_UPPER_RAD) + 0.02)
+    assert width_m < 0.03
