@@ -132,8 +132,8 @@ class StereoConfig:
     """Where the projector sits between the left (0) and the right (1) imager."""
     dots: int = 7000
     """Dots of the pattern in the imager's field of view."""
-    dot_radius_px: float = 0.55
-    """Gaussian radius of a dot in pixels of the imager, its own blur included."""
+    dot_radius_mrad: float = 3.3
+    """Gaussian radius of a dot as the imagers see it."""
     projector_power: float = 1.8
     """Irradiance of a dot's centre at one metre, relative to the ambient light's."""
     pattern_seed: int = 455

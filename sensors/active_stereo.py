@@ -269,7 +269,7 @@ def _dot_pattern(config: StereoConfig, profile: CameraProfile, projector: Camera
     texture = np.zeros((height, width), np.float32)
     rows, columns = rng.integers(0, height, count), rng.integers(0, width, count)
     np.add.at(texture, (rows, columns), rng.uniform(0.6, 1.0, count).astype(np.float32))
-    sigma = config.dot_radius_px * TEXELS_PER_PX
+    sigma = config.dot_radius_mrad / 1000 * projector.fx_px * TEXELS_PER_PX
     texture = cv2.GaussianBlur(texture, (0, 0), sigma) * (2 * math.pi * sigma**2)
     x = ((np.arange(width) + 0.5) / TEXELS_PER_PX - projector.cx_px) / projector.fx_px
     y = ((np.arange(height) + 0.5) / TEXELS_PER_PX - projector.cy_px) / projector.fy_px
