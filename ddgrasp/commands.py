@@ -91,6 +91,32 @@ class Export(_OneStage):
 
 
 @dataclass(frozen=True)
+class Deploy:
+    """Run an exported policy on a robot and a camera at 10 Hz."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    """Without --preset: the configuration of the run that the policy lies in."""
+    policy: Path
+    """ONNX file that `ddgrasp export` wrote."""
+    robot: str = "sim"
+    """sim (the pseudo-real rig) or franka."""
+    camera: str = "stereo"
+    """stereo (the rig's own), realsense, or replay (a recording)."""
+    recording: Path | None = None
+    """Recording for camera replay."""
+    object_name: str = ""
+    """Object on the rig's table; empty takes the first configured one."""
+    seconds: float = 6.0
+    """How long to run; 0 runs until Ctrl-C."""
+
+    def run(self) -> None:
+        from deploy.session import SessionOptions, deploy, describe
+
+        options = SessionOptions(self.robot, self.camera, self.recording, self.object_name, self.seconds)
+        print(describe(deploy(self.config, self.policy, options)))
+
+
+@dataclass(frozen=True)
 class Report:
     """Write report.json and report.html of a run anew, and print the table."""
 
@@ -113,6 +139,7 @@ COMMANDS: dict[str, type] = {
     "record": Record,
     "student train": StudentTrain,
     "export": Export,
+    "deploy": Deploy,
     "report": Report,
 }
 
@@ -124,6 +151,9 @@ def parse(name: str, args: Sequence[str]) -> Command:
     if issubclass(cls, _FromPreset):
         preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
         options["default"] = cls(config=preset, out=Path("runs") / preset.preset)
+    elif cls is Deploy:
+        policy = Path(_option(args, "--policy") or Path("runs") / DEFAULT_PRESET / "export" / "policy.onnx")
+        options["default"] = Deploy(config=_config_of(policy, _option(args, "--preset")), policy=policy)
     return tyro.cli(
         cls,
         prog=f"ddgrasp {name}",
@@ -160,6 +190,13 @@ def check_config_values(config: Config) -> Config:
 def load_config(run_dir: Path, stage: str) -> Config:
     """The configuration that made the finished `stage` of a run."""
     return artifacts.config_from_json(artifacts.read_manifest(run_dir / stage).config)
+
+
+def _config_of(policy: Path, preset: str | None) -> Config:
+    """The named preset; else what made the artefact beside `policy`; else the default preset."""
+    if preset is None and artifacts.is_finished(policy.parent):
+        return artifacts.config_from_json(artifacts.read_manifest(policy.parent).config)
+    return get_preset(preset or DEFAULT_PRESET)
 
 
 def _option(args: Sequence[str], name: str) -> str | None:

@@ -16,6 +16,8 @@ from ddgrasp import contract
 DEPTH_COLORS = "viridis_r"
 INVALID_RGB = (1.0, 0.0, 1.0)
 """Magenta: no depth is drawn in it."""
+MAX_FRAMES = 8
+"""Of a film strip."""
 
 
 def depth_to_metres(depth: np.ndarray) -> np.ndarray:
@@ -50,6 +52,7 @@ def draw_panels(panels: Mapping[str, np.ndarray]) -> bytes:
         title: _to_rgb(frame) if frame.ndim == 4 else color_depth(depth_to_metres(frame), near, far)
         for title, frame in frames.items()
     }
+    strips = {title: _thin(strip) for title, strip in strips.items()}
     longest = max(len(strip) for strip in strips.values())
     if longest == 1:
         figure = _grid([[strip[0] for strip in strips.values()]], list(strips), [""])
@@ -82,6 +85,13 @@ def _as_frames(panel: np.ndarray) -> np.ndarray:
         raise ValueError(f"picture panel of shape {panel.shape}; expected (T,) (H, W) depth or (H, W, 3) RGB")
     single = 3 if is_rgb else 2
     return panel[None] if panel.ndim == single else panel
+
+
+def _thin(strip: np.ndarray) -> np.ndarray:
+    """At most MAX_FRAMES of a film, evenly spread, first and last included."""
+    if len(strip) <= MAX_FRAMES:
+        return strip
+    return strip[np.linspace(0, len(strip) - 1, MAX_FRAMES).round().astype(int)]
 
 
 def _to_rgb(frames: np.ndarray) -> np.ndarray:

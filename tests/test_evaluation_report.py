@@ -129,5 +129,8 @@ def test_film_strips_have_a_row_per_panel():
     single = figures.draw_panels({"clean": np.full((18, 32), 0.8)})
     sizes = [cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR).shape for png in (strip, single)]
     assert sizes[0][0] > sizes[1][0] and sizes[0][1] > sizes[1][1]
+    assert figures.draw_panels({"long": np.full((60, 18, 32), 0.8)}) == figures.draw_panels(
+        {"long": np.full((figures.MAX_FRAMES, 18, 32), 0.8)}
+    )
     with pytest.raises(ValueError, match="picture panel of shape"):
         figures.draw_panels({"bad": np.zeros(3)})
