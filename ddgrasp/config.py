@@ -162,7 +162,7 @@ class StereoConfig:
     """Largest disagreement of the left-right check, pixels."""
     speckle_px: int = 16
     """Smaller islands of disparity are removed."""
-    residual_limit: float = 0.8
+    residual_limit: float = 0.83
     """Largest matching residual relative to the local contrast of both images; 1.4 is pure noise."""
     refine_window_px: int = 5
     """Window of the sub-pixel step."""
