@@ -1,0 +1,90 @@
+"""What the control loop needs from a camera, a robot and a clock.
+
+All timestamps are seconds on the clock's own monotonic scale, so that ages can be told.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One raw depth picture as the camera gave it."""
+
+    depth: np.ndarray
+    """(H, W) planar depth: uint16 millimetres or float32 metres; 0 = invalid."""
+    timestamp_s: float
+    """When it was exposed, on the loop's clock."""
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """Measured joints."""
+
+    q_rad: np.ndarray
+    """(7,) arm joint positions."""
+    width_m: float
+    """Opening between the finger pads."""
+    timestamp_s: float
+
+    def vector(self) -> np.ndarray:
+        """(8,) float32, the policy's state input: arm joints (rad), then the gripper's width (m)."""
+        return np.append(self.q_rad, self.width_m).astype(np.float32)
+
+
+class CameraError(Exception):
+    """A camera gave no frame (unplugged, timed out). The loop holds position and tries again."""
+
+
+class Camera(Protocol):
+    """A depth camera that always hands out its newest frame."""
+
+    def start(self) -> None:
+        """Open the device."""
+        ...
+
+    def read(self) -> Frame:
+        """The newest frame, the same one again if there is no newer. Raises CameraError."""
+        ...
+
+    def stop(self) -> None:
+        """Close the device; also called where `start` failed or was never reached."""
+        ...
+
+
+class Robot(Protocol):
+    """A seven-joint arm with a parallel gripper, position controlled."""
+
+    def start(self) -> None:
+        """Connect."""
+        ...
+
+    def read_state(self) -> RobotState:
+        """Measured joints and gripper width."""
+        ...
+
+    def command(self, q_target_rad: np.ndarray, close: bool) -> None:
+        """Set the (7,) joint target and the gripper, without waiting for the motion to end."""
+        ...
+
+    def hold(self) -> None:
+        """Stay where the arm is; the gripper keeps what it does."""
+        ...
+
+    def stop(self) -> None:
+        """Stop any motion and disconnect; also called where `start` failed or was never reached."""
+        ...
+
+
+class Clock(Protocol):
+    """Time of the loop."""
+
+    def now(self) -> float:
+        """Seconds, monotonic."""
+        ...
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Return at `deadline_s` or, where that has passed, at once. Never early."""
+        ...

@@ -1,0 +1,45 @@
+"""Where the Franka's hand is, in NumPy. Source: Franka's published modified Denavit-Hartenberg table."""
+
+import numpy as np
+
+DH_A_M = (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088)
+DH_D_M = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0)
+DH_ALPHA_RAD = (0.0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, np.pi / 2)
+FLANGE_D_M = 0.107
+HAND_YAW_RAD = -np.pi / 4
+GRIP_D_M = 0.1034
+"""From the hand's mounting face to the middle of the finger pads."""
+
+
+def grip_pose(q_rad: np.ndarray) -> np.ndarray:
+    """(4, 4) T_base_grip for (7,) joint positions: z points out of the hand, the fingers open along y."""
+    pose = np.eye(4)
+    for a, d, alpha, theta in zip(DH_A_M, DH_D_M, DH_ALPHA_RAD, q_rad, strict=True):
+        pose = pose @ _modified_dh(a, d, alpha, theta)
+    return pose @ _modified_dh(0.0, FLANGE_D_M, 0.0, HAND_YAW_RAD) @ _modified_dh(0.0, GRIP_D_M, 0.0, 0.0)
+
+
+def grip_position(q_rad: np.ndarray) -> np.ndarray:
+    """(3,) position of the point between the finger pads in the robot's base frame, metres."""
+    return grip_pose(q_rad)[:3, 3]
+
+
+def position_jacobian(q_rad: np.ndarray) -> np.ndarray:
+    """(3, 7) derivative of `grip_position` by the joints: z_i x (grip - origin_i)."""
+    pose, axes, origins = np.eye(4), [], []
+    for a, d, alpha, theta in zip(DH_A_M, DH_D_M, DH_ALPHA_RAD, q_rad, strict=True):
+        pose = pose @ _modified_dh(a, d, alpha, theta)
+        axes.append(pose[:3, 2])
+        origins.append(pose[:3, 3])
+    return np.cross(axes, grip_position(q_rad) - np.array(origins)).T
+
+
+def _modified_dh(a_m: float, d_m: float, alpha_rad: float, theta_rad: float) -> np.ndarray:
+    """(4, 4) link transform: Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d) (Craig's convention)."""
+    ca, sa, ct, st = np.cos(alpha_rad), np.sin(alpha_rad), np.cos(theta_rad), np.sin(theta_rad)
+    return np.array([
+        [ct, -st, 0.0, a_m],
+        [st * ca, ct * ca, -sa, -d_m * sa],
+        [st * sa, ct * sa, ca, d_m * ca],
+        [0.0, 0.0, 0.0, 1.0],
+    ])  # fmt: skip

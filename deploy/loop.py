@@ -1,0 +1,259 @@
+"""The control loop: sense, infer, act, at 10 Hz on absolute deadlines."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ddgrasp.errors import UserError
+from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotState
+from deploy.policy import OnnxPolicy
+from deploy.safety import NonFiniteAction, SafetyCounts, SafetyFilter
+from deploy.timing import Timings
+
+KEPT_EVENTS = 1000
+"""Events kept in a report; later ones are counted only."""
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """Time keeping of a loop."""
+
+    period_s: float = 0.1
+    stale_periods: float = 2.0
+    """A frame older than this many periods is stale."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something a person should know about a step."""
+
+    step: int
+    time_s: float
+    """Since the loop's start."""
+    kind: str
+    """hold, recover, missed, stop."""
+    reason: str
+
+    def __str__(self) -> str:
+        return f"step {self.step} ({self.time_s:.2f} s) {self.kind}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class Step:
+    """What happened in one period."""
+
+    index: int
+    frame: Frame | None
+    state: RobotState
+    action: np.ndarray | None
+    """(8,), None where the loop held position."""
+    q_target_rad: np.ndarray | None
+    """(7,) after the safety filter, None where the loop held position."""
+
+
+@dataclass
+class LoopReport:
+    """What a run of the loop did."""
+
+    period_s: float
+    steps: int = 0
+    holds: int = 0
+    """Steps that held position instead of following the policy."""
+    interrupted: bool = False
+    """Ended by Ctrl-C."""
+    timings: Timings = field(default_factory=Timings)
+    safety: SafetyCounts = field(default_factory=SafetyCounts)
+    events: list[Event] = field(default_factory=list)
+    events_dropped: int = 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "steps": self.steps,
+            "holds": self.holds,
+            "interrupted": self.interrupted,
+            "safety": self.safety.as_dict(),
+            "events": [str(event) for event in self.events],
+            "events_dropped": self.events_dropped,
+            **self.timings.summary(self.period_s),
+        }
+
+
+class ControlLoop:
+    """Drives `robot` by `policy` on what `camera` sees. One object, one run."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        robot: Robot,
+        policy: OnnxPolicy,
+        safety: SafetyFilter,
+        clock: Clock,
+        settings: LoopSettings,
+        say: Callable[[str], None] = lambda text: None,
+    ):
+        """`say` is called with one line per event, as it happens."""
+        self._camera, self._robot, self._policy = camera, robot, policy
+        self._safety, self._clock, self._settings, self._say = safety, clock, settings, say
+        self._report = LoopReport(settings.period_s, safety=safety.counts)
+        self._last_frame_s = -math.inf
+        self._held_for = ""
+
+    def run(
+        self, max_steps: int | None = None, on_step: Callable[[Step], bool | None] | None = None
+    ) -> LoopReport:
+        """Run until `max_steps`, until `on_step` returns True, or until Ctrl-C.
+
+        The last command has its whole period before this returns. Camera and robot are started here
+        and stopped whatever happens; on Ctrl-C the arm is told to hold first and the report comes back.
+        """
+        self._start_s = self._clock.now()
+        moving = False
+        try:
+            self._camera.start()
+            self._robot.start()
+            self._policy.warm_up()
+            moving = True
+            self._keep_time(max_steps, on_step)
+        except KeyboardInterrupt:
+            self._report.interrupted = True
+            if moving:
+                self._robot.hold()
+            self._log("stop", "interrupted; the robot holds position")
+        finally:
+            _stop_both(self._robot, self._camera)
+        return self._report
+
+    def _keep_time(self, max_steps: int | None, on_step: Callable[[Step], bool | None] | None) -> None:
+        deadline, previous, done = self._clock.now(), None, max_steps == 0
+        self._start_s = deadline
+        while not done:
+            self._clock.sleep_until(deadline)
+            begun = self._clock.now()
+            if previous is not None:
+                self._report.timings.period_s.append(begun - previous)
+            previous = begun
+            step = self._step()
+            self._report.steps += 1
+            done = self._report.steps == max_steps
+            if on_step is not None:
+                done = bool(on_step(step)) or done
+            deadline = self._next_deadline(deadline)
+        self._clock.sleep_until(deadline)
+
+    def _next_deadline(self, deadline: float) -> float:
+        """The next multiple of the period that is still ahead; skipped ones count as missed."""
+        period = self._settings.period_s
+        late = self._clock.now() - (deadline + period)
+        if late <= 0:
+            return deadline + period
+        missed = int(np.ceil(late / period))
+        self._report.timings.missed_deadlines += missed
+        self._log("missed", f"{missed} deadline(s), step took {1e3 * (late + period):.0f} ms")
+        return deadline + (1 + missed) * period
+
+    def _step(self) -> Step:
+        timings = self._report.timings
+        started = time.perf_counter()
+        frame, problem = self._sense_camera()
+        state = self._robot.read_state()
+        timings.sense_s.append(time.perf_counter() - started)
+        problem = problem or _state_problem(state)
+        action = None
+        started = time.perf_counter()
+        if frame is not None and not problem:
+            inferring = self._policy.will_infer
+            action = self._policy.act(frame.depth, state.vector())
+            if inferring:
+                timings.infer_s.append(time.perf_counter() - started)
+        acting = time.perf_counter()
+        target = None
+        if action is not None:
+            target, problem = self._command(state, action)
+        if problem:
+            self._hold(problem)
+        else:
+            self._recover()
+        ended = time.perf_counter()
+        timings.act_s.append(ended - acting)
+        if action is not None and inferring:
+            timings.latency_s.append(ended - started)
+        return Step(self._report.steps, frame, state, None if problem else action, target)
+
+    def _sense_camera(self) -> tuple[Frame | None, str]:
+        """The newest frame and why it cannot be used ("" if it can)."""
+        try:
+            frame = self._camera.read()
+        except CameraError as error:
+            return None, f"no frame: {error}"
+        previous_s, self._last_frame_s = self._last_frame_s, max(frame.timestamp_s, self._last_frame_s)
+        age_s = self._clock.now() - frame.timestamp_s
+        age = f"{1e3 * age_s:.0f} ms old"
+        if frame.timestamp_s == previous_s:
+            return frame, f"stale frame: the same one again ({age})"
+        if not age_s <= self._settings.stale_periods * self._settings.period_s:
+            return frame, f"stale frame: {age}"
+        if frame.timestamp_s < previous_s:
+            return frame, f"stale frame: older than the one before ({age})"
+        if self._report.steps == 0:
+            self._check_camera(frame)
+        return frame, self._policy.check_frame(frame.depth)
+
+    def _check_camera(self, frame: Frame) -> None:
+        """A camera that can never fit is the user's to change, before anything moves."""
+        problem = self._policy.check_fit(frame.depth) or self._policy.check_unit(frame.depth)
+        if problem:
+            raise UserError(
+                f"{problem}: set the camera to what {self._policy.path} takes, or export the policy for it "
+                "(world.camera_scale, export.depth_dtype)."
+            )
+
+    def _command(self, state: RobotState, action: np.ndarray) -> tuple[np.ndarray | None, str]:
+        """(7,) target sent, or why none was."""
+        try:
+            target, close, _ = self._safety.target(state.q_rad, action)
+        except NonFiniteAction as error:
+            return None, f"non-finite {error}"
+        self._robot.command(target, close)
+        return target, ""
+
+    def _hold(self, reason: str) -> None:
+        self._robot.hold()
+        self._safety.stopped()
+        # The arm stands still, so after the gap one frame repeated is what three frames would show.
+        self._policy.forget()
+        self._report.holds += 1
+        kind = reason.split(":")[0]
+        if kind != self._held_for:
+            self._log("hold", reason)
+        self._held_for = kind
+
+    def _recover(self) -> None:
+        if self._held_for:
+            self._log("recover", f"after {self._held_for}")
+        self._held_for = ""
+
+    def _log(self, kind: str, reason: str) -> None:
+        event = Event(self._report.steps, self._clock.now() - self._start_s, kind, reason)
+        if len(self._report.events) < KEPT_EVENTS:
+            self._report.events.append(event)
+        else:
+            self._report.events_dropped += 1
+        self._say(str(event))
+
+
+def _state_problem(state: RobotState) -> str:
+    if state.q_rad.shape != (7,) or not np.isfinite(state.q_rad).all() or not np.isfinite(state.width_m):
+        return f"bad joint state: {np.array2string(np.asarray(state.q_rad), precision=3)}"
+    return ""
+
+
+def _stop_both(robot: Robot, camera: Camera) -> None:
+    try:
+        robot.stop()
+    finally:
+        camera.stop()

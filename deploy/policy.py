@@ -1,0 +1,164 @@
+"""An exported policy: three raw depth frames and eight joint values in, one action out."""
+
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+
+from ddgrasp import contract
+from ddgrasp.errors import UserError
+from export import metadata
+
+DEPTH_DTYPES = {"uint16_mm": np.dtype(np.uint16), "float32_m": np.dtype(np.float32)}
+ONNX_DEPTH_TYPES = {"uint16_mm": "tensor(uint16)", "float32_m": "tensor(float)"}
+NOISES = ("zero", "normal")
+PLAUSIBLE_MEDIAN_M = (0.05, 20.0)
+"""A scene's median depth outside this is another unit, not another scene."""
+
+
+class OnnxPolicy:
+    """Runs the file on one thread; keeps the last three frames and what is left of the last chunk."""
+
+    def __init__(
+        self, path: Path | str, *, noise: str = "zero", seed: int = 0, execute_steps: int | None = None
+    ):
+        """Load and check `path`.
+
+        Args:
+            noise: start of the reverse diffusion: zero (deterministic) or normal (drawn from `seed`).
+            execute_steps: actions played from a chunk before the network runs again; None takes the
+                file's own.
+
+        Raises:
+            UserError: no such file, not ONNX, not ours, or of another contract.
+        """
+        if noise not in NOISES:
+            raise UserError(f"noise is {noise!r}; expected one of {', '.join(NOISES)}.")
+        self.path = Path(path)
+        self._session = _open(self.path)
+        self.info = _metadata(self._session, self.path)
+        self.depth_shape = (self.info.depth_height, self.info.depth_width)
+        steps = self.info.execute_steps if execute_steps is None else execute_steps
+        if not 1 <= steps <= self.info.chunk:
+            raise UserError(
+                f"execute_steps is {steps}; {self.path} predicts {self.info.chunk} actions at once: "
+                f"choose 1 to {self.info.chunk}."
+            )
+        self.execute_steps = steps
+        self._noise_kind = noise
+        self.reset(seed)
+
+    def reset(self, seed: int) -> None:
+        """Start of an episode: forget all frames, draw noise from `seed`."""
+        self._rng = np.random.default_rng(seed)
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop buffered frames and the rest of the chunk: the next frame fills the buffer alone."""
+        self._frames: deque[np.ndarray] = deque(maxlen=contract.DEPTH_FRAMES)
+        self._actions: deque[np.ndarray] = deque()
+
+    @property
+    def will_infer(self) -> bool:
+        """Whether the next `act` runs the network (otherwise it plays the last chunk on)."""
+        return not self._actions
+
+    def check_fit(self, depth: np.ndarray) -> str:
+        """Why a camera that gives `depth` cannot be used with this file, empty if it can."""
+        wanted = DEPTH_DTYPES[self.info.depth_dtype]
+        if depth.dtype != wanted:
+            return f"wrong depth: type {depth.dtype}, the policy takes {wanted} ({self.info.depth_dtype})"
+        if depth.shape != self.depth_shape:
+            return f"wrong depth: size {depth.shape}, the policy takes {self.depth_shape}"
+        return ""
+
+    def check_unit(self, depth: np.ndarray) -> str:
+        """Why the numbers in `depth` cannot be in this file's unit, empty if they can."""
+        valid = depth[depth > 0]
+        if not valid.size:
+            return ""
+        median = float(np.median(valid))
+        unit, per_metre = ("mm", 1000.0) if self.info.depth_dtype == "uint16_mm" else ("m", 1.0)
+        if PLAUSIBLE_MEDIAN_M[0] <= median / per_metre <= PLAUSIBLE_MEDIAN_M[1]:
+            return ""
+        return f"wrong depth: median {median:g} cannot be {unit}"
+
+    def check_frame(self, depth: np.ndarray) -> str:
+        """Why this one frame cannot be used, empty if it can: type, size, finiteness, any valid pixel."""
+        problem = self.check_fit(depth)
+        if problem:
+            return problem
+        if depth.dtype.kind == "f" and not np.isfinite(depth).all():
+            return f"non-finite depth: {int((~np.isfinite(depth)).sum())} pixels"
+        if not (depth > 0).any():
+            return "all-invalid depth: no pixel above 0"
+        return ""
+
+    def act(self, depth: np.ndarray, state: np.ndarray) -> np.ndarray:
+        """(8,) action for the newest frame (H, W) and the state (8,). Call once per control period."""
+        self._frames.append(depth)
+        while len(self._frames) < contract.DEPTH_FRAMES:
+            self._frames.append(depth)
+        if not self._actions:
+            self._actions.extend(self._infer(state)[: self.execute_steps])
+        return self._actions.popleft()
+
+    def warm_up(self) -> None:
+        """Run the network once, so that the first period does not pay for memory."""
+        self._frames.extend([self._blank()] * contract.DEPTH_FRAMES)
+        self._run(np.zeros(contract.STATE_SIZE, np.float32), np.zeros(self._noise_shape, np.float32))
+        self.forget()
+
+    @property
+    def _noise_shape(self) -> tuple[int, int, int]:
+        return (1, self.info.chunk, contract.ACTION_SIZE)
+
+    def _blank(self) -> np.ndarray:
+        return np.ones(self.depth_shape, DEPTH_DTYPES[self.info.depth_dtype])
+
+    def _infer(self, state: np.ndarray) -> np.ndarray:
+        """(chunk, 8) actions."""
+        if self._noise_kind == "normal":
+            noise = self._rng.standard_normal(self._noise_shape, dtype=np.float32)
+        else:
+            noise = np.zeros(self._noise_shape, np.float32)
+        return self._run(state, noise)
+
+    def _run(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        inputs = {
+            contract.ONNX_INPUT_DEPTH: np.stack(self._frames)[None],
+            contract.ONNX_INPUT_STATE: state[None].astype(np.float32),
+            contract.ONNX_INPUT_NOISE: noise,
+        }
+        return self._session.run([contract.ONNX_OUTPUT_ACTION], inputs)[0][0]
+
+
+def _open(path: Path) -> ort.InferenceSession:
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; make one with `ddgrasp export`.")
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises classes of its own, without a common base
+        reason = str(error).splitlines()[0]
+        raise UserError(
+            f"{path}: onnxruntime cannot load it ({reason}); make one with `ddgrasp export`."
+        ) from error
+
+
+def _metadata(session: ort.InferenceSession, path: Path) -> metadata.PolicyMetadata:
+    info = metadata.validate(session.get_modelmeta().custom_metadata_map, str(path))
+    shapes = {node.name: node.shape for node in (*session.get_inputs(), *session.get_outputs())}
+    metadata.validate_shapes(info, shapes, str(path))
+    depth_type = next(node.type for node in session.get_inputs() if node.name == contract.ONNX_INPUT_DEPTH)
+    expected = ONNX_DEPTH_TYPES[info.depth_dtype]
+    if depth_type != expected:
+        raise UserError(
+            f"{path}: depth input is {depth_type}, its metadata says {info.depth_dtype} ({expected}): "
+            f"{metadata.REMEDY}."
+        )
+    return info

@@ -1,0 +1,150 @@
+"""The last word before the robot: every target passes the limits here, every change is counted.
+
+A policy is a learned function; nothing it says is trusted. The filter is pure arithmetic on the
+measured joints, so it holds for any robot driver and in simulation alike.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddgrasp import contract
+from deploy import kinematics
+
+_BISECTIONS = 12
+"""Halvings when a step must end inside the workspace: 1/4096 of the step, below 0.1 mm."""
+_NEWTON_STEPS = 3
+_SLIDE_TOLERANCE_M = 1e-4
+
+
+@dataclass(frozen=True)
+class SafetyLimits:
+    """What the robot may be told to do."""
+
+    lower_rad: tuple[float, ...] = contract.JOINT_LOWER_RAD
+    upper_rad: tuple[float, ...] = contract.JOINT_UPPER_RAD
+    velocity_rad_s: tuple[float, ...] = contract.JOINT_VELOCITY_LIMIT_RAD_S
+    """Largest step per control period, divided by the period."""
+    acceleration_rad_s2: tuple[float, ...] = contract.JOINT_ACCELERATION_LIMIT_RAD_S2
+    """Largest change between two steps that follow each other, divided by the period squared."""
+    workspace_lower_m: tuple[float, float, float] = (0.15, -0.45, 0.012)
+    workspace_upper_m: tuple[float, float, float] = (0.80, 0.45, 0.80)
+    """Box for the point between the finger pads, robot base frame; 12 mm = fingertips on the table."""
+    period_s: float = contract.CONTROL_DT_S
+
+
+@dataclass
+class SafetyCounts:
+    """How often the filter changed a command: control steps by cause."""
+
+    commands: int = 0
+    by_cause: Counter[str] = field(default_factory=Counter)
+
+    def as_dict(self) -> dict[str, int]:
+        causes = ("action", "joint_position", "joint_velocity", "joint_acceleration", "workspace")
+        return {"commands": self.commands} | {cause: self.by_cause[cause] for cause in causes}
+
+
+class NonFiniteAction(Exception):
+    """The policy answered NaN or infinity."""
+
+
+class SafetyFilter:
+    """Turns a policy's action into a joint target that respects `limits`."""
+
+    def __init__(self, limits: SafetyLimits, action_scale_rad: float):
+        self.limits = limits
+        self.action_scale_rad = action_scale_rad
+        self.counts = SafetyCounts()
+        self._last_step_rad = np.zeros(7)
+
+    def stopped(self) -> None:
+        """The arm was told to hold: the next step accelerates from rest."""
+        self._last_step_rad = np.zeros(7)
+
+    def target(self, q_rad: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool, list[str]]:
+        """Joint target for a measured position and an action.
+
+        Args:
+            q_rad: (7,) measured joint positions.
+            action: (8,); the first seven are joint steps in units of `action_scale_rad` and belong
+                into [-1, 1], the last closes the gripper if above 0.
+
+        Returns:
+            (7,) target within all limits, whether to close, and the causes of any change.
+
+        Raises:
+            NonFiniteAction: nothing can be made of such an action; hold.
+        """
+        if action.shape != (contract.ACTION_SIZE,) or not np.isfinite(action).all():
+            raise NonFiniteAction(f"action {np.array2string(action, precision=3)}")
+        causes: list[str] = []
+        unit = self._noted(np.clip(action[:7], -1.0, 1.0), action[:7], "action", causes)
+        step = unit.astype(float) * self.action_scale_rad
+        step = self._limit_step(q_rad, step, causes)
+        step = self._limit_workspace(q_rad, step, causes)
+        self._last_step_rad = step
+        self.counts.commands += 1
+        self.counts.by_cause.update(causes)
+        return q_rad + step, bool(action[7] > 0), causes
+
+    def _limit_step(self, q_rad: np.ndarray, step: np.ndarray, causes: list[str]) -> np.ndarray:
+        """(7,) `step` within acceleration, velocity and position limits; the later one wins."""
+        limits, dt = self.limits, self.limits.period_s
+        change = np.array(limits.acceleration_rad_s2) * dt * dt
+        limited = np.clip(step, self._last_step_rad - change, self._last_step_rad + change)
+        step = self._noted(limited, step, "joint_acceleration", causes)
+        largest = np.array(limits.velocity_rad_s) * dt
+        step = self._noted(np.clip(step, -largest, largest), step, "joint_velocity", causes)
+        # A joint measured outside its range may only come back, and no faster than the limit above.
+        room_down = np.minimum(np.array(limits.lower_rad) - q_rad, largest)
+        room_up = np.maximum(np.array(limits.upper_rad) - q_rad, -largest)
+        return self._noted(np.clip(step, room_down, room_up), step, "joint_position", causes)
+
+    def _limit_workspace(self, q_rad: np.ndarray, step: np.ndarray, causes: list[str]) -> np.ndarray:
+        """(7,) `step`, changed so that the grip point ends in the box, or no further outside than it is."""
+        allowed = self._outside_m(q_rad)
+        if self._outside_m(q_rad + step) <= allowed:
+            return step
+        causes.append("workspace")
+        slid = self._slide(q_rad, step)
+        if self._outside_m(q_rad + slid) <= max(allowed, _SLIDE_TOLERANCE_M):
+            return slid
+        return self._shorten(q_rad, step, allowed)
+
+    def _slide(self, q_rad: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """(7,) `step` without what leads out of the box (Newton steps), within the other limits."""
+        largest = np.array(self.limits.velocity_rad_s) * self.limits.period_s
+        for _ in range(_NEWTON_STEPS):
+            target = q_rad + step
+            correction = np.linalg.pinv(kinematics.position_jacobian(target)) @ -self._overshoot_m(target)
+            target = np.clip(target + correction, self.limits.lower_rad, self.limits.upper_rad)
+            step = np.clip(target - q_rad, -largest, largest)
+        return step
+
+    def _shorten(self, q_rad: np.ndarray, step: np.ndarray, allowed_m: float) -> np.ndarray:
+        """(7,) the longest part of `step` that leaves the grip point no further outside the box."""
+        inside, beyond = 0.0, 1.0
+        for _ in range(_BISECTIONS):
+            middle = (inside + beyond) / 2
+            if self._outside_m(q_rad + middle * step) <= allowed_m:
+                inside = middle
+            else:
+                beyond = middle
+        return inside * step
+
+    def _overshoot_m(self, q_rad: np.ndarray) -> np.ndarray:
+        """(3,) vector from the nearest point of the workspace box to the grip point."""
+        position = kinematics.grip_position(q_rad)
+        return position - np.clip(position, self.limits.workspace_lower_m, self.limits.workspace_upper_m)
+
+    def _outside_m(self, q_rad: np.ndarray) -> float:
+        """Distance from the workspace box to the grip point, 0 inside."""
+        return float(np.linalg.norm(self._overshoot_m(q_rad)))
+
+    @staticmethod
+    def _noted(limited: np.ndarray, wanted: np.ndarray, cause: str, causes: list[str]) -> np.ndarray:
+        if not np.array_equal(limited, wanted):
+            causes.append(cause)
+        return limited

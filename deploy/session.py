@@ -1,0 +1,155 @@
+"""`ddgrasp deploy`: an exported policy on a robot and a camera chosen by name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ddgrasp import contract
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError, unknown_name
+from deploy.clock import RealClock
+from deploy.interfaces import Camera, Clock, Robot
+from deploy.loop import ControlLoop, LoopReport
+from deploy.policy import OnnxPolicy
+from deploy.setup import loop_settings, safety_filter
+from export.metadata import PolicyMetadata
+
+ROBOTS = ("sim", "franka")
+CAMERAS = ("stereo", "realsense", "replay")
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """What to drive, what to look through, for how long."""
+
+    robot: str = "sim"
+    """sim (the pseudo-real rig) or franka."""
+    camera: str = "stereo"
+    """stereo (the rig's own camera), realsense, or replay (a recording; the robot acts on old pictures)."""
+    recording: Path | None = None
+    """Recording for camera replay."""
+    object_name: str = ""
+    """Object on the rig's table; empty takes the first configured one."""
+    seconds: float = 6.0
+    """How long to run; 0 runs until Ctrl-C."""
+
+
+def deploy(
+    config: Config, policy_path: Path, options: SessionOptions, say: Callable[[str], None] = print
+) -> LoopReport:
+    """Run the loop on the machine's clock; events go to `say` as they happen.
+
+    Raises UserError for an unknown name, a combination that cannot work, or a device that is absent.
+    """
+    _check(options)
+    policy = OnnxPolicy(
+        policy_path,
+        noise=config.deploy.noise,
+        seed=config.seed,
+        execute_steps=config.deploy.execute_steps or None,
+    )
+    clock = RealClock()
+    robot, camera = _devices(config, options, policy.info, clock)
+    settings = loop_settings(config.deploy, policy.info)
+    loop = ControlLoop(camera, robot, policy, safety_filter(config.deploy, policy.info), clock, settings, say)
+    steps = round(options.seconds * policy.info.control_hz) if options.seconds > 0 else None
+    return loop.run(steps)
+
+
+def describe(report: LoopReport) -> str:
+    """A few lines for a terminal."""
+    values = report.as_dict()
+    rows = [
+        f"{'':<9}{'p50':>9}{'p99':>9}",
+        *(
+            _row(name, values[f"{name}_ms"])
+            for name in ("sense", "infer", "act", "latency", "period", "jitter")
+        ),
+    ]
+    safety = ", ".join(f"{name} {count}" for name, count in values["safety"].items())
+    return "\n".join([
+        *rows,
+        f"{report.steps} steps, {report.timings.missed_deadlines} missed deadlines, {report.holds} holds",
+        f"safety filter: {safety}",
+    ])  # fmt: skip
+
+
+def _row(name: str, percentiles: dict[str, float | None]) -> str:
+    cells = ("-" if percentiles[p] is None else f"{percentiles[p]:.2f}" for p in ("p50", "p99"))
+    return f"{name:<9}" + "".join(f"{cell:>9}" for cell in cells) + " ms"
+
+
+def _check(options: SessionOptions) -> None:
+    if options.robot not in ROBOTS:
+        raise unknown_name("robot", options.robot, ROBOTS)
+    if options.camera not in CAMERAS:
+        raise unknown_name("camera", options.camera, CAMERAS)
+    if options.robot == "franka" and options.camera == "stereo":
+        raise UserError(
+            "camera 'stereo' sees the simulated rig alone, not robot 'franka': use --camera realsense."
+        )
+    if options.robot == "franka" and options.camera == "replay":
+        raise UserError(
+            "camera 'replay' shows the past: robot 'franka' would move blindly; use --camera realsense."
+        )
+    if options.camera == "replay" and options.recording is None:
+        raise UserError("camera 'replay' needs --recording DIR (one recording, as `ddgrasp record` writes).")
+
+
+def _devices(
+    config: Config, options: SessionOptions, info: PolicyMetadata, clock: Clock
+) -> tuple[Robot, Camera]:
+    if options.robot == "franka":
+        return _franka(config, clock), _realsense(config, info, clock)
+    return _rig(config, options, info, clock)
+
+
+def _rig(config: Config, options: SessionOptions, info: PolicyMetadata, clock: Clock) -> tuple[Robot, Camera]:
+    from mjx_envs.rig import RigWorld
+
+    from deploy.rig_eval import camera_pose
+    from deploy.sim_robot import SimRobot
+    from deploy.stereo_camera import StereoCamera
+    from mjx_envs.objects import get_object
+    from sensors.rig_camera import RigCamera
+
+    name = get_object(options.object_name or config.world.objects[0]).name
+    rng = np.random.default_rng(config.seed)
+    world = RigWorld(objects=(name,), randomise=True)
+    world.reset(config.seed, name)
+    robot = SimRobot(world, clock, 1.0 / info.control_hz)
+    if options.camera == "realsense":
+        return robot, _realsense(config, info, clock)
+    if options.camera == "replay":
+        from deploy.replay_camera import ReplayCamera
+
+        assert options.recording is not None
+        return robot, ReplayCamera.open(options.recording, clock)
+    rig_camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+    return robot, StereoCamera(world, rig_camera, camera_pose(config, rng), rng, robot.catch_up, name)
+
+
+def _franka(config: Config, clock: Clock) -> Robot:
+    from deploy.franka_robot import FrankaRobot
+
+    deploy_config = config.deploy
+    return FrankaRobot(
+        deploy_config.franka_host,
+        clock,
+        dynamics=deploy_config.franka_dynamics,
+        grip_force_n=deploy_config.franka_grip_force_n,
+    )
+
+
+def _realsense(config: Config, info: PolicyMetadata, clock: Clock) -> Camera:
+    from deploy.realsense_camera import RealSenseCamera
+
+    if info.depth_dtype != "uint16_mm":
+        raise UserError(
+            f"camera 'realsense' gives uint16 millimetres, the policy takes {info.depth_dtype}: export it "
+            "with export.depth_dtype uint16_mm."
+        )
+    profile = contract.D455.scaled(info.depth_width / contract.D455.width_px)
+    return RealSenseCamera(clock, profile, serial=config.deploy.realsense_serial)

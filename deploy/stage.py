@@ -1,0 +1,154 @@
+"""Stage `deploy`: the exported student in the pseudo-real rig at 10 Hz."""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import artifacts, contract
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from deploy.film import Film, contact_sheet
+from deploy.rig_eval import TrialResult, plan, run_trials
+from deploy.timing import Timings
+
+STAGE = "deploy"
+POLICY_FILE = "policy.onnx"
+TRIALS_FILE = "trials.jsonl"
+
+
+def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+    """Run the trials that are not in trials.jsonl yet, then write the manifest."""
+    export = artifacts.require(run_dir, "export", config)
+    directory = run_dir / STAGE
+    policy_path = export.directory / POLICY_FILE
+    log = TrialLog(directory / TRIALS_FILE, _header(config, policy_path))
+    trials = plan(config)
+    with progress.task("trials", len(trials)) as task:
+        task.start_at(len(log.results))
+        for batch, workers in ((False, config.deploy.workers), (True, 1)):
+            # Latency is measured with the machine to itself, hence one process on the real clock.
+            todo = [t for t in trials if t.realtime is batch and (t.index, t.realtime) not in log.results]
+            for result, film in run_trials(config, policy_path, todo, workers):
+                log.append(result)
+                _keep_film(directory, result, film, progress)
+                done = [r for r in log.results.values() if not r.realtime]
+                task.advance(success=sum(r.success for r in done) / max(len(done), 1))
+    results = [log.results[(trial.index, trial.realtime)] for trial in trials]
+    return artifacts.finish(
+        directory,
+        STAGE,
+        config,
+        seconds=progress.seconds,
+        metrics=metrics(results),
+        parents=[export],
+    )
+
+
+def metrics(results: Sequence[TrialResult]) -> dict[str, Any]:
+    """What the report shows: success on the simulated clock, time keeping on the real one."""
+    simulated = [r for r in results if not r.realtime]
+    real = [r for r in results if r.realtime]
+    names = sorted({r.object_name for r in simulated})
+    rows = [{"object": name, **_success(r for r in simulated if r.object_name == name)} for name in names]
+    return {
+        "student_rig": {
+            "success": _success(simulated),
+            "per_object": {row["object"]: {k: row[k] for k in ("successes", "n")} for row in rows},
+        },
+        "holds": sum(r.holds for r in results),
+        "safety": _total(r.safety for r in simulated),
+        "realtime_trials": _success(real),
+        **_timings(real or simulated).summary(contract.CONTROL_DT_S),
+    }
+
+
+class TrialLog:
+    """Finished trials on disk, one JSON line each behind a header; a torn last line is dropped."""
+
+    def __init__(self, path: Path, header: dict[str, Any]):
+        """Read what is there. Raises UserError if it belongs to another policy or configuration."""
+        self._path = path
+        self.results: dict[tuple[int, bool], TrialResult] = {}
+        lines = _complete_lines(path)
+        if lines and lines[0] != header:
+            raise UserError(
+                f"{path} holds trials of another policy or configuration: delete {path.parent} to start "
+                "them anew, or choose another --out."
+            )
+        for line in lines[1:]:
+            result = TrialResult(**line)
+            self.results[result.key] = result
+        # Written anew, so that the next line starts on a line of its own.
+        text = "".join(_line(value) for value in [header, *map(asdict, self.results.values())])
+        artifacts.atomic_write_text(path, text)
+
+    def append(self, result: TrialResult) -> None:
+        """Add a finished trial; it is on the disk when this returns."""
+        self.results[result.key] = result
+        with open(self._path, "a") as file:
+            file.write(_line(asdict(result)))
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _line(value: dict[str, Any]) -> str:
+    return json.dumps(value, allow_nan=False) + "\n"
+
+
+def _complete_lines(path: Path) -> list[dict[str, Any]]:
+    if not path.exists():
+        return []
+    lines = []
+    for text in path.read_text(errors="replace").splitlines():
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            break
+    return lines
+
+
+def _header(config: Config, policy_path: Path) -> dict[str, Any]:
+    if not policy_path.is_file():
+        raise UserError(f"{policy_path}: no such file; run `ddgrasp export` again.")
+    return {
+        "policy_sha256": hashlib.sha256(policy_path.read_bytes()).hexdigest(),
+        "config_hash": artifacts.config_hash(config, STAGE),
+    }
+
+
+def _keep_film(directory: Path, result: TrialResult, film: Film, progress: Progress) -> None:
+    """The first success and the first failure become pictures."""
+    name = "rig_success" if result.success else "rig_failure"
+    path = directory / f"{name}.png"
+    if path.exists() or not film.steps:
+        return
+    outcome = "success" if result.success else "failure"
+    title = f"trial {result.index}, {result.object_name}: {outcome}"
+    artifacts.atomic_write_bytes(path, contact_sheet(film, title))
+    progress.picture(name, rgb=film.rgb, depth=film.depth_mm)
+
+
+def _success(results: Iterable[TrialResult]) -> dict[str, int]:
+    outcomes = [result.success for result in results]
+    return {"successes": sum(outcomes), "n": len(outcomes)}
+
+
+def _total(counts: Iterable[dict[str, int]]) -> dict[str, int]:
+    total: dict[str, int] = {}
+    for count in counts:
+        for name, value in count.items():
+            total[name] = total.get(name, 0) + value
+    return total
+
+
+def _timings(results: Iterable[TrialResult]) -> Timings:
+    total = Timings()
+    for r in results:
+        total.extend(Timings(r.sense_s, r.infer_s, r.act_s, r.latency_s, r.period_s, r.missed_deadlines))
+    return total

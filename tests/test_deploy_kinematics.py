@@ -1,0 +1,47 @@
+"""The robot side's own forward kinematics."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from ddgrasp import contract
+from deploy import kinematics
+from mjx_envs import scene
+
+LOWER, UPPER = np.array(contract.JOINT_LOWER_RAD), np.array(contract.JOINT_UPPER_RAD)
+
+
+def test_stretched_arm_by_hand():
+    # All joints zero: the arm stands upright, the wrist reaches 88 mm forward and points down.
+    expected = (0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107 - 0.1034)
+    np.testing.assert_allclose(kinematics.grip_position(np.zeros(7)), expected, atol=1e-12)
+    np.testing.assert_allclose(kinematics.grip_pose(np.zeros(7))[:3, 2], (0, 0, -1), atol=1e-12)
+
+
+def test_first_joint_turns_everything_about_the_base():
+    q = np.array(scene.HOME_RAD)
+    x, y, z = kinematics.grip_position(q)
+    q[0] += np.pi / 2
+    np.testing.assert_allclose(kinematics.grip_position(q), (-y, x, z), atol=1e-12)
+
+
+def test_pose_equals_mujocos_anywhere():
+    model = scene.build_model()
+    data = mujoco.MjData(model)
+    site = model.site("grip").id
+    for q in np.random.default_rng(0).uniform(LOWER, UPPER, (50, 7)):
+        data.qpos[:7] = q
+        mujoco.mj_kinematics(model, data)
+        pose = kinematics.grip_pose(q)
+        np.testing.assert_allclose(pose[:3, 3], data.site_xpos[site], atol=1e-9)
+        np.testing.assert_allclose(pose[:3, :3], data.site_xmat[site].reshape(3, 3), atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_jacobian_is_the_derivative(seed):
+    q, h = np.random.default_rng(seed).uniform(LOWER, UPPER), 1e-6
+    columns = [
+        (kinematics.grip_position(q + h * e) - kinematics.grip_position(q - h * e)) / (2 * h)
+        for e in np.eye(7)
+    ]
+    np.testing.assert_allclose(kinematics.position_jacobian(q), np.stack(columns, axis=1), atol=1e-8)

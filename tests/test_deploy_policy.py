@@ -1,0 +1,144 @@
+"""An exported file on the robot side: checks at loading, frame buffer, chunks, noise."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from deploy_support import SHAPE, constant_bias, depth_mm, describe, write_policy
+
+from ddgrasp.errors import UserError
+from deploy.policy import OnnxPolicy
+
+STATE = np.zeros(8, np.float32)
+
+
+def frames_weighted() -> np.ndarray:
+    """(3, 4, 8): row 0 of the chunk shows the three frames' millimetres in entries 0 to 2."""
+    gain = np.zeros((3, 4, 8))
+    for frame in range(3):
+        gain[frame, 0, frame] = 1.0
+    return gain
+
+
+def test_first_frame_fills_the_buffer_then_oldest_leaves_first(tmp_path):
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", depth_gain=frames_weighted()))
+    seen = [policy.act(depth_mm(mm), STATE)[:3].tolist() for mm in (500, 600, 700, 800)]
+    assert seen == [[500, 500, 500], [500, 500, 600], [500, 600, 700], [600, 700, 800]]
+    policy.forget()
+    assert policy.act(depth_mm(900), STATE)[:3].tolist() == [900, 900, 900]
+
+
+def test_state_reaches_the_network_in_order(tmp_path):
+    gain = np.zeros((8, 4, 8))
+    gain[np.arange(8), 0, np.arange(8)] = 2.0
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", state_gain=gain))
+    state = np.arange(8, dtype=np.float32)
+    np.testing.assert_array_equal(policy.act(depth_mm(), state), 2 * state)
+
+
+def test_chunk_is_played_for_execute_steps_and_frames_keep_coming(tmp_path):
+    # Row r of the chunk is r + 10 * newest frame (in metres).
+    gain = np.zeros((3, 4, 8))
+    gain[2] = 0.01
+    bias = np.arange(4.0)[:, None] * np.ones(8)
+    path = write_policy(tmp_path / "p.onnx", describe(execute_steps=3), depth_gain=gain, bias=bias)
+    policy = OnnxPolicy(path)
+    inferred, rows = [], []
+    for mm in (100, 200, 300, 400, 500):
+        inferred.append(policy.will_infer)
+        rows.append(float(policy.act(depth_mm(mm), STATE)[0]))
+    assert inferred == [True, False, False, True, False]
+    np.testing.assert_allclose(rows, [1 + 0, 1 + 1, 1 + 2, 4 + 0, 4 + 1], rtol=1e-6)
+
+
+def test_execute_steps_can_be_overridden_within_the_chunk(tmp_path):
+    path = write_policy(tmp_path / "p.onnx")
+    assert OnnxPolicy(path).execute_steps == 1
+    assert OnnxPolicy(path, execute_steps=4).execute_steps == 4
+    with pytest.raises(UserError, match="execute_steps is 5.*choose 1 to 4"):
+        OnnxPolicy(path, execute_steps=5)
+
+
+def test_noise_is_zero_or_seeded_normal(tmp_path):
+    path = write_policy(tmp_path / "p.onnx", noise_gain=1.0)
+    assert not OnnxPolicy(path, noise="zero").act(depth_mm(), STATE).any()
+    policy = OnnxPolicy(path, noise="normal", seed=3)
+    first = [policy.act(depth_mm(), STATE) for _ in range(2)]
+    policy.reset(3)
+    again = [policy.act(depth_mm(), STATE) for _ in range(2)]
+    np.testing.assert_array_equal(first, again)
+    expected = np.random.default_rng(3).standard_normal((1, 4, 8), dtype=np.float32)[0, 0]
+    np.testing.assert_array_equal(first[0], expected)
+    assert not np.array_equal(first[0], first[1])
+    with pytest.raises(UserError, match="noise is 'uniform'"):
+        OnnxPolicy(path, noise="uniform")
+
+
+def test_metres_go_in_as_metres(tmp_path):
+    path = write_policy(tmp_path / "p.onnx", describe("float32_m"), depth_gain=frames_weighted())
+    policy = OnnxPolicy(path)
+    depth = np.full(SHAPE, 0.75, np.float32)
+    assert policy.check_frame(depth) == ""
+    assert policy.act(depth, STATE)[2] == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize(
+    ("depth", "problem"),
+    [
+        (depth_mm(), ""),
+        (depth_mm().astype(np.float32), "wrong depth: type float32"),
+        (depth_mm()[:-1], "wrong depth: size"),
+        (np.zeros(SHAPE, np.uint16), "all-invalid depth"),
+    ],
+)
+def test_frames_in_millimetres_are_checked(tmp_path, depth, problem):
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx"))
+    assert policy.check_frame(depth).startswith(problem) and bool(policy.check_frame(depth)) == bool(problem)
+
+
+def test_frames_in_metres_are_checked_for_nan_and_unit(tmp_path):
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", describe("float32_m")))
+    depth = np.full(SHAPE, 0.7, np.float32)
+    depth[2, 3], depth[4, 5] = np.nan, np.inf
+    assert policy.check_frame(depth) == "non-finite depth: 2 pixels"
+    assert policy.check_unit(np.full(SHAPE, 0.7, np.float32)) == ""
+    assert "median 700 cannot be m" in policy.check_unit(np.full(SHAPE, 700, np.float32))
+
+
+def test_metres_rounded_into_integers_are_noticed(tmp_path):
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx"))
+    assert "median 1 cannot be mm" in policy.check_unit(np.ones(SHAPE, np.uint16))
+
+
+def test_wrong_files_get_one_line(tmp_path):
+    with pytest.raises(UserError, match=r"absent\.onnx: no such file; make one with `ddgrasp export`"):
+        OnnxPolicy(tmp_path / "absent.onnx")
+    (tmp_path / "text.onnx").write_text("not a model")
+    with pytest.raises(UserError, match="cannot load it") as error:
+        OnnxPolicy(tmp_path / "text.onnx")
+    assert "\n" not in str(error.value)
+    with pytest.raises(UserError, match="not a policy of this project"):
+        OnnxPolicy(write_policy(tmp_path / "p.onnx", properties={"author": "someone"}))
+    with pytest.raises(UserError, match="contract version 99"):
+        OnnxPolicy(write_policy(tmp_path / "p.onnx", describe(contract_version=99)))
+
+
+def test_graph_that_contradicts_its_metadata_is_refused(tmp_path):
+    lying = describe(depth_height=SHAPE[0] + 1).to_json()
+    with pytest.raises(UserError, match="'depth' has shape"):
+        OnnxPolicy(write_policy(tmp_path / "p.onnx", properties={"ddgrasp": lying}))
+    lying = describe("float32_m").to_json()
+    with pytest.raises(UserError, match=r"tensor\(uint16\).*float32_m"):
+        OnnxPolicy(write_policy(tmp_path / "p.onnx", properties={"ddgrasp": lying}))
+
+
+def test_warm_up_leaves_no_trace(tmp_path):
+    path = write_policy(
+        tmp_path / "p.onnx", depth_gain=frames_weighted(), bias=constant_bias(0.0), noise_gain=1.0
+    )
+    cold, warm = (OnnxPolicy(path, noise="normal", seed=1) for _ in range(2))
+    warm.warm_up()
+    np.testing.assert_array_equal(warm.act(depth_mm(), STATE), cold.act(depth_mm(), STATE))

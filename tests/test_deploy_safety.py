@@ -1,0 +1,132 @@
+"""Every limit of the safety filter, and that each change is counted."""
+
+import numpy as np
+import pytest
+
+from ddgrasp import contract
+from deploy import kinematics
+from deploy.safety import NonFiniteAction, SafetyFilter, SafetyLimits
+from mjx_envs.scene import HOME_RAD
+
+HOME = np.array(HOME_RAD)
+FREE = SafetyLimits(
+    acceleration_rad_s2=(1e6,) * 7,
+    workspace_lower_m=(-9.0, -9.0, -9.0),
+    workspace_upper_m=(9.0, 9.0, 9.0),
+)
+"""Position and velocity limits of the robot, nothing else."""
+
+
+def action(*joints: float, gripper: float = 0.0) -> np.ndarray:
+    return np.array([*joints, *[0.0] * (7 - len(joints)), gripper], np.float32)
+
+
+def test_harmless_action_passes_unchanged():
+    filter_ = SafetyFilter(FREE, action_scale_rad=0.1)
+    target, close, causes = filter_.target(HOME, action(0.5, -0.25, gripper=0.1))
+    np.testing.assert_allclose(target - HOME, [0.05, -0.025, 0, 0, 0, 0, 0], atol=1e-9)
+    assert close and causes == []
+    assert filter_.counts.as_dict() == {
+        "commands": 1, "action": 0, "joint_position": 0, "joint_velocity": 0, "joint_acceleration": 0,
+        "workspace": 0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("gripper", "close"), [(-1.0, False), (0.0, False), (1e-3, True)])
+def test_gripper_closes_above_zero(gripper, close):
+    assert SafetyFilter(FREE, 0.1).target(HOME, action(gripper=gripper))[1] is close
+
+
+def test_action_beyond_one_is_clipped():
+    target, _, causes = SafetyFilter(FREE, 0.1).target(HOME, action(3.0))
+    assert target[0] - HOME[0] == pytest.approx(0.1)
+    assert causes == ["action"]
+
+
+def test_velocity_limit_per_period():
+    # 0.5 rad in 0.1 s is 5 rad/s; joint 1 may do 2.175, joint 5 2.61.
+    target, _, causes = SafetyFilter(FREE, 0.5).target(HOME, action(1.0, 0, 0, 0, -1.0))
+    assert target[0] - HOME[0] == pytest.approx(0.2175)
+    assert target[4] - HOME[4] == pytest.approx(-0.261)
+    assert causes == ["joint_velocity"]
+
+
+def test_acceleration_limit_from_rest_and_on_reversal():
+    limits = SafetyLimits(
+        acceleration_rad_s2=(5.0,) * 7,
+        workspace_lower_m=FREE.workspace_lower_m,
+        workspace_upper_m=FREE.workspace_upper_m,
+    )
+    filter_ = SafetyFilter(limits, 0.1)
+    # 5 rad/s^2 over 0.1 s twice: the step may change by 0.05 rad.
+    steps = [filter_.target(HOME, action(a))[0][0] - HOME[0] for a in (1.0, 1.0, -1.0, -1.0)]
+    np.testing.assert_allclose(steps, [0.05, 0.1, 0.05, 0.0], atol=1e-12)
+    filter_.stopped()
+    assert filter_.target(HOME, action(-1.0))[0][0] - HOME[0] == pytest.approx(-0.05)
+    assert filter_.counts.by_cause["joint_acceleration"] == 4
+
+
+def test_position_limit_and_way_back_from_outside():
+    q = HOME.copy()
+    q[0] = contract.JOINT_UPPER_RAD[0] - 0.03
+    target, _, causes = SafetyFilter(FREE, 0.1).target(q, action(1.0))
+    assert target[0] == pytest.approx(contract.JOINT_UPPER_RAD[0])
+    assert causes == ["joint_position"]
+    q[0] = contract.JOINT_UPPER_RAD[0] + 1.0
+    target, _, _ = SafetyFilter(FREE, 0.1).target(q, action(1.0))
+    assert target[0] - q[0] == pytest.approx(-0.2175), "comes back, but not faster than the joint may move"
+
+
+def test_hand_slides_along_the_floor_of_the_workspace():
+    z0 = kinematics.grip_position(HOME)[2]
+    limits = SafetyLimits(acceleration_rad_s2=(1e6,) * 7, workspace_lower_m=(0.15, -0.45, z0 - 0.005))
+    filter_ = SafetyFilter(limits, 0.1)
+    # Joints 1 and 4 together: sideways and down.
+    wanted = action(1.0, 0.0, 0.0, -1.0)
+    free = kinematics.grip_position(HOME + 0.1 * wanted[:7])
+    assert free[2] < z0 - 0.02
+    target, _, causes = filter_.target(HOME, wanted)
+    slid = kinematics.grip_position(target)
+    assert slid[2] == pytest.approx(z0 - 0.005, abs=1e-4)
+    assert slid[1] == pytest.approx(free[1], abs=0.005)
+    assert causes == ["workspace"]
+
+
+def test_hand_outside_the_workspace_may_only_return():
+    z0 = kinematics.grip_position(HOME)[2]
+    limits = SafetyLimits(acceleration_rad_s2=(1e6,) * 7, workspace_upper_m=(0.8, 0.45, z0 - 0.05))
+    up, _, causes = SafetyFilter(limits, 0.1).target(HOME, action(0, 0, 0, 1.0))
+    assert kinematics.grip_position(up)[2] <= z0 + 1e-4 and causes == ["workspace"]
+    down = action(0, 0, 0, -0.3)
+    target, _, causes = SafetyFilter(limits, 0.1).target(HOME, down)
+    np.testing.assert_allclose(target - HOME, 0.1 * down[:7], atol=1e-9)
+    assert causes == []
+
+
+def test_no_action_leads_out_of_the_workspace():
+    filter_ = SafetyFilter(SafetyLimits(), 0.1)
+    rng = np.random.default_rng(0)
+    lower, upper = np.array(filter_.limits.workspace_lower_m), np.array(filter_.limits.workspace_upper_m)
+    q = HOME
+    drift = rng.uniform(-1, 1, 8)
+    for step in range(300):
+        if step % 10 == 0:
+            drift = rng.uniform(-1.5, 1.5, 8)
+        target, _, _ = filter_.target(q, drift.astype(np.float32))
+        assert np.all(np.abs(target - q) <= np.array(contract.JOINT_VELOCITY_LIMIT_RAD_S) * 0.1 + 1e-9)
+        q = target
+        position = kinematics.grip_position(q)
+        assert np.all(position >= lower - 2e-4) and np.all(position <= upper + 2e-4)
+        assert np.all(q >= contract.JOINT_LOWER_RAD) and np.all(q <= contract.JOINT_UPPER_RAD)
+    assert filter_.counts.by_cause["workspace"] > 0, "the walk never met a wall: the test says nothing"
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", [0, 7])
+def test_non_finite_action_is_refused(bad, place):
+    values = np.zeros(8, np.float32)
+    values[place] = bad
+    filter_ = SafetyFilter(FREE, 0.1)
+    with pytest.raises(NonFiniteAction):
+        filter_.target(HOME, values)
+    assert filter_.counts.commands == 0
