@@ -1,0 +1,136 @@
+"""The geometric prior c: clean relative depth that tells the generator what the scene is (paper III-B1).
+
+The paper takes c from a video depth network on RGB. Any such source fits the `Prior` protocol; the built-in one
+needs no network: affine-normalised inverse depth, from simulation directly, from recordings after filling the
+holes. Filling must not betray where the holes were, or the generator would look for traces of filling that clean
+simulated depth never has. Three things hide them: filled pixels take the background's depth of their own row (the
+true surface behind an occlusion shadow), c is blurred, and some frames are filled under decoy holes as well.
+"""
+
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from ddgrasp.config import DDGConfig
+from ddgrasp.errors import unknown_name
+
+C_LIMIT = 2.5
+"""|c| never exceeds this."""
+SAME_SURFACE = 0.05
+"""Relative inverse-depth difference below which two frames see the same surface (temporal smoothing)."""
+_STATISTICS_STRIDE = 7
+
+
+class Prior(Protocol):
+    """Source of c. Frames of one call belong to one recording or episode, in time order."""
+
+    name: str
+    needs_rgb: bool
+    """Whether `rgb` must be given; otherwise it is ignored and may be None."""
+
+    def from_recording(self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
+        """depth_m (T, H, W) with holes (0), rgb (T, h, w, 3) uint8 -> c (T, H, W) float32."""
+        ...
+
+    def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None) -> np.ndarray:
+        """Clean depth_m (T, H, W), 0 = nothing within range, rgb likewise -> c (T, H, W) float32."""
+        ...
+
+
+class InverseDepthPrior:
+    """c = clip((1/d - median) / (2 mean|1/d - median|)), the statistics over the whole sequence.
+
+    The normalisation is the affine-invariant one of MiDaS (Ranftl et al. 2020, eq. 5-6); relative depth networks
+    are trained to give inverse depth up to just that.
+    """
+
+    name = "inverse_depth"
+    needs_rgb = False
+
+    def __init__(self, blur_px: float, decoy_share: float = 0.0):
+        self.blur_px = blur_px
+        self.decoy_share = decoy_share
+
+    def from_recording(self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
+        """See `Prior`; `rng` chooses the frames filled under decoy holes and their shapes."""
+        inverse = invert(depth_m)
+        holes = inverse == 0
+        filled = np.stack([fill_from_background(frame) for frame in inverse])
+        for t in np.flatnonzero(rng.random(len(inverse)) < self.decoy_share):
+            decoy = decoy_holes(holes[rng.integers(len(holes))], rng)
+            filled[t] = fill_from_background(np.where(decoy, 0, inverse[t]))
+        return normalise(self._blurred(smooth_in_time(filled)))
+
+    def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None = None) -> np.ndarray:
+        """See `Prior`."""
+        return normalise(self._blurred(invert(depth_m)))
+
+    def _blurred(self, inverse: np.ndarray) -> np.ndarray:
+        if self.blur_px <= 0:
+            return inverse
+        return np.stack([cv2.GaussianBlur(frame, (0, 0), self.blur_px) for frame in inverse])
+
+
+def make_prior(config: DDGConfig) -> Prior:
+    """The prior that the configuration names."""
+    priors = {InverseDepthPrior.name: InverseDepthPrior}
+    if config.prior not in priors:
+        raise unknown_name("prior", config.prior, priors)
+    return priors[config.prior](config.prior_blur_px, config.decoy_holes)
+
+
+def invert(depth_m: np.ndarray) -> np.ndarray:
+    """1/d in 1/m, 0 where depth is 0 (infinitely far, or a hole). Any shape, float32."""
+    return np.divide(1, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)
+
+
+def normalise(inverse: np.ndarray) -> np.ndarray:
+    """Affine-normalised inverse depth of a sequence (T, H, W): median 0, mean deviation 1/2, |c| <= C_LIMIT."""
+    sample = inverse.reshape(-1)[::_STATISTICS_STRIDE]
+    shift = np.median(sample)
+    scale = 2 * np.mean(np.abs(sample - shift)) + 1e-6
+    return np.clip((inverse - shift) / scale, -C_LIMIT, C_LIMIT).astype(np.float32)
+
+
+def fill_from_background(inverse: np.ndarray) -> np.ndarray:
+    """Fills holes (0) of an inverse depth map (H, W) with the farther of the row's nearest valid pixels.
+
+    A stereo camera loses pixels mostly beside near objects, where one imager sees the background and the other
+    does not: the farther neighbour is the surface that was lost. Rows without a valid pixel take the nearest
+    row's values. A median over the filled pixels removes the streaks.
+    """
+    valid = inverse > 0
+    rows = np.flatnonzero(valid.any(axis=1))
+    if len(rows) == 0:
+        return inverse.copy()
+    left, right = _nearest_valid_in_row(inverse, valid), _nearest_valid_in_row(inverse[:, ::-1], valid[:, ::-1])
+    right = right[:, ::-1]
+    background = np.where((left > 0) & (right > 0), np.minimum(left, right), np.maximum(left, right))
+    filled = np.where(valid, inverse, background)
+    row_of = rows[np.abs(np.arange(len(inverse))[:, None] - rows).argmin(axis=1)]
+    filled = filled[row_of].astype(np.float32)
+    return np.where(valid, inverse, cv2.medianBlur(filled, 5))
+
+
+def _nearest_valid_in_row(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """(H, W): the last valid value at or before each column, 0 where there is none."""
+    columns = np.maximum.accumulate(np.where(valid, np.arange(values.shape[1]), -1), axis=1)
+    found = np.take_along_axis(values, np.maximum(columns, 0), axis=1)
+    return np.where(columns >= 0, found, 0)
+
+
+def decoy_holes(holes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A hole mask (H, W) moved to a random place (wrapping around), so that it lies on intact surface."""
+    shift = (int(rng.integers(holes.shape[0])), int(rng.integers(holes.shape[1])))
+    return np.roll(holes, shift, axis=(0, 1))
+
+
+def smooth_in_time(inverse: np.ndarray) -> np.ndarray:
+    """Mean over each frame and its two neighbours (T, H, W), of the pixels that still see the same surface."""
+    total, count = inverse.copy(), np.ones_like(inverse)
+    for here, there in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
+        same = np.abs(inverse[there] - inverse[here]) < SAME_SURFACE * inverse[here]
+        total[here] += np.where(same, inverse[there], 0)
+        count[here] += same
+    return total / count

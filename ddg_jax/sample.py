@@ -1,0 +1,214 @@
+"""Sampling: prior c -> noisy depth; simulated depth -> grafted noisy depth, a batch or a stream of episodes."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ddg_jax import normalise
+from ddg_jax import schedule as diffusion
+from ddg_jax.graft import artefact_mask, graft_mask
+from ddg_jax.prior import C_LIMIT, Prior, make_prior
+from ddg_jax.train import Params, make_unet
+from ddgrasp import artifacts
+from ddgrasp.config import DDGConfig
+from ddgrasp.errors import UserError, unknown_name
+
+PARAMS_FILE = "params.msgpack"
+X_LIMIT = 1.0
+"""|x_0| of the diffusion space: predictions are clipped to it."""
+SAMPLERS = ("ddim", "ddpm")
+_ASPECT_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class Generator:
+    """A fitted generator: what `generate` needs."""
+
+    config: DDGConfig
+    params: Params
+    prior: Prior
+
+    @classmethod
+    def load(cls, directory: Path | str) -> "Generator":
+        """The generator in a finished `ddg` stage directory; UserError if there is none."""
+        manifest = artifacts.read_manifest(directory)
+        if manifest.stage != "ddg":
+            raise UserError(f"{directory} holds a {manifest.stage!r} artefact; expected one of stage 'ddg'.")
+        config = artifacts.config_from_json(manifest.config).ddg
+        target = jax.eval_shape(partial(_init_shapes, config))
+        params = artifacts.load_params(Path(directory) / PARAMS_FILE, target)
+        return cls(config, params, make_prior(config))
+
+    def save(self, directory: Path | str) -> None:
+        """Writes the parameters; the manifest, written by the stage, makes them loadable."""
+        artifacts.save_params(Path(directory) / PARAMS_FILE, self.params)
+
+
+def _init_shapes(config: DDGConfig) -> Any:
+    from ddg_jax.train import init_params
+
+    return init_params(config, jax.random.key(0))
+
+
+# --- noise shared between the frames of an episode ------------------------------------------------
+
+
+def frame_noise(key: Array, episode: Array, frame: Array, shape: tuple[int, int], correlation: float) -> Array:
+    """Standard normal noise (B, H, W): sqrt(r) g_episode + sqrt(1 - r) g_frame, r = `correlation`.
+
+    Frames of one episode share g_episode, so holes stay where they are between frames, as on a camera; every
+    frame's noise depends on (key, episode, frame) alone, however the frames are batched. episode, frame: (B,) int.
+    """
+
+    def one(e: Array, t: Array) -> Array:
+        episode_key = jax.random.fold_in(key, e)
+        shared = jax.random.normal(jax.random.fold_in(episode_key, 0), shape)
+        own = jax.random.normal(jax.random.fold_in(episode_key, t + 1), shape)
+        return jnp.sqrt(correlation) * shared + jnp.sqrt(1 - correlation) * own
+
+    return jax.vmap(one)(episode, frame)
+
+
+# --- the reverse process --------------------------------------------------------------------------
+
+
+@partial(jax.jit, static_argnums=(0,), static_argnames=("steps",))
+def sample(
+    config: DDGConfig, key: Array, params: Params, c: Array, episode: Array, frame: Array, *, steps: int
+) -> Array:
+    """Generated maps in diffusion space (see ddg_jax/normalise.py), (B, H, W) float32.
+
+    Args:
+      key: the whole data set's key; c: (B, H, W); episode, frame: (B,) int, see `frame_noise`.
+      steps: network evaluations per map.
+    """
+    if config.sampler not in SAMPLERS:
+        raise unknown_name("sampler", config.sampler, SAMPLERS)
+    made = diffusion.make_schedule(config.schedule, config.diffusion_steps, config.log_snr_shift)
+    visited = diffusion.timesteps(made.steps, steps, "trailing")
+    noise = partial(
+        frame_noise, episode=episode, frame=frame, shape=c.shape[1:], correlation=config.frame_correlation
+    )
+    unet = make_unet(config)
+    prior_key, start_key, step_key = jax.random.split(key, 3)
+    c = c + config.prior_noise * noise(prior_key)
+
+    def body(x: Array, now: tuple[Array, Array]) -> tuple[Array, None]:
+        k, previous = now
+        eps = unet.apply({"params": params}, x, c, jnp.full(x.shape[:1], k))
+        fresh = partial(noise, jax.random.fold_in(step_key, k))
+        if config.sampler == "ddpm":
+            return diffusion.ddpm_step(made, x, k, previous, eps, fresh(), X_LIMIT), None
+        extra = fresh() if config.eta else 0.0
+        return diffusion.ddim_step(made, x, k, previous, eps, X_LIMIT, config.eta, extra), None
+
+    x, _ = jax.lax.scan(body, noise(start_key), (visited, diffusion.previous_steps(visited)))
+    return x
+
+
+# --- from simulated depth to noisy depth ----------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Generated:
+    """depth_m: the result, grafted (paper III-B2). predicted_m: the generator's own map. Both (B, H, W) float32."""
+
+    depth_m: np.ndarray
+    predicted_m: np.ndarray
+
+
+def generate(
+    key: Array,
+    generator: Generator,
+    depth_m: np.ndarray,
+    rgb: np.ndarray | None = None,
+    *,
+    episode: int = 0,
+    steps: int | None = None,
+) -> Generated:
+    """Gives the frames of one simulated episode the camera's artefacts.
+
+    Args:
+      depth_m: (T, H, W) clean planar depth in time order, 0 = nothing within range. Any size with the
+        generator's aspect ratio; the artefacts are made at the generator's size.
+      rgb: (T, h, w, 3) uint8, for priors that need it.
+      episode: number of the episode, which decides its noise.
+      steps: network evaluations per map, the configuration's by default.
+
+    Raises UserError for depth of another type, rank or aspect ratio.
+    """
+    config = generator.config
+    _check_depth(depth_m, config)
+    c = _at_size(generator.prior.from_sim(depth_m, rgb), (config.height_px, config.width_px))
+    x = predict(key, generator, c, episode=episode, steps=steps)
+    mask = np.asarray(artefact_mask(x, config.noise_threshold))
+    predicted = np.asarray(normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold))
+    mask, predicted = (_at_size(a, depth_m.shape[1:]) for a in (mask, predicted))
+    grafted = np.asarray(graft_mask(depth_m, predicted, mask), np.float32)
+    return Generated(grafted, predicted)
+
+
+def predict(
+    key: Array, generator: Generator, c: np.ndarray, *, episode: int = 0, steps: int | None = None
+) -> np.ndarray:
+    """Maps in diffusion space for one episode's priors c (T, H, W), in batches of one compiled size."""
+    config = generator.config
+    size = config.sample_batch
+    parts = []
+    for start in range(0, len(c), size):
+        part = np.asarray(c[start : start + size], np.float32)
+        count = len(part)
+        part = np.concatenate([part, np.zeros((size - count, *c.shape[1:]), np.float32)])
+        frames = jnp.arange(start, start + size)
+        x = sample(
+            config,
+            key,
+            generator.params,
+            jnp.clip(part, -C_LIMIT, C_LIMIT),
+            jnp.full(size, episode),
+            frames,
+            steps=steps or config.sample_steps,
+        )
+        parts.append(np.asarray(x)[:count])
+    return np.concatenate(parts)
+
+
+def generate_episodes(
+    key: Array, generator: Generator, episodes: Iterable[np.ndarray], first: int = 0
+) -> Iterator[np.ndarray]:
+    """Streams `generate` over clean episodes (T, H, W) metres: yields their grafted depth, one at a time.
+
+    `first` is the number of the first episode: a job that resumes after n episodes passes n and gets the depth
+    that an uninterrupted one would have made.
+    """
+    for number, depth_m in enumerate(episodes, start=first):
+        yield generate(key, generator, depth_m, episode=number).depth_m
+
+
+def _check_depth(depth_m: np.ndarray, config: DDGConfig) -> None:
+    if depth_m.ndim != 3 or not np.issubdtype(depth_m.dtype, np.floating):
+        raise UserError(
+            f"Simulated depth is {depth_m.dtype} {depth_m.shape}; expected (T, H, W) floating-point metres."
+        )
+    aspect, wanted = depth_m.shape[2] / depth_m.shape[1], config.width_px / config.height_px
+    if abs(aspect / wanted - 1) > _ASPECT_TOLERANCE:
+        raise UserError(
+            f"Simulated depth is {depth_m.shape[2]}x{depth_m.shape[1]}; the generator was fitted at "
+            f"{config.width_px}x{config.height_px}: render with that aspect ratio."
+        )
+
+
+def _at_size(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(T, H, W) -> (T, *size) by nearest neighbours; unchanged if it has that size."""
+    if frames.shape[1:] == size:
+        return frames
+    flat = [cv2.resize(f.astype(np.float32), size[::-1], interpolation=cv2.INTER_NEAREST) for f in frames]
+    return np.stack(flat).astype(frames.dtype)

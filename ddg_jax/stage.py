@@ -1,0 +1,169 @@
+"""Stage `ddg`: recordings -> a fitted generator, its statistics and its pictures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+
+from ddg_jax import data, normalise
+from ddg_jax.prior import make_prior
+from ddg_jax.sample import Generator, predict
+from ddg_jax.train import fit
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config, DDGConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from sensors import stats
+from sensors.recordings import find_recordings
+
+STAGE = "ddg"
+SCORED_FRAMES = 64
+"""Held-out frames on which the statistics are taken, at most."""
+SHOWN_FRAMES = 4
+_SAMPLE_SEED = 1
+
+
+def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+    """Fits the generator on the run's recordings."""
+    record = artifacts.require(run_dir, "record", config)
+    return fit_folder(config, record.directory, run_dir / STAGE, progress=progress, parents=(record,))
+
+
+def fit_folder(
+    config: Config, root: Path, directory: Path, *, progress: Progress, parents: Sequence[Artifact] = ()
+) -> Artifact:
+    """Fits (or loads, `config.ddg.init_from`) a generator for the recordings at or below `root`.
+
+    Behind `ddgrasp ddg fit --data ROOT`. Continues from the checkpoints in `directory`, if there are any. Leaves
+    params.msgpack, pictures, and a manifest whose metrics compare held-out recorded frames with generated ones.
+    """
+    prior = make_prior(config.ddg)
+    frames = data.load_frames(root, config.ddg, prior, config.seed, progress)
+    training, held_out = frames.split(config.ddg.holdout_fraction)
+    if config.ddg.init_from:
+        generator = _loaded(config.ddg)
+    else:
+        generator = Generator(config.ddg, fit(config.ddg, training, directory, config.seed, progress), prior)
+    generator.save(directory)
+    scored = held_out.part(np.linspace(0, len(held_out) - 1, min(SCORED_FRAMES, len(held_out))).astype(int))
+    metrics = {
+        "prior": prior.name,
+        "frames": {"training": len(training), "held_out": len(held_out), "skipped": len(frames.skipped)},
+        **_score(generator, scored, progress),
+    }
+    return artifacts.finish(
+        directory,
+        STAGE,
+        config,
+        seconds=progress.seconds,
+        metrics=metrics,
+        parents=parents,
+        origin="loaded" if config.ddg.init_from else "trained",
+    )
+
+
+def sample_folder(directory: Path, root: Path, out: Path, *, seed: int, count: int = SHOWN_FRAMES) -> Path:
+    """Writes one PNG: recorded frames of `root` beside what the generator in `directory` makes of their priors.
+
+    Behind `ddgrasp ddg sample`. Returns the picture's path, `out`/samples.png.
+    """
+    generator = Generator.load(directory)
+    frames = data.load_frames(root, generator.config, generator.prior, seed, Progress(quiet=True))
+    chosen = frames.part(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int))
+    panels = _panels(generator, chosen, seed)
+    path = out / "samples.png"
+    _write_png(path, panels)
+    return path
+
+
+def _loaded(config: DDGConfig) -> Generator:
+    """The generator of `config.init_from`, refused unless its network and depth space are the configured ones."""
+    source = Path(config.init_from)
+    generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source)
+    for name in (
+        "height_px", "width_px", "near_m", "far_m", "prior", "space_to_depth", "widths", "blocks",
+        "attention_heads", "diffusion_steps", "schedule", "log_snr_shift",
+    ):  # fmt: skip
+        there, here = getattr(generator.config, name), getattr(config, name)
+        if there != here:
+            raise UserError(
+                f"The generator in {source} has ddg.{name} {there!r}, this configuration {here!r}: "
+                "use the same value, or fit a new one (empty ddg.init_from)."
+            )
+    return Generator(config, generator.params, make_prior(config))
+
+
+def _score(generator: Generator, frames: data.Frames, progress: Progress) -> dict[str, Any]:
+    """Hole statistics of recorded and generated frames, on the priors of the recorded ones."""
+    panels = _panels(generator, frames, _SAMPLE_SEED)
+    shown = np.linspace(0, len(frames) - 1, min(SHOWN_FRAMES, len(frames))).astype(int)
+    few = {title: panel[shown] for title, panel in panels.items()}
+    progress.picture("ddg", **few)
+    if progress.directory is not None:
+        _write_png(progress.directory / "samples.png", few)
+    return {
+        "recorded": hole_statistics(panels["recorded"]),
+        "generated": hole_statistics(panels["generated"]),
+        "grafted_error_m": _largest_change(panels["clean"], panels["grafted"]),
+    }
+
+
+def _panels(generator: Generator, frames: data.Frames, seed: int) -> dict[str, np.ndarray]:
+    """clean (holes filled), recorded, generated and grafted depth in metres, (N, H, W) each."""
+    from ddg_jax.graft import artefact_mask, graft_mask
+    from ddg_jax.prior import fill_from_background, invert
+
+    config = generator.config
+    x = predict(jax.random.key(seed), generator, frames.prior)
+    generated = normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold)
+    clean = np.stack([invert(fill_from_background(f)) for f in invert(frames.depth_m)])
+    grafted = graft_mask(clean, generated, artefact_mask(x, config.noise_threshold))
+    return {
+        "clean": clean,
+        "recorded": frames.depth_m,
+        "generated": np.asarray(generated),
+        "grafted": np.asarray(grafted),
+    }
+
+
+def hole_statistics(depth_m: np.ndarray) -> dict[str, float]:
+    """Share of invalid pixels, regions per frame, median region and left band of (N, H, W) metres."""
+    sizes = [stats.hole_sizes_px(frame) for frame in (depth_m > 0).astype(np.uint16)]
+    every = np.concatenate(sizes)
+    return {
+        "invalid_fraction": float(np.mean(depth_m == 0)),
+        "hole_components": float(np.mean([len(s) for s in sizes])),
+        "hole_median_px": float(np.median(every)) if len(every) else 0.0,
+        "left_band_px": float(np.mean([stats.left_band_px(frame) for frame in depth_m])),
+    }
+
+
+def _largest_change(clean: np.ndarray, grafted: np.ndarray) -> float:
+    """Largest |grafted - clean| in metres where grafted is valid: 0 by construction."""
+    return float(np.max(np.abs(np.where(grafted > 0, grafted - clean, 0))))
+
+
+def _write_png(path: Path, panels: dict[str, np.ndarray]) -> None:
+    """Panels as rows, frames as columns, coloured by inverse depth, holes black."""
+    positive = np.concatenate([p[p > 0].ravel() for p in panels.values()])
+    low, high = np.quantile(1 / positive, [0.01, 0.99])
+    rows = []
+    for title, panel in panels.items():
+        row = np.hstack([_coloured(frame, low, high) for frame in panel])
+        cv2.putText(row, title, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+        rows.append(row)
+    ok, png = cv2.imencode(".png", np.vstack(rows))
+    assert ok
+    artifacts.atomic_write_bytes(path, png.tobytes())
+
+
+def _coloured(depth_m: np.ndarray, low: float, high: float) -> np.ndarray:
+    inverse = 1 / np.maximum(depth_m, 1e-6)
+    level = np.clip((inverse - low) / (high - low + 1e-9), 0, 1)
+    picture = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_TURBO)
+    picture[depth_m <= 0] = 0
+    return picture

@@ -1,0 +1,122 @@
+"""Training, resume and sampling on pictures small enough for seconds."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from ddg_jax import normalise, sample, train
+from ddg_jax.data import Frames
+from ddg_jax.prior import make_prior
+from ddgrasp.config import DDGConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+
+TINY = DDGConfig(
+    height_px=16,
+    width_px=24,
+    widths=(16, 16),
+    blocks=(0, 1),
+    attention_heads=2,
+    diffusion_steps=100,
+    train_steps=6,
+    batch_size=8,
+    checkpoint_every=3,
+    sample_batch=4,
+    prior_blur_px=0.0,
+    learning_rate=3e-3,
+)
+
+
+def pictures(count: int = 16) -> Frames:
+    """A near square at a random place; the sensor loses the four columns left of it."""
+    rng = np.random.default_rng(0)
+    clean = np.full((count, 16, 24), 2.0, np.float32)
+    noisy = clean.copy()
+    for i in range(count):
+        row, column = rng.integers(2, 8), rng.integers(6, 16)
+        clean[i, row : row + 6, column : column + 6] = 0.8
+        noisy[i, row : row + 6, column : column + 6] = 0.8
+        noisy[i, row : row + 6, column - 4 : column] = 0
+    c = np.stack([make_prior(TINY).from_sim(f[None], None)[0] for f in clean]).astype(np.float16)
+    return Frames(noisy, c, np.zeros(count, int))
+
+
+def test_resume_equals_an_uninterrupted_run(tmp_path):
+    frames, quiet = pictures(), Progress(quiet=True)
+    straight = train.fit(TINY, frames, tmp_path / "straight", 0, quiet)
+
+    class Stop(Exception):
+        pass
+
+    class Interrupted(Progress):
+        def scalars(self, step, **values):
+            raise Stop
+
+    config = dataclasses.replace(TINY, checkpoint_every=4)
+    with pytest.raises(Stop), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "LOG_EVERY", 4)
+        train.fit(config, frames, tmp_path / "resumed", 0, Interrupted(quiet=True))
+    assert [p.name for p in (tmp_path / "resumed/checkpoints").iterdir()] == ["4"]
+    resumed = train.fit(config, frames, tmp_path / "resumed", 0, quiet)
+    jax.tree.map(np.testing.assert_array_equal, resumed, straight)
+    fresh = train.init_state(TINY, jax.random.key_data(jax.random.key(0))).params
+    assert any(not np.array_equal(a, b) for a, b in zip(jax.tree.leaves(fresh), jax.tree.leaves(straight), strict=True))
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    config = dataclasses.replace(TINY, train_steps=500, batch_size=16, checkpoint_every=1000)
+    params = train.fit(config, pictures(64), tmp_path_factory.mktemp("ddg"), 0, Progress(quiet=True))
+    return sample.Generator(config, params, make_prior(config))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Clean depth never seen in training."""
+    depth = np.full((6, 16, 24), 2.0, np.float32)
+    depth[:, 5:11, 11:17] = 0.8
+    return depth
+
+
+def test_generator_learns_where_the_sensor_loses_pixels(fitted, scene):
+    made = sample.generate(jax.random.key(0), fitted, scene)
+    holes = made.depth_m == 0
+    shadow = np.zeros_like(holes)
+    shadow[:, 5:11, 7:11] = True
+    assert holes[shadow].mean() > 0.8, holes[shadow].mean()
+    assert holes[~shadow].mean() < 0.05, holes[~shadow].mean()
+    assert np.array_equal(made.depth_m[~holes], scene[~holes])
+    np.testing.assert_array_equal(holes, made.predicted_m == 0)
+    assert abs(np.median(made.predicted_m[:, :3]) - 2.0) < 0.3
+
+
+def test_generation_does_not_depend_on_batching_and_frames_of_an_episode_agree(fitted, scene):
+    key = jax.random.key(3)
+    all_at_once = sample.predict(key, fitted, fitted.prior.from_sim(scene, None), episode=2)
+    other = dataclasses.replace(fitted, config=dataclasses.replace(fitted.config, sample_batch=3))
+    np.testing.assert_allclose(
+        sample.predict(key, other, fitted.prior.from_sim(scene, None), episode=2), all_at_once, atol=2e-4
+    )
+    streamed = list(sample.generate_episodes(key, fitted, [scene[:2]], first=2))
+    x_limits = normalise.to_depth(all_at_once[:2], 0.25, 10.0, fitted.config.noise_threshold)
+    np.testing.assert_array_equal(streamed[0] == 0, np.asarray(x_limits) == 0)
+
+
+def test_frame_noise_is_standard_normal_with_the_stated_correlation():
+    episode, frame = np.array([0, 0, 1]), np.array([0, 1, 0])
+    noise = np.asarray(sample.frame_noise(jax.random.key(0), episode, frame, (200, 200), 0.9))
+    np.testing.assert_allclose(noise.std(axis=(1, 2)), 1, atol=0.02)
+    correlation = np.corrcoef(noise.reshape(3, -1))
+    assert abs(correlation[0, 1] - 0.9) < 0.01 and abs(correlation[0, 2]) < 0.02
+
+
+def test_ancestral_sampler_and_bad_input(fitted, scene):
+    ddpm = dataclasses.replace(fitted, config=dataclasses.replace(fitted.config, sampler="ddpm"))
+    holes = sample.generate(jax.random.key(1), ddpm, scene[:2], steps=20).depth_m == 0
+    assert holes[:, 5:11, 7:11].mean() > 0.6
+    with pytest.raises(UserError, match="uint16"):
+        sample.generate(jax.random.key(0), fitted, (scene * 1000).astype(np.uint16))
+    with pytest.raises(UserError, match="aspect"):
+        sample.generate(jax.random.key(0), fitted, scene[:, :, :16])
