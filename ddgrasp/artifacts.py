@@ -40,6 +40,7 @@ STAGE_FIELDS: dict[str, tuple[str, ...]] = {
 """The parts of `Config` that a stage's result depends on: these are hashed, and must match on --resume."""
 
 _LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
+_TEMPORARY = ".tmp-"
 _PARAMS_MAGIC = b"DDGRASP-PARAMS-1\n"
 
 
@@ -54,7 +55,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+    temporary = path.with_name(f"{_TEMPORARY}{os.getpid()}-{path.name}")
     try:
         yield temporary
         _fsync(temporary)
@@ -257,14 +258,17 @@ def check_config(artifact: Artifact, config: Config) -> None:
     _check_same_config(artifact.directory, artifact.manifest.stage, artifact.manifest.config, config)
 
 
-def begin(directory: Path | str, stage: str, config: Config) -> None:
-    """Marks `directory` as the place where `stage` is being made with this configuration.
+def begin(directory: Path | str, stage: str, config: Config, inputs: Mapping[str, str] | None = None) -> None:
+    """Marks `directory` as the place where `stage` is being made with this configuration and these inputs.
 
-    UserError if an unfinished attempt there used another configuration or contract version: its checkpoints
-    would not fit.
+    UserError if an unfinished attempt there used others, or another contract version: its checkpoints would
+    not fit.
     """
+    inputs = dict(inputs or {})
+    for litter in Path(directory).glob(f"{_TEMPORARY}*"):  # of an attempt that was killed mid-write
+        litter.unlink(missing_ok=True)
     path = Path(directory) / STARTED
-    if path.exists():
+    if path.exists() and has_work(directory):
         started = read_json(path)
         if started.get("contract_version") != contract.CONTRACT_VERSION:
             raise UserError(
@@ -272,8 +276,14 @@ def begin(directory: Path | str, stage: str, config: Config) -> None:
                 f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
             )
         _check_same_config(Path(directory), stage, started.get("config", {}), config)
+        if difference := next(_differences(started.get("inputs", {}), inputs), None):
+            raise UserError(
+                f"{directory} was begun with other inputs: {difference}. Use those, another --out, or delete "
+                "the directory."
+            )
     else:
-        atomic_write_json(path, {"contract_version": contract.CONTRACT_VERSION, "config": config})
+        value = {"contract_version": contract.CONTRACT_VERSION, "inputs": inputs, "config": config}
+        atomic_write_json(path, value)
 
 
 def _check_same_config(directory: Path, stage: str, made_with: Mapping[str, Any], config: Config) -> None:

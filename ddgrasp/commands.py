@@ -77,6 +77,52 @@ class Record(_OneStage):
 
 
 @dataclass(frozen=True)
+class DDGFit(_OneStage):
+    """Fit the depth noise model on recordings: the run's own, or any in --data."""
+
+    data: Path | None = None
+    """A recording, or a folder of them (color/, depth/, meta.json); none takes the run's recordings."""
+
+    stage = "ddg"
+
+    def run(self) -> None:
+        if self.data is None:
+            super().run()
+            return
+        config, data, directory = check_config_values(self.config), self.data, self.out / self.stage
+        stage = pipeline.get_stage(self.stage)
+
+        def work(progress):
+            from ddg_jax.stage import fit_folder
+
+            return fit_folder(config, data, directory, progress=progress)
+
+        inputs = {"data": str(data.resolve())}
+        pipeline.make(stage, config, self.out, work, resume=self.resume, inputs=inputs)
+
+
+@dataclass(frozen=True)
+class DDGSample:
+    """Draw recorded frames beside what a fitted noise model makes of them, as a PNG."""
+
+    model: Path
+    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    data: Path
+    """A recording, or a folder of them."""
+    out: Path = Path()
+    """Where samples.png goes."""
+    count: int = 4
+    """Frames to draw."""
+    seed: int = 0
+    """Of the noise."""
+
+    def run(self) -> None:
+        from ddg_jax.stage import sample_folder
+
+        print(sample_folder(self.model, self.data, self.out, seed=self.seed, count=self.count))
+
+
+@dataclass(frozen=True)
 class StudentTrain(_OneStage):
     """Train the depth-only student on noisy demonstrations."""
 
@@ -137,6 +183,8 @@ COMMANDS: dict[str, type] = {
     "teacher train": TeacherTrain,
     "demos collect": DemosCollect,
     "record": Record,
+    "ddg fit": DDGFit,
+    "ddg sample": DDGSample,
     "student train": StudentTrain,
     "export": Export,
     "deploy": Deploy,

@@ -10,7 +10,7 @@ when their turn comes, so that `--help` needs none of them and the robot side ne
 
 import importlib
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,24 +63,47 @@ def run(
 
 
 def run_stage(stage: Stage, config: Config, run_dir: Path, *, resume: bool, quiet: bool = False) -> Artifact:
-    """Runs one stage, or returns the finished one if `resume` is on."""
+    """Runs one stage from its parents in `run_dir`, or returns the finished one if `resume` is on."""
+    parents = {name: artifacts.require(run_dir, name, config) for name in stage.parents}
+
+    def work(progress: Progress) -> Artifact:
+        module = importlib.import_module(f"{stage.package}.stage")
+        return module.run(config, run_dir, resume=resume, progress=progress)
+
+    artifact = make(stage, config, run_dir, work, resume=resume, quiet=quiet)
+    _check_parents(artifact, parents)
+    return artifact
+
+
+def make(
+    stage: Stage,
+    config: Config,
+    run_dir: Path,
+    work: Callable[[Progress], Artifact],
+    *,
+    resume: bool,
+    quiet: bool = False,
+    inputs: Mapping[str, str] | None = None,
+) -> Artifact:
+    """Lets `work` make the stage's artefact in `run_dir / stage.name`, unless it is finished and `resume` on.
+
+    `inputs` names what the artefact is made from besides the configuration and the run's other stages: an
+    attempt with other inputs is not continued.
+    """
     directory = run_dir / stage.name
     if not resume:
         _refuse_occupied(run_dir, [stage.name])
-    parents = {name: artifacts.require(run_dir, name, config) for name in stage.parents}
     progress = Progress(directory, stage.name, quiet=quiet)
     if artifacts.is_finished(directory):
         artifact = artifacts.read_artifact(directory)
         artifacts.check_config(artifact, config)
-        _check_parents(artifact, parents)
         progress.note(f"finished before ({artifact.manifest.seconds:.0f} s, {artifact.manifest.origin})")
         return artifact
     progress.note(f"-> {directory}: {stage.makes}")
-    artifacts.begin(directory, stage.name, config)
+    artifacts.begin(directory, stage.name, config, inputs)
     with _interruptible(stage.name):
         try:
-            module = importlib.import_module(f"{stage.package}.stage")
-            artifact = module.run(config, run_dir, resume=resume, progress=progress)
+            artifact = work(progress)
         finally:
             progress.close()
     progress.note(f"finished in {artifact.manifest.seconds:.0f} s ({artifact.manifest.origin})")
@@ -99,7 +122,7 @@ def _refuse_occupied(run_dir: Path, names: Sequence[str]) -> None:
             raise UserError(
                 f"{directory} holds a finished stage: continue with --resume, or choose another --out."
             )
-        if directory.is_dir() and any(directory.iterdir()):
+        if artifacts.has_work(directory):
             raise UserError(
                 f"{directory} holds an unfinished stage: continue with --resume, or choose another --out."
             )

@@ -91,10 +91,27 @@ def test_an_artefact_of_another_config_is_refused_naming_both_values(tmp_path):
 
 def test_an_unfinished_attempt_of_another_config_is_refused(tmp_path):
     artifacts.begin(tmp_path / "teacher", "teacher", CONFIG)
+    (tmp_path / "teacher" / "checkpoint").touch()
     artifacts.begin(tmp_path / "teacher", "teacher", CONFIG)
     other = dataclasses.replace(CONFIG, world=WorldConfig(episode_steps=7))
     with pytest.raises(UserError, match=r"world\.episode_steps is 60 there, 7 here"):
         artifacts.begin(tmp_path / "teacher", "teacher", other)
+
+
+def test_an_unfinished_attempt_with_other_inputs_is_refused(tmp_path):
+    artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a"})
+    (tmp_path / "ddg" / "checkpoint").touch()
+    with pytest.raises(UserError, match="data is '/a' there, '/b' here"):
+        artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/b"})
+
+
+def test_an_attempt_that_left_nothing_binds_nobody(tmp_path):
+    artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a typing error"})
+    (tmp_path / "ddg" / ".tmp-123-params").write_bytes(b"half")
+    assert not artifacts.has_work(tmp_path / "ddg")
+    artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/b"})
+    assert [file.name for file in (tmp_path / "ddg").iterdir()] == [artifacts.STARTED]
+    assert artifacts.read_json(tmp_path / "ddg" / artifacts.STARTED)["inputs"] == {"data": "/b"}
 
 
 def test_an_artefact_of_another_contract_version_is_refused(tmp_path):

@@ -99,7 +99,7 @@ def test_a_run_is_not_overwritten_without_resume(stages, tmp_path):
     with pytest.raises(UserError, match="holds a finished stage: continue with --resume, or choose another"):
         _run(stages, run_dir)
     assert artifacts.read_artifact(run_dir / "teacher") == before
-    (run_dir / "teacher" / artifacts.MANIFEST).unlink()
+    (run_dir / "teacher" / artifacts.MANIFEST).rename(run_dir / "teacher" / "checkpoint")
     with pytest.raises(UserError, match="holds an unfinished stage"):
         _run(stages, run_dir)
 
