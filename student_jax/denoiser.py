@@ -7,12 +7,26 @@ from flax import linen as nn
 
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
-from ddgrasp.errors import unknown_name
+from ddgrasp.errors import UserError, unknown_name
 
 CONDITIONINGS = ("film", "concat")
 MAX_PERIOD = 10_000.0
+LAYER_NORM_EPSILON = 1e-5
 STATE_LOWER = np.array([*contract.JOINT_LOWER_RAD, 0.0], np.float32)
 STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M], np.float32)
+
+
+def check_denoiser(config: StudentConfig) -> None:
+    """UserError for options that do not exist."""
+    if config.conditioning not in CONDITIONINGS:
+        raise unknown_name("student conditioning", config.conditioning, CONDITIONINGS)
+    if config.time_features < 2 or config.time_features % 2:
+        raise UserError(f"student.time_features is {config.time_features}; expected an even number.")
+    if not 1 <= config.ddim_steps <= config.diffusion_steps:
+        raise UserError(
+            f"student.ddim_steps is {config.ddim_steps}; expected 1 to {config.diffusion_steps} "
+            "(student.diffusion_steps)."
+        )
 
 
 def normalise_state(state: jax.Array) -> jax.Array:
@@ -51,7 +65,7 @@ class DenoiserBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, condition: jax.Array) -> jax.Array:
-        y = nn.Dense(self.width, name="first")(nn.LayerNorm(epsilon=1e-5, name="norm")(x))
+        y = nn.Dense(self.width, name="first")(nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="norm")(x))
         if self.film:
             scale, shift = jnp.split(nn.Dense(2 * self.width, name="film")(condition), 2, axis=-1)
             y = y * (1.0 + scale) + shift
@@ -67,8 +81,7 @@ class Denoiser(nn.Module):
     def __call__(self, noisy_action: jax.Array, k: jax.Array, cond: jax.Array) -> jax.Array:
         """(B, chunk, 8), (B,) int, (B, D) -> (B, chunk, 8)."""
         config = self.config
-        if config.conditioning not in CONDITIONINGS:
-            raise unknown_name("student conditioning", config.conditioning, CONDITIONINGS)
+        check_denoiser(config)
         film = config.conditioning == "film"
         embedded = nn.Dense(config.time_features, name="time_first")(embed_time(k, config.time_features))
         embedded = nn.Dense(config.time_features, name="time_second")(nn.silu(embedded))
@@ -78,6 +91,6 @@ class Denoiser(nn.Module):
         x = nn.Dense(config.denoiser_width, name="input")(x)
         for index in range(config.denoiser_blocks):
             x = DenoiserBlock(config.denoiser_width, film, name=f"block{index}")(x, condition)
-        x = nn.silu(nn.LayerNorm(epsilon=1e-5, name="norm")(x))
+        x = nn.silu(nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="norm")(x))
         x = nn.Dense(config.chunk * contract.ACTION_SIZE, name="output", kernel_init=nn.initializers.zeros)(x)
         return x.reshape(noisy_action.shape)

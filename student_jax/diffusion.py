@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ddg_jax.schedule import timesteps
+
 TERMINAL_TIME = 0.98
 
 
@@ -30,8 +32,8 @@ def q_sample(x0: jax.Array, noise: jax.Array, k: jax.Array, alpha_bar: jax.Array
 
 
 def ddim_timesteps(steps: int, iterations: int) -> np.ndarray:
-    """(iterations,) int32 descending steps from K-1 to 0, evenly spaced."""
-    return np.round(np.linspace(steps - 1, 0, iterations)).astype(np.int32)
+    """(iterations,) int32 descending steps, evenly spaced from K-1, where the sample is pure noise."""
+    return timesteps(steps, iterations, "trailing")
 
 
 def ddim_coefficients(alpha_bar: np.ndarray, iterations: int) -> np.ndarray:

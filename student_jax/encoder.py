@@ -42,6 +42,9 @@ def check_encoder(config: StudentConfig) -> None:
             raise unknown_name(kind, value, known)
     if config.output_stride not in OUTPUT_STRIDES:
         raise UserError(f"student.output_stride is {config.output_stride}; expected one of {OUTPUT_STRIDES}.")
+    if config.pooling == "spatial_softmax":
+        for name in ("relief", "valid"):
+            newest_channel_index(config, name)
     if config.norm == "group" and config.width % GROUP_CHANNELS:
         raise UserError(f"student.width is {config.width}; expected a multiple of {GROUP_CHANNELS}.")
     if config.input_height_px % STEM_STRIDE or config.input_width_px % STEM_STRIDE:
@@ -288,3 +291,11 @@ def crop_centre(origin_rc: jax.Array, profile: CameraProfile) -> jax.Array:
     half = jnp.array([profile.crop_height_px, profile.crop_width_px], jnp.float32) / 2
     size = jnp.array([profile.height_px, profile.width_px], jnp.float32)
     return 2 * (origin_rc + half) / size - 1
+
+
+def static_crop_centre(profile: CameraProfile) -> np.ndarray:
+    """(2,) `crop_centre` of the centred window, for the exported graph."""
+    row, column = profile.crop_origin_px
+    v = 2 * (row + profile.crop_height_px / 2) / profile.height_px - 1
+    u = 2 * (column + profile.crop_width_px / 2) / profile.width_px - 1
+    return np.array([v, u], np.float32)

