@@ -18,7 +18,8 @@ from mjx_envs.camera import Buffers, Camera
 from mjx_envs.ray_geometry import Vector
 from mjx_envs.visible_geoms import AMBIENT, BACKGROUND_RGB, LIGHT_DIRECTION_W, visible_geoms
 
-_SHADED_TYPES = ("plane", "sphere", "capsule", "box", "cylinder")
+_CHUNK_PX = 8192
+"""Pixels per pass of the cast; a few of its float32 rows fit into a core's cache."""
 
 jax.tree_util.register_dataclass(
     Camera,
@@ -81,15 +82,15 @@ def render(
 
     Planar depth in metres, 0 beyond `far_m`; the other buffers have no such limit.
     """
-    x, y = _rays(camera, row0, col0, crop_shape)
-    view = _view(geoms, camera)
-    t, winner = _cast(geoms, view, x, y)
-    rgb, normal_w = _shade(geoms, camera, x, y, t, winner)
     shape = crop_shape or (camera.height_px, camera.width_px)
+    rays = _rays(camera, row0, col0, shape)
+    t, winner = jax.lax.map(partial(_cast, geoms, camera), rays)
+    rgb, normal_w = jax.lax.map(lambda args: _shade(geoms, camera, *args), (rays, t, winner))
+    ids = jnp.array((*(geoms.ids or range(len(geoms.types))), -1), jnp.int32)
     return Buffers(
         _limited(t, far_m).reshape(shape),
         rgb.reshape(*shape, 3),
-        winner.reshape(shape),
+        ids[winner].reshape(shape),
         normal_w.reshape(*shape, 3),
     )
 
@@ -104,47 +105,48 @@ def render_depth(
     far_m: Any = 2.0,
 ) -> jax.Array:
     """(H, W) planar depth in metres alone, 0 beyond `far_m`; arguments as `render`'s."""
-    x, y = _rays(camera, row0, col0, crop_shape)
-    t, _ = _cast(geoms, _view(geoms, camera), x, y)
-    return _limited(t, far_m).reshape(crop_shape or (camera.height_px, camera.width_px))
+    shape = crop_shape or (camera.height_px, camera.width_px)
+    t, _ = jax.lax.map(partial(_cast, geoms, camera), _rays(camera, row0, col0, shape))
+    return _limited(t, far_m).reshape(shape)
 
 
 def _limited(t: jax.Array, far_m: Any) -> jax.Array:
     return jnp.where(t <= far_m, t, 0)
 
 
-def _rays(
-    camera: Camera, row0: Any, col0: Any, crop_shape: tuple[int, int] | None
-) -> tuple[jax.Array, jax.Array]:
-    """x and y, each (H * W,), of every pixel's ray in the camera frame; z is 1."""
-    height, width = crop_shape or (camera.height_px, camera.width_px)
+def _rays(camera: Camera, row0: Any, col0: Any, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+    """x and y, each (chunks, pixels of a chunk), of every pixel's ray in the camera frame; z is 1."""
+    height, width = shape
     x = (jnp.arange(width) + (0.5 - camera.cx_px) + col0) / camera.fx_px
     y = (jnp.arange(height) + (0.5 - camera.cy_px) + row0) / camera.fy_px
-    x = jnp.broadcast_to(x.astype(jnp.float32)[None, :], (height, width))
-    y = jnp.broadcast_to(y.astype(jnp.float32)[:, None], (height, width))
-    return x.reshape(-1), y.reshape(-1)
+    x = jnp.broadcast_to(x.astype(jnp.float32)[None, :], shape)
+    y = jnp.broadcast_to(y.astype(jnp.float32)[:, None], shape)
+    chunk = _chunk_size(height * width)
+    return x.reshape(-1, chunk), y.reshape(-1, chunk)
 
 
-def _view(geoms: Geoms, camera: Camera) -> tuple[jax.Array, jax.Array]:
-    """The camera in each geom's frame: position (G, 3), axes (G, 3, 3)."""
-    T = jnp.asarray(camera.T_world_cam, jnp.float32)
-    exact = jax.lax.Precision.HIGHEST
-    origin = jnp.einsum("gji,gj->gi", geoms.rot_w, T[:3, 3] - geoms.pos_w, precision=exact)
-    return origin, jnp.einsum("gji,jk->gik", geoms.rot_w, T[:3, :3], precision=exact)
+def _chunk_size(pixels: int) -> int:
+    """The largest divisor of `pixels` that leaves at least two chunks of at most _CHUNK_PX.
+
+    Pixels go through a loop in chunks, for two reasons: intermediate results stay in cache, and
+    XLA on CPU cannot fuse a loop (of two or more turns) into its consumers, which would otherwise
+    repeat the whole cast once per output channel.
+    """
+    fewest = max(2, -(-pixels // _CHUNK_PX))
+    return next(pixels // n for n in range(fewest, pixels + 1) if pixels % n == 0)
 
 
-def _cast(
-    geoms: Geoms, view: tuple[jax.Array, jax.Array], x: jax.Array, y: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _cast(geoms: Geoms, camera: Camera, rays: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
     """(P,) nearest t (inf where nothing is hit) and (P,) index of the winner (-1)."""
-    origin, axes = view
-    nearest = jnp.full(x.shape, ray_geometry.MISS, jnp.float32)
-    winner = jnp.full(x.shape, -1, jnp.int32)
+    T, exact = jnp.asarray(camera.T_world_cam, jnp.float32), jax.lax.Precision.HIGHEST
+    origin = jnp.einsum("gji,gj->gi", geoms.rot_w, T[:3, 3] - geoms.pos_w, precision=exact)
+    axes = jnp.einsum("gji,jk->gik", geoms.rot_w, T[:3, :3], precision=exact)
+    nearest = jnp.full(rays[0].shape, ray_geometry.MISS, jnp.float32)
+    winner = jnp.full(rays[0].shape, -1, jnp.int32)
     for g, kind in enumerate(geoms.types):
-        t = ray_geometry.HIT[kind](jnp, tuple(origin[g]), _direction(axes[g], x, y), geoms.size[g])
+        t = ray_geometry.HIT[kind](jnp, tuple(origin[g]), _direction(axes[g], *rays), geoms.size[g])
         nearer = t < nearest
-        nearest = jnp.where(nearer, t, nearest)
-        winner = jnp.where(nearer, g, winner)
+        nearest, winner = jnp.where(nearer, t, nearest), jnp.where(nearer, g, winner)
     return nearest, winner
 
 
@@ -153,12 +155,12 @@ def _direction(axes: Any, x: jax.Array, y: jax.Array) -> Vector:
 
 
 def _shade(
-    geoms: Geoms, camera: Camera, x: jax.Array, y: jax.Array, t: jax.Array, winner: jax.Array
+    geoms: Geoms, camera: Camera, rays: tuple[jax.Array, jax.Array], t: jax.Array, winner: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """(P, 3) Lambert-shaded colours and (P, 3) world normals of the winners.
 
-    The winner's parameters are looked up by a product with a one-hot matrix. A gather walks pixel
-    by pixel on a CPU, and a chain of selects makes XLA emit the whole cast once per channel.
+    The winner's parameters are looked up by a product with a one-hot matrix: a gather walks pixel
+    by pixel on a CPU, and a chain of selects takes XLA minutes to compile.
     """
     kinds = tuple(k for k in ray_geometry.NORMAL if k in geoms.types)
     kind_of_geom = jnp.array([kinds.index(k) for k in geoms.types], jnp.float32)[:, None]
@@ -173,7 +175,7 @@ def _shade(
     T = jnp.asarray(camera.T_world_cam, jnp.float32)
     hit = winner >= 0
     t = jnp.where(hit, t, 1.0)
-    offset = [T[i, 3] - pos_w[i] + t * d for i, d in enumerate(_direction(T, x, y))]
+    offset = [T[i, 3] - pos_w[i] + t * d for i, d in enumerate(_direction(T, *rays))]
     point = tuple(sum(rot_w[3 * i + j] * offset[i] for i in range(3)) for j in range(3))
     local = (0.0, 0.0, 0.0)
     for k, name in enumerate(kinds):
