@@ -258,6 +258,12 @@ def check_config(artifact: Artifact, config: Config) -> None:
     _check_same_config(artifact.directory, artifact.manifest.stage, artifact.manifest.config, config)
 
 
+def has_work(directory: Path | str) -> bool:
+    """Whether an attempt left anything in `directory` besides the notes about itself."""
+    names = os.listdir(directory) if Path(directory).is_dir() else ()
+    return any(name != STARTED and not name.startswith(".") for name in names)
+
+
 def begin(directory: Path | str, stage: str, config: Config, inputs: Mapping[str, str] | None = None) -> None:
     """Marks `directory` as the place where `stage` is being made with this configuration and these inputs.
 
