@@ -33,10 +33,10 @@ Policy = Callable[[np.ndarray], np.ndarray]
 def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
     """Record `config.record.trajectories` episodes; finished recordings are kept on resume."""
     from mjx_envs.rig import RigWorld
-    from ppo.policy import load_policy
+    from ppo import policy as teacher_policy
 
     teacher = artifacts.require(run_dir, "teacher", config)
-    policy = load_policy(teacher.directory)
+    policy = teacher_policy.load(teacher.directory)
     world = RigWorld(objects=config.world.objects, randomise=True)
     directory = run_dir / STAGE
     camera = RigCamera(world.model, config.record.stereo, config.world.profile)
