@@ -92,10 +92,11 @@ def _quat_z_to(direction: np.ndarray) -> np.ndarray:
 
 
 def _banana_arc(length_m: float, bend_rad: float, radius_m: float) -> tuple[Capsule, ...]:
-    """Four capsules along an arc in the x-y plane whose middle is at the origin."""
+    """Four capsules along an arc in the x-y plane, centred on the arc's centroid so that it lies flat."""
     arc_radius = length_m / bend_rad
     angles = np.linspace(-bend_rad / 2, bend_rad / 2, 5)
-    points = [(arc_radius * math.sin(a), arc_radius * (1 - math.cos(a)), 0.0) for a in angles]
+    centroid = arc_radius * (1 - math.sin(bend_rad / 2) / (bend_rad / 2))
+    points = [(arc_radius * math.sin(a), arc_radius * (1 - math.cos(a)) - centroid, 0.0) for a in angles]
     return tuple(Capsule(points[i], points[i + 1], radius_m) for i in range(4))
 
 

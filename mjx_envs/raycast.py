@@ -5,8 +5,9 @@ geom; the normal and colour are computed for the winner alone. Works under jit, 
 on any backend. `raycast_numpy.py` renders the same picture without JAX.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -84,7 +85,7 @@ def render(
     """
     shape = crop_shape or (camera.height_px, camera.width_px)
     rays = _rays(camera, row0, col0, shape)
-    t, winner = jax.lax.map(partial(_cast, geoms, camera), rays)
+    t, winner = _decode(geoms, jax.lax.map(partial(_nearest_key, geoms, camera), rays))
     rgb, normal_w = jax.lax.map(lambda args: _shade(geoms, camera, *args), (rays, t, winner))
     ids = jnp.array((*(geoms.ids or range(len(geoms.types))), -1), jnp.int32)
     return Buffers(
@@ -106,7 +107,7 @@ def render_depth(
 ) -> jax.Array:
     """(H, W) planar depth in metres alone, 0 beyond `far_m`; arguments as `render`'s."""
     shape = crop_shape or (camera.height_px, camera.width_px)
-    t, _ = jax.lax.map(partial(_cast, geoms, camera), _rays(camera, row0, col0, shape))
+    t = jax.lax.map(partial(_nearest, geoms, camera), _rays(camera, row0, col0, shape))
     return _limited(t, far_m).reshape(shape)
 
 
@@ -136,18 +137,43 @@ def _chunk_size(pixels: int) -> int:
     return next(pixels // n for n in range(fewest, pixels + 1) if pixels % n == 0)
 
 
-def _cast(geoms: Geoms, camera: Camera, rays: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-    """(P,) nearest t (inf where nothing is hit) and (P,) index of the winner (-1)."""
+def _hits(geoms: Geoms, camera: Camera, rays: tuple[jax.Array, jax.Array]) -> Iterator[jax.Array]:
+    """(P,) t of each geom in turn, inf for a miss."""
     T, exact = jnp.asarray(camera.T_world_cam, jnp.float32), jax.lax.Precision.HIGHEST
     origin = jnp.einsum("gji,gj->gi", geoms.rot_w, T[:3, 3] - geoms.pos_w, precision=exact)
     axes = jnp.einsum("gji,jk->gik", geoms.rot_w, T[:3, :3], precision=exact)
-    nearest = jnp.full(rays[0].shape, ray_geometry.MISS, jnp.float32)
-    winner = jnp.full(rays[0].shape, -1, jnp.int32)
     for g, kind in enumerate(geoms.types):
-        t = ray_geometry.HIT[kind](jnp, tuple(origin[g]), _direction(axes[g], *rays), geoms.size[g])
-        nearer = t < nearest
-        nearest, winner = jnp.where(nearer, t, nearest), jnp.where(nearer, g, winner)
-    return nearest, winner
+        yield ray_geometry.HIT[kind](jnp, tuple(origin[g]), _direction(axes[g], *rays), geoms.size[g])
+
+
+def _nearest(geoms: Geoms, camera: Camera, rays: tuple[jax.Array, jax.Array]) -> jax.Array:
+    """(P,) nearest t, inf where nothing is hit."""
+    return reduce(jnp.minimum, _hits(geoms, camera, rays), jnp.full(rays[0].shape, ray_geometry.MISS))
+
+
+def _nearest_key(geoms: Geoms, camera: Camera, rays: tuple[jax.Array, jax.Array]) -> jax.Array:
+    """(P,) int32: the bits of the nearest t, the last of them replaced by the geom's index.
+
+    A positive float orders as its bits do, so one integer minimum finds both; two results would
+    make XLA cast twice. With 32 geoms t loses 4 micrometres at 1 m.
+    """
+    mask = _index_mask(geoms)
+    keys = (
+        jax.lax.bitcast_convert_type(t.astype(jnp.float32), jnp.int32) & ~mask | g
+        for g, t in enumerate(_hits(geoms, camera, rays))
+    )
+    return reduce(jnp.minimum, keys, jnp.full(rays[0].shape, jnp.iinfo(jnp.int32).max))
+
+
+def _index_mask(geoms: Geoms) -> int:
+    return (1 << max(len(geoms.types) - 1, 1).bit_length()) - 1
+
+
+def _decode(geoms: Geoms, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """t (inf where nothing is hit) and the winner's index (-1) of a key."""
+    mask = _index_mask(geoms)
+    t = jax.lax.bitcast_convert_type(key & ~mask, jnp.float32)
+    return t, jnp.where(t < ray_geometry.MISS, key & mask, -1)
 
 
 def _direction(axes: Any, x: jax.Array, y: jax.Array) -> Vector:

@@ -6,7 +6,6 @@ Identification of the Franka Emika Panda Robot", RA-L 2019. Geometry is our own:
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import mujoco
 
@@ -65,14 +64,21 @@ GRIP_POS_M = (0.0, 0.0, 0.1034)
 HOME_RAD = (0.0, -0.2016, 0.0, -2.4853, 0.0, 2.2836, 0.7854)
 """Grip 0.26 m above the table over x = 0.45, fingers down, opening along world y."""
 
-ARM_GAIN_NM_RAD = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
-ARM_DAMPING_NMS_RAD = (450.0, 450.0, 350.0, 350.0, 200.0, 200.0, 200.0)
+ARM_GAIN_NM_RAD = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)
+"""Stiffness of libfranka's internal joint impedance controller in its examples."""
+ARM_DAMPING_NMS_RAD = (140.0, 140.0, 120.0, 110.0, 60.0, 50.0, 50.0)
+ARM_ARMATURE_KG_M2 = 0.3
+"""Damping is near critical and stays below inertia / time step: the constraint solver does not know
+of implicit damping, and beyond that bound grasped objects were thrown."""
 ARM_TORQUE_LIMIT_NM = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 """Joint torque limits: Franka's interface specification."""
-FINGER_GAIN_N_M = 800.0
+FINGER_GAIN_N_M = 2000.0
 FINGER_FORCE_LIMIT_N = 20.0
-"""With 30 N and 2 kN/m the solver lost a squeezed sphere in most lifts at 5 ms; with these it held all."""
+FINGER_DAMPING_NS_M = 100.0
+FINGER_ARMATURE_KG = 1.0
+"""Force and speed (0.2 m/s per finger) of the Franka Hand's order; inertia as for the arm."""
 PAD_FRICTION = 1.0
+JOINT_DAMPING_NMS_RAD = 1.0
 
 N_ARM, N_ROBOT, NQ, NV, NU = 7, 9, 16, 15, 9
 
@@ -87,8 +93,8 @@ def _arm_xml(depth: int = 0) -> str:
     return f"""
     <body name="{link.name}" pos="{_fmt(link.pos_m)}" quat="{_fmt(link.quat)}" gravcomp="1">
       <inertial mass="{link.mass_kg}" pos="{_fmt(link.com_m)}" fullinertia="{_fmt(link.fullinertia_kg_m2)}"/>
-      <joint name="{contract.ARM_JOINTS[depth]}" axis="0 0 1" range="{lower} {upper}" damping="1"
-             armature="0.1"/>
+      <joint name="{contract.ARM_JOINTS[depth]}" axis="0 0 1" range="{lower} {upper}" damping="{JOINT_DAMPING_NMS_RAD}"
+             frictionloss="0.1" armature="{ARM_ARMATURE_KG_M2}"/>
       {geoms}{_arm_xml(depth + 1)}
     </body>"""
 
@@ -102,7 +108,8 @@ def _hand_xml() -> str:
         fingers += f"""
       <body name="{name}" pos="{_fmt(FINGER_POS_M)}" quat="{quat}" gravcomp="1">
         <inertial mass="0.015" pos="0 0.01 0.025" diaginertia="3e-6 3e-6 1e-6"/>
-        <joint name="{joint}" type="slide" axis="0 1 0" range="0 0.04" damping="10" armature="0.1"/>
+        <joint name="{joint}" type="slide" axis="0 1 0" range="0 0.04" damping="{FINGER_DAMPING_NS_M}"
+               armature="{FINGER_ARMATURE_KG}"/>
         <geom class="arm" type="box" size="0.009 0.009 0.013" pos="0 0.012 0.013" rgba="0.2 0.2 0.2 1"/>
         <geom name="{name}_pad" class="pad" type="box" size="0.0105 0.005 0.0155" pos="0 0.005 0.0415"/>
       </body>"""
@@ -140,29 +147,38 @@ def _actuators_xml() -> str:
         )
     )  # fmt: skip
     fingers = "".join(
-        f'<position joint="{j}" kp="{FINGER_GAIN_N_M}" kv="60" ctrlrange="0 0.04" '
+        f'<position joint="{j}" kp="{FINGER_GAIN_N_M}" ctrlrange="0 0.04" '
         f'forcerange="-{FINGER_FORCE_LIMIT_N} {FINGER_FORCE_LIMIT_N}"/>'
         for j in contract.FINGER_JOINTS
     )
     return arm + fingers
 
 
-def scene_xml(sim_dt_s: float = 0.005) -> str:
+def _touch_xml() -> str:
+    """Force of the strongest contact of each finger pad with each slot: MJX matches geoms only."""
+    return "".join(
+        f'<contact geom1="{side}_finger_pad" geom2="{slot}" data="force" reduce="maxforce" num="1"/>'
+        for side in ("left", "right")
+        for slot in SLOT_NAMES
+    )
+
+
+def scene_xml(sim_dt_s: float = 0.01) -> str:
     """MJCF of the whole scene."""
     return f"""
 <mujoco model="franka_table">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="{sim_dt_s}" integrator="implicitfast" cone="elliptic" impratio="10"
-          iterations="20" ls_iterations="20"><flag eulerdamp="disable"/></option>
+          iterations="10" ls_iterations="10"><flag eulerdamp="disable" midphase="disable"/></option>
   <default>
     <default class="arm"><geom contype="0" conaffinity="0" group="1" rgba="0.92 0.92 0.92 1"/></default>
     <default class="hand"><geom contype="1" conaffinity="0" group="1" rgba="0.85 0.85 0.85 1"/></default>
     <default class="pad">
       <geom contype="1" conaffinity="0" group="1" condim="4" friction="{PAD_FRICTION} 0.01 0.0001" priority="0"
-            solref="0.01 1" rgba="0.15 0.15 0.15 1"/>
+            solref="{2 * sim_dt_s} 1" rgba="0.15 0.15 0.15 1"/>
     </default>
     <default class="slot">
-      <geom contype="1" conaffinity="1" group="1" condim="4" friction="0.9 0.005 0.0001" solref="0.01 1"/>
+      <geom contype="1" conaffinity="1" group="1" condim="4" friction="0.9 0.005 0.0001" solref="{2 * sim_dt_s} 1"/>
     </default>
   </default>
   <visual><global offwidth="1280" offheight="720"/><map znear="0.02" zfar="20"/></visual>
@@ -177,26 +193,35 @@ def scene_xml(sim_dt_s: float = 0.005) -> str:
     {_object_xml()}
   </worldbody>
   <equality>
-    <joint joint1="{contract.FINGER_JOINTS[0]}" joint2="{contract.FINGER_JOINTS[1]}" solref="0.01 1"
+    <joint joint1="{contract.FINGER_JOINTS[0]}" joint2="{contract.FINGER_JOINTS[1]}" solref="{2 * sim_dt_s} 1"
            solimp="0.95 0.99 0.001"/>
   </equality>
   <actuator>{_actuators_xml()}</actuator>
   <sensor>
-    <contact name="left_touch" geom1="left_finger_pad" body2="object" data="force" reduce="netforce"/>
-    <contact name="right_touch" geom1="right_finger_pad" body2="object" data="force" reduce="netforce"/>
+    {_touch_xml()}
   </sensor>
 </mujoco>"""
 
 
-def build_model(sim_dt_s: float = 0.005) -> mujoco.MjModel:
+def build_model(sim_dt_s: float = 0.01) -> mujoco.MjModel:
     """A new compiled model; change it freely."""
-    return mujoco.MjModel.from_xml_string(scene_xml(sim_dt_s))
+    model = mujoco.MjModel.from_xml_string(scene_xml(sim_dt_s))
+    _widen_object_bounds(model)
+    return model
 
 
-@lru_cache
-def shared_model(sim_dt_s: float = 0.005) -> mujoco.MjModel:
-    """The compiled model, built once; treat it as read-only."""
-    return build_model(sim_dt_s)
+def _widen_object_bounds(model: mujoco.MjModel) -> None:
+    """Make the compiler's shortcuts hold for every object the slots can take.
+
+    Collision filters: the bounding boxes of the body and of its geoms. Kinematics: `geom_sameframe`
+    marks geoms that the compiler found centred in their body, whose pose MuJoCo then does not read.
+    """
+    body = model.body("object").id
+    slots = [model.geom(name).id for name in SLOT_NAMES]
+    model.geom_sameframe[slots] = 0
+    model.geom_aabb[slots] = [0.0, 0.0, 0.0, 0.15, 0.15, 0.15]
+    first, count = model.body_bvhadr[body], model.body_bvhnum[body]
+    model.bvh_aabb[first : first + count] = [0.0, 0.0, 0.0, 0.15, 0.15, 0.15]
 
 
 def _fmt(values) -> str:

@@ -1,0 +1,195 @@
+"""The grasping task behind MuJoCo Playground's environment API.
+
+Reads top to bottom: state, reset, step, reward. `reset` and `step` are for one environment; vmap
+them, or use `AutoReset`, which also draws a new episode where one ended.
+"""
+
+import jax
+import jax.numpy as jp
+from flax import struct
+from ml_collections import config_dict
+from mujoco import mjx
+from mujoco_playground._src import mjx_env
+
+from ddgrasp import contract
+from ddgrasp.config import WorldConfig
+from mjx_envs import grasp_math, kinematics, physics, randomize, rewards, scene
+
+TOUCH_N = 0.3
+"""Pad force from which a pad counts as touching the object."""
+LIFTED_M = 0.03
+OUT_OF_REACH_M = 0.35
+"""An object that rolled this far from the workspace's centre ends the episode."""
+
+
+@struct.dataclass
+class Episode:
+    """What stays fixed during an episode, and its counters."""
+
+    params: physics.ModelParams
+    object_index: jax.Array
+    rest_height: jax.Array
+    """() m."""
+    branch: jax.Array
+    """() see `grasp_math.yaw_branch`."""
+    distances: rewards.Distances
+    action: jax.Array
+    """(8,) last action."""
+    steps: jax.Array
+    hold_count: jax.Array
+    """() consecutive steps with the object at the target."""
+    grasped: jax.Array
+    """() bool."""
+
+
+class GraspEnv(mjx_env.MjxEnv):
+    """Grasp the object and hold it 40 cm up. Observation (40,), action (8,), 10 Hz."""
+
+    def __init__(self, config: WorldConfig):
+        super().__init__(config_dict.create(ctrl_dt=contract.CONTROL_DT_S, sim_dt=config.sim_dt_s))
+        self.config = config
+        self.table = randomize.ObjectTable(config.objects)
+        self.physics = physics.make_physics(config.backend, config.sim_dt_s)
+        self._mj_model = scene.build_model(config.sim_dt_s)
+
+    def reset(self, rng: jax.Array) -> mjx_env.State:
+        """A new episode: object, pose, dynamics and joints drawn from `rng`."""
+        k_object, k_params, k_qpos, k_next = jax.random.split(rng, 4)
+        index = jax.random.randint(k_object, (), 0, len(self.table.names))
+        params, size = randomize.sample_params(k_params, self.config.random, self.table, index)
+        rest = jp.asarray(self.table.rest_height, jp.float32)[index] * size
+        state = physics.initial_state(randomize.sample_qpos(k_qpos, self.config.random, rest))
+        branch = grasp_math.yaw_branch(state.qpos[12:16], self._symmetry(index), jp)
+        episode = Episode(
+            params=params,
+            object_index=index,
+            rest_height=rest,
+            branch=branch,
+            distances=self._distances(state.qpos, index, branch),
+            action=jp.zeros(contract.ACTION_SIZE).at[7].set(-1.0),
+            steps=jp.zeros((), jp.int32),
+            hold_count=jp.zeros((), jp.int32),
+            grasped=jp.zeros((), bool),
+        )
+        obs = self._get_obs(state, episode)
+        metrics = {f"reward/{name}": jp.zeros(()) for name in rewards.TERMS}
+        metrics |= {"success": jp.zeros(()), "saturated": jp.zeros(())}
+        info = {"episode": episode, "rng": k_next, "truncation": jp.zeros(())}
+        return mjx_env.State(state, obs, jp.zeros(()), jp.zeros(()), metrics, info)
+
+    def step(self, state: mjx_env.State, action: jax.Array) -> mjx_env.State:
+        """One control step with `action` (8,)."""
+        old: physics.PhysicsState = state.data
+        episode: Episode = state.info["episode"]
+        new = self.physics.step(episode.params, old, grasp_math.controls(old.qpos[:7], action, jp))
+        finite = jp.all(jp.isfinite(new.qpos)) & jp.all(jp.isfinite(new.qvel))
+        new = jax.tree.map(lambda a, b: jp.where(finite, a, b), new, old)
+
+        distances = self._distances(new.qpos, episode.object_index, episode.branch)
+        object_pos = new.qpos[9:12]
+        grasped = jp.all(new.touch > TOUCH_N) & (action[7] > 0)
+        held = jp.linalg.norm(object_pos - jp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
+        hold_count = jp.where(held & grasped, episode.hold_count + 1, 0)
+        terms = rewards.terms(
+            self.config.reward,
+            rewards.Transition(
+                before=episode.distances, after=distances, action=action, last_action=episode.action,
+                acceleration=(new.qvel[:7] - old.qvel[:7]) / contract.CONTROL_DT_S,
+                grasped=grasped, lifted=grasped & (object_pos[2] > episode.rest_height + LIFTED_M),
+                hold_count=hold_count,
+            ),
+        )  # fmt: skip
+        steps = episode.steps + 1
+        center = jp.asarray(contract.WORKSPACE_CENTER_M)
+        lost = jp.linalg.norm(object_pos[:2] - center) > OUT_OF_REACH_M
+        lost = (lost & ~grasped) | ~finite
+        over = steps >= self.config.episode_steps
+        episode = episode.replace(
+            distances=distances, action=action, steps=steps, hold_count=hold_count, grasped=grasped
+        )
+        metrics = {f"reward/{name}": value for name, value in terms.items()}
+        metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jp.float32)
+        metrics["saturated"] = jp.mean(jp.abs(action[:7]) > 0.95)
+        info = state.info | {"episode": episode, "truncation": (over & ~lost).astype(jp.float32)}
+        return state.replace(
+            data=new,
+            obs=self._get_obs(new, episode),
+            reward=jp.sum(jp.stack(list(terms.values()))),
+            done=(over | lost).astype(jp.float32),
+            metrics=metrics,
+            info=info,
+        )
+
+    def _get_obs(self, state: physics.PhysicsState, episode: Episode) -> jax.Array:
+        log_category = jp.asarray(self.table.log_category, jp.float32)[episode.object_index]
+        symmetry = self._symmetry(episode.object_index)
+        return grasp_math.observation(state.qpos, state.qvel, symmetry, episode.branch, log_category, jp)
+
+    def _distances(self, qpos, index, branch) -> rewards.Distances:
+        grasp_pos, grasp_quat = grasp_math.grasp_pose(
+            qpos[9:12], qpos[12:16], self._symmetry(index), branch, jp
+        )
+        return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[:7], jp))
+
+    def _symmetry(self, index) -> jax.Array:
+        return jp.asarray(self.table.symmetry)[index]
+
+    @property
+    def xml_path(self) -> str:
+        """None on disk: the scene is generated (`mjx_envs.scene.scene_xml`)."""
+        return ""
+
+    @property
+    def action_size(self) -> int:
+        """8."""
+        return contract.ACTION_SIZE
+
+    @property
+    def mj_model(self) -> "mjx_env.mujoco.MjModel":
+        """The scene, with the cube in the slots."""
+        return self._mj_model
+
+    @property
+    def mjx_model(self) -> mjx.Model:
+        """The scene on the JAX device."""
+        return mjx.put_model(self._mj_model)
+
+
+class AutoReset:
+    """Batched environment: where an episode ended, a new one takes its place.
+
+    The reward, done, metrics and truncation of the ending step are kept. New episodes wait in
+    `info["next"]`; call `refresh` at least once an episode, not every step: drawing them costs as
+    much as stepping.
+    """
+
+    def __init__(self, env: GraspEnv):
+        self.env = env
+
+    def reset(self, rng: jax.Array) -> mjx_env.State:
+        """Batch of new episodes from keys (B, 2), at staggered times so that they do not end together."""
+        state = jax.vmap(self.env.reset)(rng)
+        episode = state.info["episode"]
+        stagger = jp.arange(rng.shape[0]) % self.env.config.episode_steps
+        info = state.info | {"episode": episode.replace(steps=stagger.astype(jp.int32))}
+        return self.refresh(state.replace(info=info))
+
+    def refresh(self, state: mjx_env.State) -> mjx_env.State:
+        """Draw the batch's next episodes."""
+        fresh = jax.vmap(self.env.reset)(state.info["rng"])
+        waiting = (fresh.data, fresh.obs, fresh.info["episode"])
+        return state.replace(info=state.info | {"next": waiting, "rng": fresh.info["rng"]})
+
+    def step(self, state: mjx_env.State, action: jax.Array) -> mjx_env.State:
+        """One control step of the batch with `action` (B, 8)."""
+        waiting = state.info["next"]
+        bare = {k: v for k, v in state.info.items() if k != "next"}
+        state = jax.vmap(self.env.step)(state.replace(info=bare), action)
+
+        def pick(new, old):
+            return jp.where(state.done.reshape((-1,) + (1,) * (old.ndim - 1)) > 0, new, old)
+
+        ended = (state.data, state.obs, state.info["episode"])
+        data, obs, episode = jax.tree.map(pick, waiting, ended)
+        info = state.info | {"episode": episode, "next": waiting}
+        return state.replace(data=data, obs=obs, info=info)

@@ -1,0 +1,68 @@
+"""Grasp pose, observation and geometry of the task, for NumPy (rig, robot) and JAX (training) alike."""
+
+from types import ModuleType
+
+import numpy as np
+
+from ddgrasp import contract
+from mjx_envs import kinematics as kin
+
+HAND_DOWN = (0.0, 1.0, 0.0, 0.0)
+"""Hand orientation with the fingers down and opening along world y."""
+MIN_GRIP_HEIGHT_M = 0.02
+"""The pads reach 12 mm beyond the grip site: keep them off the table."""
+
+
+def yaw_branch(object_quat, symmetry, xp: ModuleType = np):
+    """() multiple of 2 pi / symmetry to add to the object's yaw so that the hand turns least.
+
+    Chosen once per episode, so that the target does not jump while the object moves.
+    """
+    turn = 2 * np.pi / xp.maximum(symmetry, 1)
+    return -xp.round(kin.yaw_of(object_quat, xp) / turn)
+
+
+def grasp_pose(object_pos, object_quat, symmetry, branch, xp: ModuleType = np):
+    """((3,), (4,)) top-down grasp: pads close along the object's local y axis at its origin.
+
+    Args:
+      object_pos, object_quat: object pose in the world.
+      symmetry: equivalent yaws per turn; 0 = any, then the hand keeps yaw 0.
+      branch: from `yaw_branch`.
+    """
+    turn = 2 * np.pi / xp.maximum(symmetry, 1)
+    yaw = xp.where(symmetry == 0, 0.0, kin.yaw_of(object_quat, xp) + branch * turn)
+    down = xp.broadcast_to(xp.asarray(HAND_DOWN, dtype=object_quat.dtype), object_quat.shape)
+    quat = kin.quat_mul(kin.quat_about_z(yaw, xp), down, xp)
+    height = xp.maximum(object_pos[..., 2], MIN_GRIP_HEIGHT_M)
+    return xp.concatenate([object_pos[..., :2], height[..., None]], axis=-1), canonical(quat, 1, xp)
+
+
+def canonical(quat, axis: int, xp: ModuleType = np):
+    """The one of +-quat whose component `axis` is not negative: the same rotation, one number."""
+    return xp.where(quat[..., axis : axis + 1] < 0, -quat, quat)
+
+
+def observation(qpos, qvel, symmetry, branch, log_category, xp: ModuleType = np):
+    """(40,) teacher observation (ddgrasp.contract.OBSERVATION_SIZE lists its parts)."""
+    grip_pos, grip_quat = kin.grip_pose(qpos[..., :7], xp)
+    object_pos, object_quat = qpos[..., 9:12], qpos[..., 12:16]
+    grasp_pos, grasp_quat = grasp_pose(object_pos, object_quat, symmetry, branch, xp)
+    return xp.concatenate(
+        [
+            qpos[..., :9], qvel[..., :9],
+            grip_pos, canonical(grip_quat, 1, xp),
+            object_pos, canonical(object_quat, 0, xp),
+            grasp_pos, grasp_quat,
+            xp.asarray(log_category, dtype=qpos.dtype)[..., None],
+        ],
+        axis=-1,
+    )  # fmt: skip
+
+
+def controls(q_arm, action, xp: ModuleType = np):
+    """(9,) actuator targets of an action (8,): clipped joint targets and the fingers' opening."""
+    target = q_arm + contract.ACTION_SCALE_RAD * xp.clip(action[..., :7], -1.0, 1.0)
+    target = xp.clip(target, xp.asarray(contract.JOINT_LOWER_RAD), xp.asarray(contract.JOINT_UPPER_RAD))
+    finger = xp.where(action[..., 7:8] > 0, 0.0, contract.GRIPPER_MAX_WIDTH_M / 2)
+    return xp.concatenate([target, finger, finger], axis=-1)

@@ -1,0 +1,79 @@
+"""MuJoCo's C engine on all cores, called from jitted JAX code."""
+
+import jax
+import numpy as np
+from mujoco.batch import Batch
+
+from mjx_envs import scene
+from mjx_envs.physics import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
+
+
+class CpuPhysics:
+    """`mujoco.batch` behind `jax.pure_callback`: one host call steps the whole vmapped batch."""
+
+    def __init__(self, sim_dt_s: float, substeps: int):
+        self._model = scene.build_model(sim_dt_s)
+        self._substeps = substeps
+        self._index = ModelIndex(self._model)
+        self._batches: dict[int, _HostBatch] = {}
+
+    def step(self, params: ModelParams, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+        """See `Physics.step`."""
+        out = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
+        return jax.pure_callback(self._host_step, out, params, state, ctrl, vmap_method="broadcast_all")
+
+    def _host_step(self, params: ModelParams, state: PhysicsState, ctrl) -> PhysicsState:
+        lead = np.shape(ctrl)[:-1]
+        params, state, ctrl = jax.tree.map(
+            lambda x: np.asarray(x).reshape((-1,) + np.shape(x)[len(lead) :]), (params, state, ctrl)
+        )
+        n = ctrl.shape[0]
+        if n not in self._batches:
+            self._batches[n] = _HostBatch(self._model, self._index, n)
+        new = self._batches[n].step(params, state, ctrl, self._substeps)
+        return jax.tree.map(lambda x: x.reshape(lead + x.shape[1:]), new)
+
+
+class _HostBatch:
+    """A `mujoco.batch.Batch` of a fixed number of environments."""
+
+    def __init__(self, model, index: ModelIndex, n: int):
+        self._model, self._index = model, index
+        self._batch = Batch(model, nsim=n)
+        self._params: ModelParams | None = None
+        self._expanded: dict[str, np.ndarray] = {}
+        self._qpos = self._batch.bind("qpos")
+        self._qvel = self._batch.bind("qvel")
+        self._ctrl = self._batch.bind("ctrl")
+        self._warmstart = self._batch.bind("qacc_warmstart")
+        self._sensors = self._batch.bind("sensordata")
+
+    def step(self, params: ModelParams, state: PhysicsState, ctrl, substeps: int) -> PhysicsState:
+        self._write_params(params)
+        self._qpos[:], self._qvel[:] = state.qpos, state.qvel
+        self._warmstart[:], self._ctrl[:] = state.warmstart, ctrl
+        self._batch.step(nstep=substeps)
+        return PhysicsState(
+            qpos=self._qpos.astype(np.float32),
+            qvel=self._qvel.astype(np.float32),
+            warmstart=self._warmstart.astype(np.float32),
+            touch=touch_from_sensors(self._sensors, np).astype(np.float32),
+        )
+
+    def _write_params(self, params: ModelParams) -> None:
+        """Write per-environment model fields, of the environments whose parameters changed alone."""
+        leaves = jax.tree.leaves(params)
+        if self._params is None:
+            changed = np.ones(len(leaves[0]), bool)
+        else:
+            changed = np.zeros(len(leaves[0]), bool)
+            for old, new in zip(jax.tree.leaves(self._params), leaves, strict=True):
+                changed |= (old != new).reshape(len(new), -1).any(axis=1)
+            if not changed.any():
+                return
+        fields = self._index.fields(self._model, jax.tree.map(lambda x: x[changed], params))
+        for name, value in fields.items():
+            if name not in self._expanded:
+                self._expanded[name] = self._batch.expand(name)
+            self._expanded[name][changed] = value
+        self._params = jax.tree.map(np.array, params)

@@ -1,0 +1,28 @@
+"""MJX: the same scene on any JAX device."""
+
+import jax
+import jax.numpy as jp
+from mujoco import mjx
+
+from mjx_envs import scene
+from mjx_envs.physics import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
+
+
+class JaxPhysics:
+    """MJX-JAX; carries no `mjx.Data` between control steps, so the state stays small."""
+
+    def __init__(self, sim_dt_s: float, substeps: int):
+        self._model = scene.build_model(sim_dt_s)
+        self._mx = mjx.put_model(self._model)
+        self._substeps = substeps
+        self._index = ModelIndex(self._model)
+
+    def step(self, params: ModelParams, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+        """See `Physics.step`."""
+        mx = self._mx.replace(**self._index.fields(self._mx, params, jp))
+        data = mjx.make_data(self._model).replace(
+            qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl
+        )
+        data, _ = jax.lax.scan(lambda d, _: (mjx.step(mx, d), None), data, None, self._substeps)
+        touch = touch_from_sensors(data.sensordata, jp)
+        return PhysicsState(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc_warmstart, touch=touch)

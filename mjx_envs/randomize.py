@@ -1,0 +1,81 @@
+"""What differs from episode to episode: object, its pose and size, dynamics, joints, camera."""
+
+import jax
+import jax.numpy as jp
+import numpy as np
+
+from ddgrasp import contract
+from ddgrasp.config import RandomConfig
+from mjx_envs import kinematics, scene
+from mjx_envs.objects import get_object
+from mjx_envs.physics import ModelParams
+
+
+class ObjectTable:
+    """The objects' constants as arrays indexed by position in `names`."""
+
+    def __init__(self, names: tuple[str, ...]):
+        specs = [get_object(name) for name in names]
+        slots = [spec.slot_arrays() for spec in specs]
+        self.names = tuple(names)
+        self.slot_size = np.stack([s[0] for s in slots])
+        self.slot_pos = np.stack([s[1] for s in slots])
+        self.slot_quat = np.stack([s[2] for s in slots])
+        self.mass = np.array([s.mass_kg for s in specs])
+        self.inertia = np.stack([s.inertia_kg_m2() for s in specs])
+        self.friction = np.array([s.friction for s in specs])
+        self.rest_height = np.array([s.rest_height_m for s in specs])
+        self.symmetry = np.array([s.grasp_symmetry for s in specs])
+        self.log_category = np.log([s.category_id for s in specs])
+        self.rgb = np.array([s.rgb for s in specs])
+
+
+def _around(key, half_range, shape=()):
+    """Uniform factors in [1 - half_range, 1 + half_range]."""
+    return 1.0 + half_range * jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+
+
+def sample_params(key: jax.Array, config: RandomConfig, table: ObjectTable, index) -> tuple[ModelParams, jax.Array]:
+    """Model parameters of one episode with object `index`; also the object's size factor ()."""
+    keys = jax.random.split(key, 7)
+    size = _around(keys[0], config.size)
+    mass = _around(keys[1], config.object_mass)
+    take = lambda a: jp.asarray(a, jp.float32)[index]  # noqa: E731
+    params = ModelParams(
+        slot_size=take(table.slot_size) * size,
+        slot_pos=take(table.slot_pos) * size,
+        slot_quat=take(table.slot_quat),
+        object_mass=take(table.mass) * mass,
+        object_inertia=take(table.inertia) * mass * size**2,
+        object_friction=take(table.friction) * _around(keys[2], config.object_friction),
+        link_mass_scale=_around(keys[3], config.link_mass, (scene.N_ARM,)),
+        joint_damping=_around(keys[4], config.damping, (scene.N_ARM,)) * scene.JOINT_DAMPING_NMS_RAD,
+        joint_friction=config.friction_nm * jax.random.uniform(keys[5], (scene.N_ARM,)),
+        gain_scale=_around(keys[6], config.stiffness, (scene.N_ARM,)),
+    )
+    return params, size
+
+
+def sample_qpos(key: jax.Array, config: RandomConfig, rest_height_m) -> jax.Array:
+    """(16,) initial joints around home, gripper open, object on the table with any yaw."""
+    k_joint, k_xy, k_yaw = jax.random.split(key, 3)
+    joints = jp.asarray(scene.HOME_RAD) + config.joint_rad * jax.random.uniform(
+        k_joint, (scene.N_ARM,), minval=-1.0, maxval=1.0
+    )
+    half = jp.asarray(contract.WORKSPACE_SIZE_M) / 2
+    xy = jp.asarray(contract.WORKSPACE_CENTER_M) + half * jax.random.uniform(k_xy, (2,), minval=-1.0, maxval=1.0)
+    yaw = jax.random.uniform(k_yaw, (), minval=-jp.pi, maxval=jp.pi)
+    fingers = jp.full(2, contract.GRIPPER_MAX_WIDTH_M / 2)
+    return jp.concatenate([joints, fingers, xy, rest_height_m[None], kinematics.quat_about_z(yaw, jp)])
+
+
+def sample_camera(key: jax.Array, config: RandomConfig, T_world_cam) -> jax.Array:
+    """(4, 4) the nominal camera pose, moved and turned within the configured range."""
+    k_pos, k_rot = jax.random.split(key)
+    shift = config.camera_position_m * jax.random.uniform(k_pos, (3,), minval=-1.0, maxval=1.0)
+    rx, ry, rz = config.camera_angle_rad * jax.random.uniform(k_rot, (3,), minval=-1.0, maxval=1.0)
+    # First-order rotation, made orthonormal: the angles are a few hundredths of a radian.
+    quat = jp.array([1.0, rx / 2, ry / 2, rz / 2])
+    turn = kinematics.quat_to_mat(quat / jp.linalg.norm(quat), jp)
+    T = jp.asarray(T_world_cam, jp.float32)
+    return T.at[:3, :3].set(T[:3, :3] @ turn).at[:3, 3].add(shift)

@@ -1,0 +1,138 @@
+"""PPO as pure functions over one state: Brax's networks, losses and normaliser under our own loop.
+
+`iteration` collects one batch of experience and takes the gradient steps on it. The whole learner,
+environments included, is one pytree, so that a checkpoint of it resumes exactly.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jp
+import optax
+from brax.training import acting
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import losses as ppo_losses
+from brax.training.agents.ppo import networks as ppo_networks
+from flax import linen, struct
+
+from ddgrasp import contract
+from ddgrasp.config import TeacherConfig
+from mjx_envs.grasp_env import AutoReset
+
+
+@struct.dataclass
+class LearnerState:
+    """Everything training needs to go on: this is what a checkpoint holds."""
+
+    params: ppo_losses.PPONetworkParams
+    normalizer: running_statistics.RunningStatisticsState
+    opt_state: optax.OptState
+    env_state: Any
+    key: jax.Array
+    iteration: jax.Array
+    """() iterations done."""
+
+
+def make_networks(config: TeacherConfig) -> ppo_networks.PPONetworks:
+    """Brax's PPO networks: tanh-squashed normal policy and value MLPs on normalised observations."""
+    return ppo_networks.make_ppo_networks(
+        contract.OBSERVATION_SIZE,
+        contract.ACTION_SIZE,
+        preprocess_observations_fn=running_statistics.normalize,
+        policy_hidden_layer_sizes=config.hidden,
+        value_hidden_layer_sizes=config.hidden,
+        activation=linen.elu,
+    )
+
+
+def iterations(config: TeacherConfig) -> int:
+    """Number of iterations in `config.total_steps` control steps."""
+    return max(1, round(config.total_steps / (config.num_envs * config.unroll_steps)))
+
+
+def make_optimizer(config: TeacherConfig) -> optax.GradientTransformation:
+    """Adam with linearly decaying step size and clipped gradients."""
+    updates = iterations(config) * config.epochs * config.minibatches
+    rate = optax.linear_schedule(config.learning_rate, 0.1 * config.learning_rate, updates)
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate))
+
+
+def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
+    """A fresh learner and its environments."""
+    k_policy, k_value, k_env, k_next = jax.random.split(key, 4)
+    networks = make_networks(config)
+    params = ppo_losses.PPONetworkParams(networks.policy_network.init(k_policy), networks.value_network.init(k_value))
+    normalizer = running_statistics.init_state(specs.Array((contract.OBSERVATION_SIZE,), jp.dtype("float32")))
+    return LearnerState(
+        params=params,
+        normalizer=normalizer,
+        opt_state=make_optimizer(config).init(params),
+        env_state=env.reset(jax.random.split(k_env, config.num_envs)),
+        key=k_next,
+        iteration=jp.zeros((), jp.int32),
+    )
+
+
+def iteration(
+    config: TeacherConfig, env: AutoReset, state: LearnerState
+) -> tuple[LearnerState, dict[str, jax.Array]]:
+    """One batch of experience and the gradient steps on it. Pure; jit with config and env static."""
+    networks = make_networks(config)
+    key = jax.random.fold_in(state.key, state.iteration)
+    k_unroll, k_sgd = jax.random.split(key)
+    env_state = env.refresh(state.env_state)
+    policy = ppo_networks.make_inference_fn(networks)((state.normalizer, state.params.policy))
+    env_state, data, outcome = _unroll(env, env_state, policy, k_unroll, config.unroll_steps)
+    normalizer = running_statistics.update(state.normalizer, data.observation)
+    (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state)
+    new = LearnerState(params, normalizer, opt_state, env_state, state.key, state.iteration + 1)
+    return new, losses | outcome
+
+
+def _unroll(env, env_state, policy, key, length):
+    """`length` steps of all environments: final state, transitions (B, T, ...), outcome scalars."""
+
+    def step(carry, _):
+        env_state, key = carry
+        key, k_act = jax.random.split(key)
+        env_state, transition = acting.actor_step(env, env_state, policy, k_act, extra_fields=("truncation",))
+        return (env_state, key), (transition, env_state.done, env_state.metrics)
+
+    (env_state, _), (data, done, metrics) = jax.lax.scan(step, (env_state, key), None, length)
+    episodes = jp.maximum(done.sum(), 1.0)
+    outcome = {"success": metrics["success"].sum() / episodes, "saturated": metrics["saturated"].mean()}
+    outcome |= {k: v.mean() for k, v in metrics.items() if k.startswith("reward/")}
+    return env_state, jax.tree.map(lambda x: jp.swapaxes(x, 0, 1), data), outcome
+
+
+def _improve(config, networks, normalizer, data, key, state):
+    """`epochs` passes of minibatch gradient steps; new (params, opt_state) and mean loss terms."""
+    optimizer = make_optimizer(config)
+    loss_fn = partial(
+        ppo_losses.compute_ppo_loss,
+        ppo_network=networks,
+        entropy_cost=config.entropy_cost,
+        discounting=config.discount,
+        reward_scaling=config.reward_scaling,
+        gae_lambda=config.gae_lambda,
+        clipping_epsilon=config.clip,
+    )
+
+    def minibatch(carry, batch_and_key):
+        params, opt_state = carry
+        batch, k_loss = batch_and_key
+        (_, terms), grads = jax.value_and_grad(loss_fn, has_aux=True)(params, normalizer, batch, k_loss)
+        updates, opt_state = optimizer.update(grads, opt_state, params)
+        return (optax.apply_updates(params, updates), opt_state), terms
+
+    def epoch(carry, k_epoch):
+        k_permute, k_loss = jax.random.split(k_epoch)
+        order = jax.random.permutation(k_permute, config.num_envs).reshape(config.minibatches, -1)
+        batches = jax.tree.map(lambda x: x[order], data)
+        return jax.lax.scan(minibatch, carry, (batches, jax.random.split(k_loss, config.minibatches)))
+
+    carry = (state.params, state.opt_state)
+    carry, terms = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
+    keep = ("total_loss", "policy_loss", "v_loss", "entropy_loss")
+    return carry, {f"loss/{name}": jp.mean(terms[name]) for name in keep if name in terms}

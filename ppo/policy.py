@@ -1,0 +1,70 @@
+"""The trained teacher as a function from observation to action: in NumPy for the rig, in JAX for batches."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ddgrasp import artifacts, contract
+from ddgrasp.errors import UserError
+
+PARAMS_FILE = "policy.msgpack"
+ACTIVATION = "elu"
+_STD_MIN = 1e-6
+
+
+class TeacherPolicy:
+    """Deterministic action (the mode) of the PPO policy: an MLP on the normalised observation."""
+
+    def __init__(self, mean: np.ndarray, std: np.ndarray, layers: list[tuple[np.ndarray, np.ndarray]]):
+        self.mean, self.std, self.layers = mean, std, layers
+
+    def __call__(self, observation, xp=np):
+        """(..., 8) action in [-1, 1] for observation (..., 40). `xp`: numpy or jax.numpy."""
+        x = (observation - self.mean) / self.std
+        for kernel, bias in self.layers[:-1]:
+            x = x @ kernel + bias
+            x = xp.where(x > 0, x, xp.expm1(xp.minimum(x, 0.0)))
+        kernel, bias = self.layers[-1]
+        return xp.tanh((x @ kernel + bias)[..., : contract.ACTION_SIZE])
+
+
+def save(path: Path, normalizer, policy_params) -> None:
+    """Writes what `load` reads. `policy_params`: Brax's policy network parameters."""
+    layers = policy_params["params"]
+    artifacts.save_params(
+        path,
+        {
+            "mean": np.asarray(normalizer.mean),
+            "std": np.maximum(np.asarray(normalizer.std), _STD_MIN),
+            "layers": {name: {k: np.asarray(v) for k, v in layer.items()} for name, layer in layers.items()},
+        },
+    )
+
+
+def from_learner(normalizer, policy_params) -> TeacherPolicy:
+    """The policy of a learner's current parameters; works on traced arrays."""
+    layers = policy_params["params"]
+    ordered = [layers[f"hidden_{i}"] for i in range(len(layers))]
+    return TeacherPolicy(normalizer.mean, normalizer.std, [(layer["kernel"], layer["bias"]) for layer in ordered])
+
+
+def load(directory: Path | str) -> TeacherPolicy:
+    """The teacher in a stage directory, a run directory or a pretrained folder."""
+    directory = Path(directory)
+    for candidate in (directory / PARAMS_FILE, directory / "teacher" / PARAMS_FILE):
+        if candidate.exists():
+            break
+    else:
+        raise UserError(f"{directory} holds no teacher ({PARAMS_FILE}): train one with `ddgrasp teacher train`.")
+    state = artifacts.load_params(candidate)
+    if state["mean"].shape != (contract.OBSERVATION_SIZE,):
+        raise UserError(
+            f"The teacher in {candidate} takes {state['mean'].shape[0]} inputs, this contract "
+            f"{contract.OBSERVATION_SIZE}: train a new one."
+        )
+    ordered = [state["layers"][f"hidden_{i}"] for i in range(len(state["layers"]))]
+    return TeacherPolicy(state["mean"], state["std"], [(layer["kernel"], layer["bias"]) for layer in ordered])
+
+
+load_policy: Callable[[Path | str], TeacherPolicy] = load

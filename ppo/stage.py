@@ -1,0 +1,37 @@
+"""Stage `teacher`: world -> PPO policy on the privileged state."""
+
+import shutil
+from pathlib import Path
+
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.progress import Progress
+from mjx_envs.grasp_env import GraspEnv
+from ppo import policy as teacher_policy
+from ppo.evaluate import evaluate
+from ppo.train import policy_of, train
+
+STAGE = "teacher"
+_TEST_SEED = 20_000
+
+
+def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+    """Trains a teacher (or loads one, `config.teacher.init_from`) and evaluates it."""
+    directory = run_dir / STAGE
+    path = directory / teacher_policy.PARAMS_FILE
+    if config.teacher.init_from:
+        policy = teacher_policy.load(config.teacher.init_from)
+        source = Path(config.teacher.init_from)
+        source = source if (source / teacher_policy.PARAMS_FILE).exists() else source / STAGE
+        with artifacts.atomic_path(path) as temporary:
+            shutil.copyfile(source / teacher_policy.PARAMS_FILE, temporary)
+    else:
+        state = train(config, directory, progress)
+        teacher_policy.save(path, state.normalizer, state.params.policy)
+        policy = policy_of(state)
+    metrics = evaluate(GraspEnv(config.world), policy, config.evaluation.teacher_trials, _TEST_SEED)
+    return artifacts.finish(
+        directory, STAGE, config, seconds=progress.seconds, metrics=metrics,
+        origin="loaded" if config.teacher.init_from else "trained",
+    )  # fmt: skip

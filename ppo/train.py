@@ -1,0 +1,99 @@
+"""Training loop: iterations, evaluations, checkpoints, curves."""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from mjx_envs.grasp_env import AutoReset, GraspEnv
+from ppo import learner
+from ppo.evaluate import evaluate
+from ppo.policy import TeacherPolicy, from_learner
+
+CHECKPOINTS = "checkpoints"
+LOG_EVERY = 5
+_KEPT = 2
+_EVAL_SEED = 10_000
+
+
+def train(config: Config, directory: Path, progress: Progress) -> learner.LearnerState:
+    """Trains in `directory`, going on from its newest checkpoint if it has one."""
+    teacher = config.teacher
+    _check(config)
+    env = AutoReset(GraspEnv(config.world))
+    iterate = jax.jit(partial(learner.iteration, teacher, env), donate_argnums=0)
+    total = learner.iterations(teacher)
+    options = ocp.CheckpointManagerOptions(max_to_keep=_KEPT, enable_async_checkpointing=False)
+    with ocp.CheckpointManager((directory / CHECKPOINTS).absolute(), options=options) as manager:
+        state = _start(config, env, manager)
+        good_evaluations = 0
+        with progress.task("PPO", total) as task:
+            task.start_at(int(state.iteration))
+            for i in range(int(state.iteration) + 1, total + 1):
+                state, metrics = iterate(state)
+                if i % LOG_EVERY == 0 or i == total:
+                    _log(i, metrics, progress, task)
+                task.advance()
+                if i % teacher.eval_every == 0:
+                    rate = _evaluate(env.env, state, config, i, progress)
+                    good_evaluations = good_evaluations + 1 if rate >= teacher.stop_at else 0
+                if i % teacher.checkpoint_every == 0 or i == total:
+                    manager.save(i, args=ocp.args.StandardSave(state), force=True)
+                    manager.wait_until_finished()
+                if good_evaluations >= 2:
+                    progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
+                    break
+    return state
+
+
+def restore(config: Config, directory: Path) -> learner.LearnerState:
+    """The newest checkpoint in `directory`; UserError if there is none."""
+    env = AutoReset(GraspEnv(config.world))
+    with ocp.CheckpointManager((directory / CHECKPOINTS).absolute()) as manager:
+        if manager.latest_step() is None:
+            raise UserError(f"{directory} holds no checkpoint of a teacher.")
+        return _start(config, env, manager)
+
+
+def policy_of(state: learner.LearnerState) -> TeacherPolicy:
+    """The deterministic policy of a learner."""
+    return from_learner(state.normalizer, state.params.policy)
+
+
+def _check(config: Config) -> None:
+    if config.teacher.num_envs % config.teacher.minibatches:
+        raise UserError(
+            f"teacher.num_envs {config.teacher.num_envs} is no multiple of teacher.minibatches "
+            f"{config.teacher.minibatches}: change one of them."
+        )
+
+
+def _start(config: Config, env: AutoReset, manager: ocp.CheckpointManager) -> learner.LearnerState:
+    state = jax.jit(partial(learner.init, config.teacher, env))(jax.random.PRNGKey(config.seed))
+    if manager.latest_step() is None:
+        return state
+    return manager.restore(manager.latest_step(), args=ocp.args.StandardRestore(state))
+
+
+def _log(i: int, metrics, progress: Progress, task) -> None:
+    values = {name: float(value) for name, value in metrics.items()}
+    for name, value in values.items():
+        if not np.isfinite(value):
+            raise UserError(f"PPO diverged at iteration {i}: {name} is {value}. Lower teacher.learning_rate.")
+    progress.scalars(i, **values)
+    task.advance(0, success=values["success"])
+
+
+def _evaluate(env: GraspEnv, state, config: Config, i: int, progress: Progress) -> float:
+    result = evaluate(env, policy_of(state), min(256, config.evaluation.teacher_trials), _EVAL_SEED)
+    rate = result["success"]["successes"] / result["success"]["n"]
+    steps = i * config.teacher.num_envs * config.teacher.unroll_steps
+    progress.scalars(i, eval_success=rate, eval_saturated=result["saturated_actions"])
+    objects = "  ".join(f"{k} {v['successes']}/{v['n']}" for k, v in result["objects"].items())
+    progress.note(f"after {steps / 1e6:.2f} M steps: success {rate:.3f} ({objects})")
+    return rate
