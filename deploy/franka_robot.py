@@ -1,10 +1,13 @@
 """A Franka arm through franky (`pip install ddgrasp[franka]`).
 
-Written against franky-control's documented API; it has not been run on an arm by us. Keep the
-emergency stop in your hand, and start with a small `dynamics`.
+Written against franky-control 2.0's documented API and tried against franky-sim, a simulator that
+speaks the arm's network protocol; it has not been run on an arm by us. Keep the emergency stop in
+your hand, and start with a small `dynamics`.
 """
 
+import importlib
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,49 +25,54 @@ WIDTH_PERIOD_S = 0.03
 class FrankaRobot:
     """Joint position targets that pre-empt each other: franky replans smoothly from the moving state."""
 
-    def __init__(self, host: str, clock: Clock, *, dynamics: float = 0.2, grip_force_n: float = 20.0):
-        """`dynamics` in (0, 1] scales the arm's velocity, acceleration and jerk limits."""
+    def __init__(
+        self,
+        host: str,
+        clock: Clock,
+        *,
+        dynamics: float = 0.2,
+        grip_force_n: float = 20.0,
+        realtime: bool = True,
+    ):
+        """`dynamics` in (0, 1] scales the arm's velocity, acceleration and jerk limits.
+
+        `realtime` insists on a real-time kernel, as a real arm needs; a simulated one does not.
+        """
         if not 0.0 < dynamics <= 1.0:
             raise UserError(f"deploy.franka_dynamics is {dynamics}; expected above 0 and at most 1.")
         self._host, self._clock = host, clock
-        self._dynamics, self._grip_force_n = dynamics, grip_force_n
+        self._dynamics, self._grip_force_n, self._realtime = dynamics, grip_force_n, realtime
         self._arm: Any = None
-        self._gripper: Any = None
-        self._gripper_motion: Any = None
-        self._closed: bool | None = None
+        self._hand: _Hand | None = None
         self._holding = False
-        self._width_m = float("nan")
-        self._watcher: threading.Thread | None = None
-        self._watching = threading.Event()
 
     def start(self) -> None:
         """Connect to arm and gripper. Raises UserError."""
         franky = self._franky = _franky()
         try:
-            arm = franky.Robot(self._host, relative_dynamics_factor=self._dynamics)
+            kernel = franky.RealtimeConfig.Enforce if self._realtime else franky.RealtimeConfig.Ignore
+            arm = franky.Robot(self._host, relative_dynamics_factor=self._dynamics, realtime_config=kernel)
             arm.recover_from_errors()
-            self._gripper = franky.Gripper(self._host)
-            self._width_m = float(self._gripper.width)
+            self._hand = _Hand(franky.Gripper(self._host), franky.Exception, self._grip_force_n)
         except franky.Exception as error:
             raise UserError(
                 f"no Franka at {self._host!r} ({error}): unlock the joints, activate FCI in Desk and check "
                 "deploy.franka_host."
             ) from error
         self._arm = arm
-        self._watching.set()
-        self._watcher = threading.Thread(target=self._watch_width, daemon=True)
-        self._watcher.start()
 
     def read_state(self) -> RobotState:
-        """Joints as of now; the width as the gripper last reported it (NaN once it is lost)."""
+        """Joints as of now; the width as the gripper last reported it. Raises what stopped the gripper."""
+        assert self._hand is not None
         q = np.asarray(self._arm.state.q, float)
-        return RobotState(q, self._width_m, self._clock.now())
+        return RobotState(q, self._hand.width_m(), self._clock.now())
 
     def command(self, q_target_rad: np.ndarray, close: bool) -> None:
+        assert self._hand is not None
         joints = [float(q) for q in q_target_rad]
         self._move(self._franky.JointMotion(joints, return_when_finished=False))
         self._holding = False
-        self._set_gripper(close)
+        self._hand.set(close)
 
     def hold(self) -> None:
         """Brake as fast as the limits allow, then stay: once, since asking again would restart the stop."""
@@ -74,9 +82,9 @@ class FrankaRobot:
 
     def stop(self) -> None:
         """Brake along a planned stop, wait for it, let go of the connection. The gripper keeps its grip."""
-        self._watching.clear()
-        if self._watcher is not None:
-            self._watcher.join(timeout=1.0)
+        hand, self._hand = self._hand, None
+        if hand is not None:
+            hand.stop()
         arm, self._arm = self._arm, None
         if arm is None:
             return
@@ -90,32 +98,62 @@ class FrankaRobot:
         self._arm.poll_motion()  # raises what stopped the last motion (a reflex, a limit)
         self._arm.move(motion, asynchronous=True)
 
-    def _set_gripper(self, close: bool) -> None:
-        """Start closing or opening when the wish changes; the hand takes about half a second."""
-        if close == self._closed:
-            return
-        self._closed = close
-        if close:
-            self._gripper_motion = self._gripper.grasp_async(
-                0.0, GRIPPER_SPEED_M_S, self._grip_force_n, epsilon_outer=GRASP_ANY_WIDTH_M
-            )
-        else:
-            self._gripper_motion = self._gripper.open_async(GRIPPER_SPEED_M_S)
 
-    def _watch_width(self) -> None:
-        # The gripper answers over the network, too slowly to be asked inside a control period.
-        pause = threading.Event()
-        while self._watching.is_set():
-            try:
-                self._width_m = float(self._gripper.width)
-            except self._franky.Exception:
-                self._width_m = float("nan")
-            pause.wait(WIDTH_PERIOD_S)
+class _Hand:
+    """The gripper, asked and told in threads of its own.
+
+    It answers over the network, and a command waits for the end of the one before: both take too
+    long for a control period.
+    """
+
+    def __init__(self, gripper: Any, error_class: type[Exception], force_n: float):
+        self._gripper, self._error_class, self._force_n = gripper, error_class, force_n
+        self._width_m = float(gripper.width)
+        self._wish: bool | None = None
+        self._changed, self._stopping = threading.Event(), threading.Event()
+        self._error: Exception | None = None
+        for work in (self._watch, self._act):
+            threading.Thread(target=self._guard, args=(work,), daemon=True).start()
+
+    def width_m(self) -> float:
+        if self._error is not None:
+            raise self._error
+        return self._width_m
+
+    def set(self, close: bool) -> None:
+        """Close or open, once the motion under way has ended; the newest wish counts."""
+        if close != self._wish:
+            self._wish = close
+            self._changed.set()
+
+    def stop(self) -> None:
+        self._stopping.set()
+        self._changed.set()
+
+    def _guard(self, work: Callable[[], None]) -> None:
+        try:
+            while not self._stopping.is_set():
+                work()
+        except self._error_class as error:
+            self._error = error
+
+    def _watch(self) -> None:
+        self._width_m = float(self._gripper.width)
+        self._stopping.wait(WIDTH_PERIOD_S)
+
+    def _act(self) -> None:
+        self._changed.wait()
+        self._changed.clear()
+        if self._stopping.is_set():
+            return
+        if self._wish:
+            self._gripper.grasp(0.0, GRIPPER_SPEED_M_S, self._force_n, epsilon_outer=GRASP_ANY_WIDTH_M)
+        else:
+            self._gripper.open(GRIPPER_SPEED_M_S)
 
 
 def _franky() -> Any:
     try:
-        import franky
+        return importlib.import_module("franky")
     except ImportError as error:
         raise UserError(f"robot 'franka' needs franky ({error}): pip install 'ddgrasp[franka]'.") from error
-    return franky

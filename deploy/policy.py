@@ -131,7 +131,8 @@ class OnnxPolicy:
             contract.ONNX_INPUT_STATE: state[None].astype(np.float32),
             contract.ONNX_INPUT_NOISE: noise,
         }
-        return self._session.run([contract.ONNX_OUTPUT_ACTION], inputs)[0][0]
+        (action,) = self._session.run([contract.ONNX_OUTPUT_ACTION], inputs)
+        return np.asarray(action)[0]
 
 
 def _open(path: Path) -> ort.InferenceSession:

@@ -3,6 +3,7 @@
 Written against pyrealsense2's documented API; it has not been run on a camera by us.
 """
 
+import importlib
 import time
 from typing import Any
 
@@ -119,9 +120,8 @@ class RealSenseCamera:
 
 def _pyrealsense2() -> Any:
     try:
-        import pyrealsense2
+        return importlib.import_module("pyrealsense2")
     except ImportError as error:
         raise UserError(
             f"camera 'realsense' needs pyrealsense2 ({error}): pip install 'ddgrasp[realsense]'."
         ) from error
-    return pyrealsense2

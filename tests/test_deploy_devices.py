@@ -1,0 +1,140 @@
+"""Camera and robot drivers as far as they go without hardware, and what a user sees who chose wrongly."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from deploy_support import HOME_RAD, KinematicRobot, constant_bias, describe, write_policy
+
+from ddgrasp import contract
+from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
+from deploy.clock import SimClock
+from deploy.franka_robot import FrankaRobot
+from deploy.loop import ControlLoop, LoopSettings
+from deploy.policy import OnnxPolicy
+from deploy.realsense_camera import RealSenseCamera
+from deploy.replay_camera import ReplayCamera
+from deploy.safety import SafetyFilter, SafetyLimits
+from deploy.session import SessionOptions, deploy
+from sensors.recordings import RecordingWriter
+
+SIZE = (45, 80)
+
+
+@pytest.fixture
+def recording(tmp_path) -> Path:
+    """Four frames, 700, 710, 720 and 730 mm everywhere."""
+    path = tmp_path / "recording"
+    with RecordingWriter(path, {"consecutive_frames": True}) as writer:
+        for index in range(4):
+            writer.add(np.zeros((*SIZE, 3), np.uint8), np.full(SIZE, 700 + 10 * index, np.uint16))
+    return path
+
+
+def test_replay_follows_the_clock_and_ends_on_its_last_frame(recording):
+    clock = SimClock()
+    camera = ReplayCamera.open(recording, clock)
+    camera.start()
+    seen = []
+    for now_s in (0.0, 0.05, 0.1, 0.3, 0.4, 0.9):
+        clock.sleep_until(now_s)
+        frame = camera.read()
+        seen.append((int(frame.depth[0, 0]), round(frame.timestamp_s, 6)))
+    assert seen == [(700, 0.0), (700, 0.0), (710, 0.1), (730, 0.3), (730, 0.3), (730, 0.3)]
+
+
+def test_loop_over_a_replay_holds_once_the_recording_ends(recording, tmp_path):
+    clock = SimClock()
+    info = describe(depth_height=SIZE[0], depth_width=SIZE[1])
+    # Joint 1 moves by 1e-4 rad per millimetre beyond 700 in the newest frame.
+    gain, bias = np.zeros((3, 4, 8)), constant_bias(-0.7)
+    gain[2, :, 0] = 1e-3
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", info, depth_gain=gain, bias=bias))
+    robot = KinematicRobot(clock)
+    limits = SafetyLimits(acceleration_rad_s2=(1e6,) * 7)
+    camera = ReplayCamera.open(recording, clock)
+    loop = ControlLoop(camera, robot, policy, SafetyFilter(limits, 0.1), clock, LoopSettings(0.1))
+    report = loop.run(max_steps=6)
+    assert robot.q_rad[0] - HOME_RAD[0] == pytest.approx(1e-4 * (0 + 10 + 20 + 30), abs=1e-7)
+    assert robot.calls == ["start"] + ["command"] * 4 + ["hold"] * 2 + ["stop"]
+    assert report.events[0].reason.startswith("stale frame: the same one again")
+
+
+def test_realsense_takes_the_centre_pixel_of_every_block():
+    camera = RealSenseCamera(SimClock(), contract.D455.scaled(0.25))
+    counts = np.zeros((720, 1280), np.uint16)
+    counts[2::4, 2::4] = np.arange(180 * 320, dtype=np.uint16).reshape(180, 320)
+    depth = camera._convert(counts)
+    assert depth.dtype == np.uint16
+    np.testing.assert_array_equal(depth, counts[2::4, 2::4])
+    camera._unit_m = 0.0001  # a device set to a tenth of a millimetre
+    np.testing.assert_array_equal(camera._convert(np.full((720, 1280), 7004, np.uint16)), 700)
+
+
+def test_realsense_refuses_what_it_cannot_deliver():
+    with pytest.raises(UserError, match=r"300x169 depth, no whole fraction of 1280x720"):
+        RealSenseCamera(SimClock(), contract.D455.scaled(300 / 1280))
+    camera = RealSenseCamera(SimClock(), contract.D455)
+    camera._check_focal(contract.D455.fx_px * 1.05)
+    with pytest.raises(UserError, match="focal length is 380.0 px"):
+        camera._check_focal(380.0)
+
+
+def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
+    class DepthFrame:
+        def get_frame_timestamp_domain(self):
+            return "global_time"
+
+        def get_timestamp(self):
+            return 999_960.0  # ms, 40 ms before the patched time of day
+
+    class Library:
+        class timestamp_domain:
+            hardware_clock = "hardware_clock"
+
+    clock = SimClock()
+    clock.sleep_until(5.0)
+    camera = RealSenseCamera(clock, contract.D455)
+    camera._rs = Library
+    monkeypatch.setattr("deploy.realsense_camera.time.time", lambda: 1000.0)
+    assert camera._exposed_s(DepthFrame()) == pytest.approx(4.96)
+
+
+@pytest.mark.parametrize(
+    ("module", "start", "extra"),
+    [
+        ("pyrealsense2", lambda: RealSenseCamera(SimClock(), contract.D455).start(), "realsense"),
+        ("franky", lambda: FrankaRobot("127.0.0.1", SimClock()).start(), "franka"),
+    ],
+)
+def test_missing_driver_names_the_extra(monkeypatch, module, start, extra):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UserError, match=rf"pip install 'ddgrasp\[{extra}\]'") as error:
+        start()
+    assert "\n" not in str(error.value)
+
+
+def test_drivers_that_never_started_can_be_stopped():
+    RealSenseCamera(SimClock(), contract.D455).stop()
+    FrankaRobot("127.0.0.1", SimClock()).stop()
+    with pytest.raises(UserError, match="franka_dynamics is 1.5"):
+        FrankaRobot("127.0.0.1", SimClock(), dynamics=1.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (SessionOptions(robot="frank"), "Unknown robot 'frank'. Did you mean 'franka'"),
+        (SessionOptions(camera="stero"), "Unknown camera 'stero'. Did you mean 'stereo'"),
+        (SessionOptions(robot="franka", camera="stereo"), "use --camera realsense"),
+        (SessionOptions(robot="franka", camera="replay", recording=Path("r")), "would move blindly"),
+        (SessionOptions(camera="replay"), "needs --recording"),
+    ],
+)
+def test_wrong_combination_gets_one_line(options, message):
+    with pytest.raises(UserError, match=message):
+        deploy(get_preset("debug"), Path("absent.onnx"), options)
