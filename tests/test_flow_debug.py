@@ -1,0 +1,97 @@
+"""The whole flow at its smallest: killed once, resumed, reported. No quality is claimed of the debug preset."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ddgrasp import artifacts, pipeline
+from ddgrasp.presets import PRESETS
+
+ROOT = Path(__file__).parents[1]
+TIMEOUT_S = 600.0
+
+
+def _start(out: Path) -> subprocess.Popen:
+    command = [sys.executable, "-m", "ddgrasp.cli", "run", "--preset", "debug", "--out", str(out), "--resume"]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _manifests(out: Path) -> dict[str, bytes]:
+    return {path.parent.name: path.read_bytes() for path in out.glob(f"*/{artifacts.MANIFEST}")}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """(run directory, manifests at the kill, standard output of the resumed run)."""
+    out = tmp_path_factory.mktemp("flow") / "run"
+    process = _start(out)
+    deadline = time.monotonic() + TIMEOUT_S
+    while not artifacts.is_finished(out / "teacher") and process.poll() is None:
+        assert time.monotonic() < deadline, "the teacher did not end in time"
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    _, errors = process.communicate()
+    before = _manifests(out)
+    assert "teacher" in before, errors[-3000:]
+    resumed = _start(out)
+    output, errors = resumed.communicate(timeout=TIMEOUT_S)
+    assert resumed.returncode == 0, errors[-3000:]
+    return out, before, output
+
+
+def test_killed_and_resumed_every_stage_ends_and_none_is_redone(finished):
+    out, before, _ = finished
+    after = _manifests(out)
+    assert set(after) == {stage.name for stage in pipeline.STAGES}
+    assert {name: after[name] for name in before} == before
+    for stage in pipeline.STAGES:
+        artifact = artifacts.require(out, stage.name, PRESETS["debug"])
+        for parent in stage.parents:
+            assert artifact.manifest.parents[parent] == artifacts.read_artifact(out / parent).hash
+
+
+def test_the_report_has_every_promised_number(finished):
+    out, _, _ = finished
+    report = json.loads((out / "report.json").read_text())
+    for name in ("teacher", "student_rig", "student_clean", "student_ddg"):
+        success = report[name]["success"]
+        assert 0 <= success["low"] <= success["rate"] <= success["high"] <= 1
+        assert success["rate"] == success["successes"] / success["n"]
+    assert report["student_rig"]["success"]["n"] == PRESETS["debug"].evaluation.rig_trials
+    assert 0 <= report["export"]["max_abs_diff"] <= 1e-4
+    assert 0 < report["deploy"]["latency_ms"]["p50"] <= report["deploy"]["latency_ms"]["p99"]
+    for stage in pipeline.STAGES:
+        entry = report["stages"][stage.name]
+        assert entry["seconds"] > 0
+        assert entry["trained"] != entry["loaded"]
+
+
+def test_the_last_line_printed_is_the_student_in_the_rig(finished):
+    out, _, output = finished
+    success = json.loads((out / "report.json").read_text())["student_rig"]["success"]
+    last = output.rstrip().splitlines()[-1]
+    assert "exported student in the pseudo-real rig" in last
+    assert f"{100 * success['rate']:.1f} % of {success['n']}" in last
+    assert f"({100 * success['low']:.1f} to {100 * success['high']:.1f})" in last
+
+
+def test_the_page_has_a_picture_for_every_stage_that_makes_pictures(finished):
+    page = (finished[0] / "report.html").read_text()
+    assert page.count("data:image/png;base64,") >= 5
+    assert "cannot be shown" not in page
+
+
+def test_a_finished_run_is_only_reported_again(finished):
+    out, _, _ = finished
+    before = _manifests(out)
+    start = time.monotonic()
+    again = _start(out)
+    _, errors = again.communicate(timeout=TIMEOUT_S)
+    assert again.returncode == 0, errors[-3000:]
+    assert time.monotonic() - start < 60
+    assert _manifests(out) == before
