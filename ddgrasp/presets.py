@@ -1,6 +1,6 @@
 """The four named configurations. Presets are values: nothing branches on a preset's name."""
 
-from ddgrasp.config import Config, DDGConfig, RecordConfig
+from ddgrasp.config import Config, DDGConfig, DeployConfig, EvalConfig, RecordConfig
 from ddgrasp.errors import unknown_name
 
 _DEBUG_DDG = DDGConfig(
@@ -29,10 +29,27 @@ _PAPER_DDG = DDGConfig(
     sample_batch=256,
 )
 
-DEBUG = Config(preset="debug", ddg=_DEBUG_DDG, record=RecordConfig(trajectories=2, frames=12))
+DEBUG = Config(
+    preset="debug",
+    ddg=_DEBUG_DDG,
+    record=RecordConfig(trajectories=2, frames=12),
+    deploy=DeployConfig(realtime_trials=1),
+    evaluation=EvalConfig(rig_trials=4),
+)
 DEMO = Config(preset="demo", record=RecordConfig(trajectories=24))
-LAPTOP = Config(preset="laptop", ddg=_LAPTOP_DDG, record=RecordConfig(trajectories=80))
-PAPER = Config(preset="paper", ddg=_PAPER_DDG, record=RecordConfig(trajectories=80))
+LAPTOP = Config(
+    preset="laptop",
+    ddg=_LAPTOP_DDG,
+    record=RecordConfig(trajectories=80),
+    evaluation=EvalConfig(rig_trials=300),
+)
+PAPER = Config(
+    preset="paper",
+    ddg=_PAPER_DDG,
+    record=RecordConfig(trajectories=80),
+    deploy=DeployConfig(workers=8, realtime_trials=10),
+    evaluation=EvalConfig(rig_trials=300),
+)
 
 PRESETS = {config.preset: config for config in (DEBUG, DEMO, LAPTOP, PAPER)}
 
