@@ -63,6 +63,30 @@ class TeacherTrain(_OneStage):
 
 
 @dataclass(frozen=True)
+class TeacherEval:
+    """Measure a trained teacher again: success per object, over as many trials as asked for."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run."""
+    trials: int = 1000
+    """Episodes."""
+    seed: int = 0
+    """Of the episodes."""
+
+    def run(self) -> None:
+        from evaluation import wilson
+        from mjx_envs.grasp_env import GraspEnv
+        from ppo.evaluate import evaluate
+        from ppo.policy import load_policy
+
+        config = load_config(self.run_dir, "teacher")
+        policy = load_policy(self.run_dir / "teacher")
+        result = evaluate(GraspEnv(config.world), policy, self.trials, self.seed)
+        for name, counts in {**result["objects"], "all": result["success"]}.items():
+            print(f"{name:<12} {wilson.describe(wilson.success(counts['successes'], counts['n']))}")
+
+
+@dataclass(frozen=True)
 class DemosCollect(_OneStage):
     """Collect successful teacher episodes with clean depth."""
 
@@ -181,6 +205,7 @@ class Report:
 COMMANDS: dict[str, type] = {
     "run": Run,
     "teacher train": TeacherTrain,
+    "teacher eval": TeacherEval,
     "demos collect": DemosCollect,
     "record": Record,
     "ddg fit": DDGFit,

@@ -125,7 +125,7 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
     metrics = report.get(stage, {})
     if stage == "teacher":
         lines = [f"success {wilson.describe(metrics['success'])}"] if "success" in metrics else []
-        per_object = metrics.get("per_object", {})
+        per_object = metrics.get("per_object") or metrics.get("objects") or {}
         return lines + [
             f"{name}: {wilson.describe(value.get('success', value))}"
             for name, value in (per_object.items() if isinstance(per_object, Mapping) else ())

@@ -1,4 +1,4 @@
-"""The whole flow at its smallest: killed once, resumed, reported. No quality is claimed of the debug preset."""
+"""The whole flow at its smallest: killed once, resumed, reported. No quality is claimed of preset debug."""
 
 import json
 import signal
