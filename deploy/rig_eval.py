@@ -192,16 +192,17 @@ def _rotation(vector_rad: np.ndarray) -> np.ndarray:
 # --- worker processes --------------------------------------------------------------------------
 
 _rig: Rig | None = None
+_rig_of: tuple[Config, Path]
 
 
 def _start_worker(config: Config, policy_path: Path, parent: int) -> None:
-    """Build the rig; leave Ctrl-C to the parent, and go when the parent has gone."""
+    """Leave Ctrl-C to the parent, and go when the parent has gone."""
     import signal
 
-    global _rig
+    global _rig_of
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
-    _rig = Rig(config, policy_path)
+    _rig_of = config, policy_path
 
 
 def _leave_with(parent: int) -> None:
@@ -211,5 +212,7 @@ def _leave_with(parent: int) -> None:
 
 
 def _run_in_worker(trial: Trial) -> tuple[TrialResult, Film]:
-    assert _rig is not None
+    # The rig is built here, not in the initialiser, so that its errors reach the parent as they are.
+    global _rig
+    _rig = _rig or Rig(*_rig_of)
     return _rig.run(trial)

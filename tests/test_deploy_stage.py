@@ -1,0 +1,214 @@
+"""Trials in the pseudo-real rig, their log on disk, and the deploy stage that resumes from it."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from deploy_support import write_policy
+
+from ddgrasp import artifacts, contract
+from ddgrasp.config import Config, DeployConfig, EvalConfig, WorldConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from deploy import rig_eval, stage
+from deploy.clock import SimClock
+from deploy.rig_eval import Trial, TrialResult, plan, run_trials
+from deploy.sim_robot import SimRobot
+from deploy.stage import TrialLog, metrics
+from export import metadata
+from mjx_envs.camera import nominal_camera
+
+CONFIG = Config(
+    preset="test",
+    world=WorldConfig(objects=("cube", "apple"), camera_scale=0.125, episode_steps=4),
+    deploy=DeployConfig(realtime_trials=1, film_every=2, workers=2),
+    evaluation=EvalConfig(rig_trials=3),
+)
+
+
+def result(
+    index: int = 0, object_name: str = "cube", realtime: bool = False, success: bool = True, **changes
+):
+    """A finished trial of two steps."""
+    values = TrialResult(
+        index, object_name, realtime, success, steps=2, holds=0, missed_deadlines=0,
+        safety={"commands": 2, "workspace": 1}, events=[], sense_s=[0.03, 0.03], infer_s=[0.01, 0.01],
+        act_s=[0.001, 0.001], latency_s=[0.011, 0.011], period_s=[0.1],
+    )  # fmt: skip
+    return dataclasses.replace(values, **changes)
+
+
+@pytest.fixture
+def policy(tmp_path) -> Path:
+    """Lowers the arm slowly; says nothing about success."""
+    info = metadata.describe_run(CONFIG, project_version="0", student_manifest_hash="0")
+    bias = np.zeros((info.chunk, 8))
+    bias[:, 1], bias[:, 7] = 0.2, -1.0
+    return write_policy(tmp_path / "policy.onnx", info, bias=bias)
+
+
+@pytest.fixture
+def run_dir(tmp_path, policy) -> Path:
+    """A run whose export stage is finished."""
+    run = tmp_path / "run"
+    export = run / "export"
+    export.mkdir(parents=True)
+    (export / stage.POLICY_FILE).write_bytes(policy.read_bytes())
+    artifacts.finish(export, "export", CONFIG, seconds=0.0, metrics={})
+    return run
+
+
+def run_stage(run_dir: Path, resume: bool = False) -> artifacts.Artifact:
+    progress = Progress(run_dir / "deploy", "deploy", quiet=True)
+    try:
+        return stage.run(CONFIG, run_dir, resume=resume, progress=progress)
+    finally:
+        progress.close()
+
+
+# --- the log -------------------------------------------------------------------------------------
+
+
+def test_log_returns_what_was_appended(tmp_path):
+    path, header = tmp_path / "trials.jsonl", {"policy_sha256": "a", "config_hash": "b"}
+    log = TrialLog(path, header)
+    log.append(result(0))
+    log.append(result(0, realtime=True))
+    again = TrialLog(path, header)
+    assert again.results == {(0, False): result(0), (0, True): result(0, realtime=True)}
+
+
+def test_torn_last_line_is_dropped_and_the_next_one_is_whole(tmp_path):
+    path, header = tmp_path / "trials.jsonl", {"policy_sha256": "a"}
+    log = TrialLog(path, header)
+    log.append(result(0))
+    log.append(result(1))
+    path.write_bytes(path.read_bytes()[:-20])
+    torn = TrialLog(path, header)
+    assert list(torn.results) == [(0, False)]
+    torn.append(result(2))
+    assert list(TrialLog(path, header).results) == [(0, False), (2, False)]
+    assert all(json.loads(line) for line in path.read_text().splitlines())
+
+
+def test_trials_of_another_policy_are_refused_and_kept(tmp_path):
+    path = tmp_path / "trials.jsonl"
+    TrialLog(path, {"policy_sha256": "a"}).append(result(0))
+    before = path.read_bytes()
+    with pytest.raises(UserError, match="another policy or configuration"):
+        TrialLog(path, {"policy_sha256": "b"})
+    assert path.read_bytes() == before
+
+
+def test_metrics_count_success_by_object_and_time_on_the_real_clock_alone():
+    results = [
+        result(0, "cube", success=True),
+        result(1, "apple", success=False, infer_s=[9.0, 9.0], latency_s=[9.0, 9.0]),
+        result(2, "cube", success=False),
+        result(0, "cube", realtime=True, success=True, period_s=[0.1, 0.102], missed_deadlines=3),
+    ]
+    values = metrics(results)
+    assert values["student_rig"]["success"] == {"successes": 1, "n": 3}
+    assert values["student_rig"]["per_object"] == {
+        "apple": {"successes": 0, "n": 1},
+        "cube": {"successes": 1, "n": 2},
+    }
+    assert values["latency_ms"] == {"p50": 11.0, "p99": 11.0}
+    assert values["missed_deadlines"] == 3
+    assert values["jitter_ms"]["max"] == pytest.approx(2.0)
+    assert values["safety"] == {"commands": 6, "workspace": 3}
+
+
+def test_plan_mixes_objects_and_keeps_real_time_apart():
+    trials = plan(CONFIG)
+    assert [(t.index, t.object_name, t.realtime) for t in trials] == [
+        (0, "cube", False), (1, "apple", False), (2, "cube", False), (0, "cube", True),
+    ]  # fmt: skip
+
+
+# --- the rig -------------------------------------------------------------------------------------
+
+
+def test_camera_stands_within_the_calibration_error():
+    nominal = nominal_camera(CONFIG.world.profile).T_world_cam
+    spread = CONFIG.world.random
+    for seed in range(20):
+        pose = rig_eval.camera_pose(CONFIG, np.random.default_rng(seed))
+        assert np.abs(pose[:3, 3] - nominal[:3, 3]).max() <= spread.camera_position_m
+        turn = pose[:3, :3] @ nominal[:3, :3].T
+        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+        assert 0 < angle <= np.sqrt(3) * spread.camera_angle_rad + 1e-9
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_sim_robot_moves_one_period_per_period_and_holds_where_it_is():
+    from mjx_envs.rig import RigWorld
+
+    world, clock = RigWorld(objects=("cube",), randomise=False), SimClock()
+    world.reset(0, "cube")
+    robot = SimRobot(world, clock)
+    robot.start()
+    start_s, q0 = world.data.time, robot.read_state().q_rad
+    assert world.data.time == start_s, "no time has passed on the clock"
+    robot.command(q0 + [0.1, 0, 0, 0, 0, 0, 0], False)
+    clock.sleep_until(0.1)
+    state = robot.read_state()
+    assert world.data.time - start_s == pytest.approx(0.1) and state.timestamp_s == pytest.approx(0.1)
+    assert 0.01 < state.q_rad[0] - q0[0] < 0.11
+    clock.sleep_until(0.35)  # a step that missed two deadlines
+    assert robot.read_state().timestamp_s == pytest.approx(0.3)
+    assert world.data.time - start_s == pytest.approx(0.3)
+    robot.hold()
+    held = robot.read_state().q_rad
+    clock.sleep_until(1.0)
+    robot.hold()
+    assert np.abs(robot.read_state().q_rad - held).max() < 0.02
+    assert state.width_m == pytest.approx(contract.GRIPPER_MAX_WIDTH_M, abs=2e-3)
+
+
+def test_trial_is_repeatable_and_fits_the_loop(policy):
+    trial = Trial(1, "apple")
+    (first, film), (again, _) = (next(run_trials(CONFIG, policy, [trial], 0)) for _ in range(2))
+    outcome = ("success", "steps", "holds", "safety", "events")
+    assert [getattr(first, n) for n in outcome] == [getattr(again, n) for n in outcome]
+    assert first.steps == first.safety["commands"] == 4 and first.holds == 0
+    assert film.steps == (0, 2)
+    assert film.rgb.shape == (2, 90, 160, 3) and film.depth_mm.shape == (2, 90, 160)
+    seen = film.depth_mm[film.depth_mm > 0]
+    assert 0.5 < np.median(seen) / 1000 < 1.5 and len(seen) > 0.5 * film.depth_mm.size
+
+
+def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):
+    ran = []
+    real = stage.run_trials
+
+    def counted(config, policy_path, trials, workers):
+        ran.append([(t.index, t.realtime) for t in trials])
+        for count, outcome in enumerate(real(config, policy_path, trials, workers)):
+            yield outcome
+            if len(ran) == 1 and count == 1:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(stage, "run_trials", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run_stage(run_dir)
+    done = set(
+        TrialLog(
+            run_dir / "deploy" / stage.TRIALS_FILE,
+            stage._header(CONFIG, run_dir / "export" / stage.POLICY_FILE),
+        ).results
+    )
+    assert len(done) == 2 and not artifacts.is_finished(run_dir / "deploy")
+    artifact = run_stage(run_dir, resume=True)
+    assert {*ran[1], *ran[2]} == {(0, False), (1, False), (2, False), (0, True)} - done
+    values = artifact.manifest.metrics
+    assert values["student_rig"]["success"]["n"] == 3
+    assert values["latency_ms"]["p50"] > 0 and values["jitter_ms"]["p50"] is not None
+    outcome = "rig_success" if values["student_rig"]["success"]["successes"] else "rig_failure"
+    assert (run_dir / "deploy" / f"{outcome}.png").read_bytes()[:4] == b"\x89PNG"
+    assert artifact.manifest.parents.keys() == {"export"}
