@@ -17,7 +17,8 @@ from sensors.recordings import Recording, find_recordings
 class Frames:
     """Frames of several recordings, one after the other.
 
-    depth_m (N, H, W) float32, 0 = hole; prior (N, H, W) float16; recording (N,) int: which one a frame is from.
+    depth_m (N, H, W) float32, 0 = hole; prior (N, H, W) float16; recording (N,) int: which one a frame is
+    from.
     """
 
     depth_m: np.ndarray
@@ -36,7 +37,9 @@ class Frames:
         """(training, held-out) frames: the held-out ones are the last, at least one."""
         held = max(1, round(len(self) * holdout_fraction))
         if held >= len(self):
-            raise UserError(f"{len(self)} frame(s) cannot be split: the generator needs 2 or more; record more.")
+            raise UserError(
+                f"{len(self)} frame(s) cannot be split: the generator needs 2 or more; record more."
+            )
         return self.part(slice(0, len(self) - held)), self.part(slice(len(self) - held, len(self)))
 
 
@@ -58,7 +61,9 @@ def load_frames(
             break
         frames = read_depth(recording, count, config)
         rgb = np.stack([recording.rgb(i) for i in range(count)]) if prior.needs_rgb else None
-        priors.append(prior.from_recording(frames, rgb, np.random.default_rng((seed, number))).astype(np.float16))
+        priors.append(
+            prior.from_recording(frames, rgb, np.random.default_rng((seed, number))).astype(np.float16)
+        )
         depth.append(frames)
         index.append(np.full(count, number))
         left = None if left is None else left - count
@@ -94,8 +99,8 @@ class Batch:
 def make_batch(frames: Frames, config: DDGConfig, seed: int, step: int) -> Batch:
     """The training batch of `step`: random frames, half of them upside down, their prior jittered.
 
-    A function of (seed, step) alone, so that a resumed run sees the batches an uninterrupted one would. Frames are
-    never mirrored left to right: stereo shadows lie on one side.
+    A function of (seed, step) alone, so that a resumed run sees the batches an uninterrupted one would.
+    Frames are never mirrored left to right: stereo shadows lie on one side.
     """
     rng = np.random.default_rng((seed, step))
     chosen = rng.integers(len(frames), size=config.batch_size)

@@ -1,10 +1,11 @@
 """The geometric prior c: clean relative depth that tells the generator what the scene is (paper III-B1).
 
-The paper takes c from a video depth network on RGB. Any such source fits the `Prior` protocol; the built-in one
-needs no network: affine-normalised inverse depth, from simulation directly, from recordings after filling the
-holes. Filling must not betray where the holes were, or the generator would look for traces of filling that clean
-simulated depth never has. Three things hide them: filled pixels take the background's depth of their own row (the
-true surface behind an occlusion shadow), c is blurred, and some frames are filled under decoy holes as well.
+The paper takes c from a video depth network on RGB. Any such source fits the `Prior` protocol; the built-in
+one needs no network: affine-normalised inverse depth, from simulation directly, from recordings after
+filling the holes. Filling must not betray where the holes were, or the generator would look for traces of
+filling that clean simulated depth never has. Three things hide them: filled pixels take the background's
+depth of their own row (the true surface behind an occlusion shadow), c is blurred, and some frames are
+filled under decoy holes as well.
 """
 
 from typing import Protocol
@@ -29,7 +30,9 @@ class Prior(Protocol):
     needs_rgb: bool
     """Whether `rgb` must be given; otherwise it is ignored and may be None."""
 
-    def from_recording(self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
+    def from_recording(
+        self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator
+    ) -> np.ndarray:
         """depth_m (T, H, W) with holes (0), rgb (T, h, w, 3) uint8 -> c (T, H, W) float32."""
         ...
 
@@ -41,8 +44,8 @@ class Prior(Protocol):
 class InverseDepthPrior:
     """c = clip((1/d - median) / (2 mean|1/d - median|)), the statistics over the whole sequence.
 
-    The normalisation is the affine-invariant one of MiDaS (Ranftl et al. 2020, eq. 5-6); relative depth networks
-    are trained to give inverse depth up to just that.
+    The normalisation is the affine-invariant one of MiDaS (Ranftl et al. 2020, eq. 5-6); relative depth
+    networks are trained to give inverse depth up to just that.
     """
 
     name = "inverse_depth"
@@ -52,7 +55,9 @@ class InverseDepthPrior:
         self.blur_px = blur_px
         self.decoy_share = decoy_share
 
-    def from_recording(self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
+    def from_recording(
+        self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator
+    ) -> np.ndarray:
         """See `Prior`; `rng` chooses the frames filled under decoy holes and their shapes."""
         inverse = invert(depth_m)
         holes = inverse == 0
@@ -86,7 +91,7 @@ def invert(depth_m: np.ndarray) -> np.ndarray:
 
 
 def normalise(inverse: np.ndarray) -> np.ndarray:
-    """Affine-normalised inverse depth of a sequence (T, H, W): median 0, mean deviation 1/2, |c| <= C_LIMIT."""
+    """Affine-normalised inverse depth of a sequence (T, H, W): median 0, mean deviation 1/2, clipped."""
     sample = inverse.reshape(-1)[::_STATISTICS_STRIDE]
     shift = np.median(sample)
     scale = 2 * np.mean(np.abs(sample - shift)) + 1e-6
@@ -96,15 +101,18 @@ def normalise(inverse: np.ndarray) -> np.ndarray:
 def fill_from_background(inverse: np.ndarray) -> np.ndarray:
     """Fills holes (0) of an inverse depth map (H, W) with the farther of the row's nearest valid pixels.
 
-    A stereo camera loses pixels mostly beside near objects, where one imager sees the background and the other
-    does not: the farther neighbour is the surface that was lost. Rows without a valid pixel take the nearest
-    row's values. A median over the filled pixels removes the streaks.
+    A stereo camera loses pixels mostly beside near objects, where one imager sees the background and the
+    other does not: the farther neighbour is the surface that was lost. Rows without a valid pixel take the
+    nearest row's values. A median over the filled pixels removes the streaks.
     """
     valid = inverse > 0
     rows = np.flatnonzero(valid.any(axis=1))
     if len(rows) == 0:
         return inverse.copy()
-    left, right = _nearest_valid_in_row(inverse, valid), _nearest_valid_in_row(inverse[:, ::-1], valid[:, ::-1])
+    left, right = (
+        _nearest_valid_in_row(inverse, valid),
+        _nearest_valid_in_row(inverse[:, ::-1], valid[:, ::-1]),
+    )
     right = right[:, ::-1]
     background = np.where((left > 0) & (right > 0), np.minimum(left, right), np.maximum(left, right))
     filled = np.where(valid, inverse, background)
@@ -127,7 +135,7 @@ def decoy_holes(holes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def smooth_in_time(inverse: np.ndarray) -> np.ndarray:
-    """Mean over each frame and its two neighbours (T, H, W), of the pixels that still see the same surface."""
+    """Mean over each frame and its two neighbours (T, H, W), of pixels that still see the same surface."""
     total, count = inverse.copy(), np.ones_like(inverse)
     for here, there in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
         same = np.abs(inverse[there] - inverse[here]) < SAME_SURFACE * inverse[here]

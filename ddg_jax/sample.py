@@ -1,4 +1,4 @@
-"""Sampling: prior c -> noisy depth; simulated depth -> grafted noisy depth, a batch or a stream of episodes."""
+"""Sampling: prior c -> noisy depth; simulated depth -> grafted noisy depth, per batch or per episode."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from ddg_jax import normalise
 from ddg_jax import schedule as diffusion
 from ddg_jax.graft import artefact_mask, graft_mask
 from ddg_jax.prior import C_LIMIT, Prior, make_prior
-from ddg_jax.train import Params, make_unet
+from ddg_jax.train import Params, config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError, unknown_name
@@ -53,19 +53,20 @@ class Generator:
 
 
 def _init_shapes(config: DDGConfig) -> Any:
-    from ddg_jax.train import init_params
-
     return init_params(config, jax.random.key(0))
 
 
 # --- noise shared between the frames of an episode ------------------------------------------------
 
 
-def frame_noise(key: Array, episode: Array, frame: Array, shape: tuple[int, int], correlation: float) -> Array:
+def frame_noise(
+    key: Array, episode: Array, frame: Array, shape: tuple[int, int], correlation: float
+) -> Array:
     """Standard normal noise (B, H, W): sqrt(r) g_episode + sqrt(1 - r) g_frame, r = `correlation`.
 
     Frames of one episode share g_episode, so holes stay where they are between frames, as on a camera; every
-    frame's noise depends on (key, episode, frame) alone, however the frames are batched. episode, frame: (B,) int.
+    frame's noise depends on (key, episode, frame) alone, however the frames are batched. episode, frame:
+    (B,) int.
     """
 
     def one(e: Array, t: Array) -> Array:
@@ -92,25 +93,25 @@ def sample(
     """
     if config.sampler not in SAMPLERS:
         raise unknown_name("sampler", config.sampler, SAMPLERS)
-    made = diffusion.make_schedule(config.schedule, config.diffusion_steps, config.log_snr_shift)
+    made = config_schedule(config)
     visited = diffusion.timesteps(made.steps, steps, "trailing")
     noise = partial(
-        frame_noise, episode=episode, frame=frame, shape=c.shape[1:], correlation=config.frame_correlation
+        frame_noise, episode=episode, frame=frame, shape=(c.shape[1], c.shape[2]), correlation=config.frame_correlation
     )
-    unet = make_unet(config)
     prior_key, start_key, step_key = jax.random.split(key, 3)
     c = c + config.prior_noise * noise(prior_key)
 
     def body(x: Array, now: tuple[Array, Array]) -> tuple[Array, None]:
         k, previous = now
-        eps = unet.apply({"params": params}, x, c, jnp.full(x.shape[:1], k))
+        eps = predict_noise(config, params, x, c, jnp.full(x.shape[:1], k))
         fresh = partial(noise, jax.random.fold_in(step_key, k))
         if config.sampler == "ddpm":
             return diffusion.ddpm_step(made, x, k, previous, eps, fresh(), X_LIMIT), None
         extra = fresh() if config.eta else 0.0
         return diffusion.ddim_step(made, x, k, previous, eps, X_LIMIT, config.eta, extra), None
 
-    x, _ = jax.lax.scan(body, noise(start_key), (visited, diffusion.previous_steps(visited)))
+    path = (jnp.asarray(visited), jnp.asarray(diffusion.previous_steps(visited)))
+    x, _ = jax.lax.scan(body, noise(start_key), path)
     return x
 
 
@@ -119,7 +120,9 @@ def sample(
 
 @dataclass(frozen=True)
 class Generated:
-    """depth_m: the result, grafted (paper III-B2). predicted_m: the generator's own map. Both (B, H, W) float32."""
+    """depth_m: the result, grafted (paper III-B2). predicted_m: the generator's own map. Both (B, H, W)
+    float32.
+    """
 
     depth_m: np.ndarray
     predicted_m: np.ndarray
@@ -147,7 +150,7 @@ def generate(
     """
     config = generator.config
     _check_depth(depth_m, config)
-    c = _at_size(generator.prior.from_sim(depth_m, rgb), (config.height_px, config.width_px))
+    c = generator.prior.from_sim(_at_size(depth_m, (config.height_px, config.width_px)), rgb)
     x = predict(key, generator, c, episode=episode, steps=steps)
     mask = np.asarray(artefact_mask(x, config.noise_threshold))
     predicted = np.asarray(normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold))
@@ -186,8 +189,8 @@ def generate_episodes(
 ) -> Iterator[np.ndarray]:
     """Streams `generate` over clean episodes (T, H, W) metres: yields their grafted depth, one at a time.
 
-    `first` is the number of the first episode: a job that resumes after n episodes passes n and gets the depth
-    that an uninterrupted one would have made.
+    `first` is the number of the first episode: a job that resumes after n episodes passes n and gets the
+    depth that an uninterrupted one would have made.
     """
     for number, depth_m in enumerate(episodes, start=first):
         yield generate(key, generator, depth_m, episode=number).depth_m

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from ddgrasp.errors import UserError, unknown_name
 
@@ -42,7 +43,7 @@ def linear_betas(steps: int, first: float = 1e-4, last: float = 0.02) -> np.ndar
 
 
 def cosine_betas(steps: int) -> np.ndarray:
-    """beta_k = 1 - f((k+1)/K) / f(k/K), f(u) = cos^2(pi/2 (u+s)/(1+s)), (K,) float64 (N. & D. 2021, eq. 17)."""
+    """beta_k = 1 - f((k+1)/K) / f(k/K), f(u) = cos^2(pi/2 (u+s)/(1+s)), (K,) (N. & D. 2021, eq. 17)."""
     u = np.arange(steps + 1) / steps
     f = np.cos((u + COSINE_OFFSET) / (1 + COSINE_OFFSET) * math.pi / 2) ** 2
     return np.minimum(1 - f[1:] / f[:-1], MAX_BETA)
@@ -98,40 +99,58 @@ def previous_steps(visited: np.ndarray) -> np.ndarray:
     return np.append(visited[1:], -1).astype(np.int32)
 
 
-def alpha_bar_at(schedule: Schedule, step: Array, x: Array) -> Array:
+def alpha_bar_at(schedule: Schedule, step: ArrayLike, x: ArrayLike) -> Array:
     """alpha_bar at `step` (any leading shape of x; -1 gives 1), with axes added to broadcast against x."""
     step = jnp.asarray(step)
     value = jnp.where(step < 0, 1.0, jnp.asarray(schedule.alpha_bars)[jnp.maximum(step, 0)])
     return value.reshape(value.shape + (1,) * (jnp.ndim(x) - value.ndim))
 
 
-def q_sample(schedule: Schedule, x_0: Array, step: Array, eps: Array) -> Array:
-    """x_k = sqrt(alpha_bar) x_0 + sqrt(1 - alpha_bar) eps (Ho et al. 2020, eq. 4). x_0, eps: (B, ...), step (B,)."""
+def q_sample(schedule: Schedule, x_0: ArrayLike, step: ArrayLike, eps: ArrayLike) -> Array:
+    """x_k = sqrt(alpha_bar) x_0 + sqrt(1 - alpha_bar) eps (Ho et al. 2020, eq. 4). x_0, eps: (B, ...), step
+    (B,).
+    """
     a = alpha_bar_at(schedule, step, x_0)
     return jnp.sqrt(a) * x_0 + jnp.sqrt(1 - a) * eps
 
 
-def predict_x_0(schedule: Schedule, x_k: Array, step: Array, eps: Array) -> Array:
+def predict_x_0(schedule: Schedule, x_k: ArrayLike, step: ArrayLike, eps: ArrayLike) -> Array:
     """x_0 = (x_k - sqrt(1 - alpha_bar) eps) / sqrt(alpha_bar): `q_sample` solved for x_0 (eq. 15)."""
     a = alpha_bar_at(schedule, step, x_k)
-    return (x_k - jnp.sqrt(1 - a) * eps) / jnp.sqrt(a)
+    return jnp.asarray((x_k - jnp.sqrt(1 - a) * eps) / jnp.sqrt(a))
 
 
-def posterior_mean(schedule: Schedule, x_k: Array, x_0: Array, step: Array, previous: Array) -> Array:
-    """Mean of q(x_previous | x_k, x_0) (Ho et al. 2020, eq. 7, alpha_k = alpha_bar_k / alpha_bar_previous)."""
+def eps_from_velocity(schedule: Schedule, x_k: ArrayLike, step: ArrayLike, velocity: ArrayLike) -> Array:
+    """eps = sqrt(1 - alpha_bar) x_k + sqrt(alpha_bar) v (Salimans & Ho 2022, appendix D)."""
+    a = alpha_bar_at(schedule, step, x_k)
+    return jnp.sqrt(1 - a) * x_k + jnp.sqrt(a) * velocity
+
+
+def posterior_mean(
+    schedule: Schedule, x_k: ArrayLike, x_0: ArrayLike, step: ArrayLike, previous: ArrayLike
+) -> Array:
+    """Mean of q(x_previous | x_k, x_0) (Ho et al., eq. 7; alpha = alpha_bar_k / alpha_bar_previous)."""
     a, a_prev = alpha_bar_at(schedule, step, x_k), alpha_bar_at(schedule, previous, x_k)
     alpha = a / a_prev
     return (jnp.sqrt(a_prev) * (1 - alpha) * x_0 + jnp.sqrt(alpha) * (1 - a_prev) * x_k) / (1 - a)
 
 
-def posterior_variance(schedule: Schedule, step: Array, previous: Array, x: Array) -> Array:
-    """beta~ = (1 - alpha_bar_previous) / (1 - alpha_bar_k) * (1 - alpha_k) (Ho et al. 2020, eq. 7), 0 at the end."""
+def posterior_variance(schedule: Schedule, step: ArrayLike, previous: ArrayLike, x: ArrayLike) -> Array:
+    """beta~ = (1 - alpha_bar_previous) / (1 - alpha_bar_k) * (1 - alpha_k) (Ho et al. 2020, eq. 7), 0 at the
+    end.
+    """
     a, a_prev = alpha_bar_at(schedule, step, x), alpha_bar_at(schedule, previous, x)
     return (1 - a_prev) / (1 - a) * (1 - a / a_prev)
 
 
 def ddpm_step(
-    schedule: Schedule, x_k: Array, step: Array, previous: Array, eps: Array, noise: Array, clip: float | None
+    schedule: Schedule,
+    x_k: ArrayLike,
+    step: ArrayLike,
+    previous: ArrayLike,
+    eps: ArrayLike,
+    noise: ArrayLike,
+    clip: float | None,
 ) -> Array:
     """One ancestral step x_k -> x_previous from predicted `eps` (Ho et al. 2020, algorithm 2).
 
@@ -146,13 +165,13 @@ def ddpm_step(
 
 def ddim_step(
     schedule: Schedule,
-    x_k: Array,
-    step: Array,
-    previous: Array,
-    eps: Array,
+    x_k: ArrayLike,
+    step: ArrayLike,
+    previous: ArrayLike,
+    eps: ArrayLike,
     clip: float | None,
     eta: float = 0.0,
-    noise: Array | float = 0.0,
+    noise: ArrayLike = 0.0,
 ) -> Array:
     """One DDIM step x_k -> x_previous from predicted `eps` (Song et al. 2021, eq. 12; sigma by eq. 16).
 

@@ -9,7 +9,8 @@ import jax
 import numpy as np
 
 from ddg_jax import data, normalise
-from ddg_jax.prior import make_prior
+from ddg_jax.graft import artefact_mask, graft_mask
+from ddg_jax.prior import fill_from_background, invert, make_prior
 from ddg_jax.sample import Generator, predict
 from ddg_jax.train import fit
 from ddgrasp import artifacts
@@ -18,7 +19,6 @@ from ddgrasp.config import Config, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from sensors import stats
-from sensors.recordings import find_recordings
 
 STAGE = "ddg"
 SCORED_FRAMES = 64
@@ -38,8 +38,9 @@ def fit_folder(
 ) -> Artifact:
     """Fits (or loads, `config.ddg.init_from`) a generator for the recordings at or below `root`.
 
-    Behind `ddgrasp ddg fit --data ROOT`. Continues from the checkpoints in `directory`, if there are any. Leaves
-    params.msgpack, pictures, and a manifest whose metrics compare held-out recorded frames with generated ones.
+    Behind `ddgrasp ddg fit --data ROOT`. Continues from the checkpoints in `directory`, if there are any.
+    Leaves params.msgpack, pictures, and a manifest whose metrics compare held-out recorded frames with
+    generated ones.
     """
     prior = make_prior(config.ddg)
     frames = data.load_frames(root, config.ddg, prior, config.seed, progress)
@@ -67,7 +68,8 @@ def fit_folder(
 
 
 def sample_folder(directory: Path, root: Path, out: Path, *, seed: int, count: int = SHOWN_FRAMES) -> Path:
-    """Writes one PNG: recorded frames of `root` beside what the generator in `directory` makes of their priors.
+    """Writes one PNG: recorded frames of `root` beside what the generator in `directory` makes of their
+    priors.
 
     Behind `ddgrasp ddg sample`. Returns the picture's path, `out`/samples.png.
     """
@@ -81,7 +83,7 @@ def sample_folder(directory: Path, root: Path, out: Path, *, seed: int, count: i
 
 
 def _loaded(config: DDGConfig) -> Generator:
-    """The generator of `config.init_from`, refused unless its network and depth space are the configured ones."""
+    """The generator of `config.init_from`, refused if its network or depth space is another."""
     source = Path(config.init_from)
     generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source)
     for name in (
@@ -114,9 +116,6 @@ def _score(generator: Generator, frames: data.Frames, progress: Progress) -> dic
 
 def _panels(generator: Generator, frames: data.Frames, seed: int) -> dict[str, np.ndarray]:
     """clean (holes filled), recorded, generated and grafted depth in metres, (N, H, W) each."""
-    from ddg_jax.graft import artefact_mask, graft_mask
-    from ddg_jax.prior import fill_from_background, invert
-
     config = generator.config
     x = predict(jax.random.key(seed), generator, frames.prior)
     generated = normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold)

@@ -16,9 +16,11 @@ from ddg_jax import schedule as diffusion
 from ddg_jax.data import Frames, make_batch
 from ddg_jax.unet import UNet
 from ddgrasp.config import DDGConfig
+from ddgrasp.errors import unknown_name
 from ddgrasp.progress import Progress, Task
 
-Params = dict[str, Any]
+Params = Any
+"""Nested dict of arrays."""
 WARMUP_STEPS = 50
 FINAL_LEARNING_RATE = 0.05
 """Share of the learning rate left at the end."""
@@ -73,18 +75,45 @@ def init_state(config: DDGConfig, key: Array) -> TrainState:
     return TrainState(jnp.zeros((), jnp.int32), params, params, make_optimizer(config).init(params), key)
 
 
+def config_schedule(config: DDGConfig) -> diffusion.Schedule:
+    """The forward process of the configuration."""
+    return diffusion.make_schedule(config.schedule, config.diffusion_steps, config.log_snr_shift)
+
+
+def predict_noise(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
+    """eps_theta(d_k (+) c, k), (B, H, W).
+
+    The U-Net's output enters as a velocity, so that eps_theta starts as the best guess without a network
+    and the x_0 it implies stays accurate where x_k is nearly pure noise: the place where few-step sampling
+    starts.
+    """
+    velocity: Any = make_unet(config).apply({"params": params}, x_k, c, step)
+    return diffusion.eps_from_velocity(config_schedule(config), x_k, step, velocity)
+
+
+def loss_weight(config: DDGConfig, step: Array) -> Array:
+    """Weight of each step's noise error: 1 (the paper) or 1 / alpha_bar (Salimans & Ho 2022, section 4)."""
+    if config.loss_weight == "uniform":
+        return jnp.ones(step.shape)
+    if config.loss_weight == "velocity":
+        return 1 / jnp.asarray(config_schedule(config).alpha_bars)[step]
+    raise unknown_name("loss weight", config.loss_weight, ("uniform", "velocity"))
+
+
 def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Array, eps: Array) -> Array:
-    """mean |eps - eps_theta(d_k (+) c, k)|^2 (paper eq. 4). x_0, c, eps (B, H, W); step (B,) int."""
-    made = diffusion.make_schedule(config.schedule, config.diffusion_steps, config.log_snr_shift)
+    """mean w_k |eps - eps_theta(d_k (+) c, k)|^2 (paper eq. 4; w_k: `loss_weight`). x_0, c, eps (B, H, W);
+    step (B,) int.
+    """
+    made = config_schedule(config)
     x_k = diffusion.q_sample(made, x_0, step, eps)
-    predicted = make_unet(config).apply({"params": params}, x_k, c, step)
-    return jnp.mean((eps - predicted) ** 2)
+    error = jnp.mean((eps - predict_noise(config, params, x_k, c, step)) ** 2, axis=(1, 2))
+    return jnp.mean(loss_weight(config, step) * error)
 
 
 def averaged(ema: Params, params: Params, step: Array, decay: float) -> Params:
     """EMA update; the decay starts small so that the first, random weights are forgotten."""
-    decay = jnp.minimum(decay, (1 + step) / (10 + step))
-    return jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, ema, params)
+    now = jnp.minimum(decay, (1 + step) / (10 + step))
+    return jax.tree.map(lambda old, new: now * old + (1 - now) * new, ema, params)
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
@@ -108,17 +137,18 @@ def train_step(
 def fit(config: DDGConfig, frames: Frames, directory: Path, seed: int, progress: Progress) -> Params:
     """Trains for `config.train_steps` and returns the averaged parameters.
 
-    Checkpoints go to `directory`/checkpoints; if some are there, training continues after the latest one and ends
-    with the parameters an uninterrupted run would have. On Ctrl-C the current state is saved first.
+    Checkpoints go to `directory`/checkpoints; if some are there, training continues after the latest one
+    and ends with the parameters an uninterrupted run would have. On Ctrl-C the current state is saved
+    first.
     """
     options = ocp.CheckpointManagerOptions(max_to_keep=_CHECKPOINTS_KEPT, enable_async_checkpointing=False)
     with ocp.CheckpointManager((directory / "checkpoints").absolute(), options=options) as manager:
         state = _latest(config, manager, seed)
-        step = int(state.step)
+        done = int(state.step)
         with progress.task("fitting the generator", config.train_steps) as task:
-            task.start_at(step)
+            task.start_at(done)
             try:
-                for step in range(step, config.train_steps):
+                for step in range(done, config.train_steps):
                     batch = make_batch(frames, config, seed, step)
                     state, metrics = train_step(config, state, batch.x_0, batch.c)
                     _report(config, step + 1, metrics, task, progress)
@@ -143,7 +173,10 @@ def _report(config: DDGConfig, step: int, metrics: dict[str, Array], task: Task,
 def _latest(config: DDGConfig, manager: ocp.CheckpointManager, seed: int) -> TrainState:
     state = init_state(config, jax.random.key_data(jax.random.key(seed)))
     step = manager.latest_step()
-    return state if step is None else manager.restore(step, args=ocp.args.StandardRestore(state))
+    if step is None:
+        return state
+    restored: Any = manager.restore(step, args=ocp.args.StandardRestore(state))
+    return restored
 
 
 def _save(manager: ocp.CheckpointManager, state: TrainState) -> None:

@@ -1,8 +1,8 @@
 """Conditional U-Net eps_theta(d_k (+) c, k) (paper III-B1): encoder-decoder, skips, attention in the middle.
 
-Space-to-depth folds f x f pixels into channels before the network and back after it: with f = 4 a 180x320 map is
-45x80x16, and a convolution costs a sixteenth. Strided layers are space-to-depth and a matrix product as well, the
-shape that CPUs and accelerators are fast at.
+Space-to-depth folds f x f pixels into channels before the network and back after it: with f = 4 a 180x320
+map is 45x80x16, and a convolution costs a sixteenth. Strided layers are space-to-depth and a matrix product
+as well, the shape that CPUs and accelerators are fast at.
 """
 
 import math
@@ -73,7 +73,7 @@ class SelfAttention(nn.Module):
 
 
 class UNet(nn.Module):
-    """Predicts the noise in x_k given the prior c.
+    """Maps x_k and the prior c to one number per pixel; `ddg_jax/train.py` turns it into the noise.
 
     Args:
       widths: channels per level; every level halves the one before in height and width.
@@ -90,7 +90,7 @@ class UNet(nn.Module):
 
     @nn.compact
     def __call__(self, x_k: Array, c: Array, step: Array) -> Array:
-        """x_k (B, H, W), c (B, H, W), step (B,) int -> predicted noise (B, H, W) float32. Any H, W."""
+        """x_k (B, H, W), c (B, H, W), step (B,) int -> (B, H, W) float32. Any H, W."""
         height, width = x_k.shape[1:]
         folded = space_to_depth(self._padded(jnp.stack([x_k, c], axis=-1)), self.factor).astype(self.dtype)
         time = self._time_embedding(step)
@@ -101,11 +101,8 @@ class UNet(nn.Module):
         h = ResBlock(self.widths[-1], self.dtype)(h, time)
         h = nn.silu(self._decode(h, skips, time))
         out = nn.Conv(self.factor**2, (3, 3), dtype=self.dtype, kernel_init=nn.initializers.zeros)(h)
-        # At high noise eps is nearly x_k itself: the input reaches the output past every bottleneck.
-        gain = nn.Dense(1, dtype=self.dtype)(time)[:, None]
-        out = out + nn.Dense(self.factor**2, dtype=self.dtype)(folded)
-        out = depth_to_space(out, self.factor)[:, :height, :width, 0]
-        return (out + gain * x_k).astype(jnp.float32)
+        out = out + nn.Dense(self.factor**2, dtype=self.dtype, kernel_init=nn.initializers.zeros)(folded)
+        return depth_to_space(out, self.factor)[:, :height, :width, 0].astype(jnp.float32)
 
     def _padded(self, x: Array) -> Array:
         """Zeros at the bottom and right up to the next multiple of the total stride."""

@@ -239,6 +239,9 @@ class DDGConfig:
     """AdamW's step size after the warm-up; falls to a twentieth along a cosine."""
     weight_decay: float = 1e-4
     """AdamW's weight decay."""
+    loss_weight: str = "velocity"
+    """Weight of a diffusion step's error: uniform (the paper's) or velocity (more weight on noisy steps,
+    which few-step sampling needs)."""
     ema_decay: float = 0.995
     """Decay of the averaged parameters, which are the ones used."""
     checkpoint_every: int = 250

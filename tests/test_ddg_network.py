@@ -36,7 +36,9 @@ def test_depth_survives_the_diffusion_space_and_holes_are_far_away():
     np.testing.assert_allclose(x, [-1, 1, 1.9 / 3.9, 0.9 / 3.9, (1 / 9 - 0.1) / 3.9], atol=1e-6)
     np.testing.assert_allclose(normalise.to_depth(x, 0.25, 10.0, -0.5), depth, rtol=1e-5)
     assert normalise.to_depth(jnp.array([-0.51]), 0.25, 10.0, -0.5)[0] == 0.0
-    np.testing.assert_allclose(normalise.to_depth(jnp.array([-0.4, 2.0]), 0.25, 10.0, -0.5), [10, 0.25], rtol=1e-6)
+    np.testing.assert_allclose(
+        normalise.to_depth(jnp.array([-0.4, 2.0]), 0.25, 10.0, -0.5), [10, 0.25], rtol=1e-6
+    )
     assert normalise.to_diffusion(jnp.array([60.0, 0.1]), 0.25, 10.0).tolist() == [0.0, 1.0]
 
 

@@ -12,7 +12,9 @@ import pytest
 from ddg_jax import schedule as s
 from ddgrasp.errors import UserError
 
-PARITY = Path(os.environ.get("PARITY_DIR") or Path(__file__).resolve().parents[1].parent / "shared/parity/public")
+PARITY = Path(
+    os.environ.get("PARITY_DIR") or Path(__file__).resolve().parents[1].parent / "shared/parity/public"
+)
 FILE = PARITY / "unit_diffusion_schedule.npz"
 NAMES = {"linear": "linear", "squaredcos_cap_v2": "cosine"}
 

@@ -22,7 +22,7 @@ TINY = DDGConfig(
     diffusion_steps=100,
     train_steps=6,
     batch_size=8,
-    checkpoint_every=3,
+    checkpoint_every=4,
     sample_batch=4,
     prior_blur_px=0.0,
     learning_rate=3e-3,
@@ -54,20 +54,22 @@ def test_resume_equals_an_uninterrupted_run(tmp_path):
         def scalars(self, step, **values):
             raise Stop
 
-    config = dataclasses.replace(TINY, checkpoint_every=4)
     with pytest.raises(Stop), pytest.MonkeyPatch.context() as patch:
         patch.setattr(train, "LOG_EVERY", 4)
-        train.fit(config, frames, tmp_path / "resumed", 0, Interrupted(quiet=True))
+        train.fit(TINY, frames, tmp_path / "resumed", 0, Interrupted(quiet=True))
     assert [p.name for p in (tmp_path / "resumed/checkpoints").iterdir()] == ["4"]
-    resumed = train.fit(config, frames, tmp_path / "resumed", 0, quiet)
+    resumed = train.fit(TINY, frames, tmp_path / "resumed", 0, quiet)
     jax.tree.map(np.testing.assert_array_equal, resumed, straight)
     fresh = train.init_state(TINY, jax.random.key_data(jax.random.key(0))).params
-    assert any(not np.array_equal(a, b) for a, b in zip(jax.tree.leaves(fresh), jax.tree.leaves(straight), strict=True))
+    assert any(
+        not np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(fresh), jax.tree.leaves(straight), strict=True)
+    )
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
-    config = dataclasses.replace(TINY, train_steps=500, batch_size=16, checkpoint_every=1000)
+    config = dataclasses.replace(TINY, train_steps=300, batch_size=16, checkpoint_every=1000)
     params = train.fit(config, pictures(64), tmp_path_factory.mktemp("ddg"), 0, Progress(quiet=True))
     return sample.Generator(config, params, make_prior(config))
 
