@@ -1,6 +1,6 @@
 """A RealSense D4xx through pyrealsense2 (`pip install ddgrasp[realsense]`).
 
-Written against pyrealsense2 2.58's documented API and tried through librealsense's own playback of
+Written against pyrealsense2 2.59's documented API and tried through librealsense's own playback of
 a synthetic stream; it has not been run on a camera by us.
 """
 
