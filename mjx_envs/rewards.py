@@ -11,6 +11,8 @@ from mjx_envs import grasp_math, kinematics
 TERMS = ("reach", "lift", "orient", "bonus", "accel", "align", "saturation", "toggle")
 FUNNEL_HEIGHT_M = 0.10
 FUNNEL_FREE_M = 0.01
+MAX_DISTANCE_M = 1.0
+"""Bounds the reward should an object be thrown."""
 
 
 @struct.dataclass
@@ -46,8 +48,8 @@ def distances(qpos, grasp_pos, grasp_quat, grip_pose) -> Distances:
     """`Distances` in the configuration qpos (16,)."""
     grip_pos, grip_quat = grip_pose
     return Distances(
-        hand=approach_distance(grip_pos, grasp_pos),
-        object=jp.linalg.norm(qpos[9:12] - jp.asarray(contract.LIFT_TARGET_M)),
+        hand=jp.minimum(approach_distance(grip_pos, grasp_pos), MAX_DISTANCE_M),
+        object=jp.minimum(jp.linalg.norm(qpos[9:12] - jp.asarray(contract.LIFT_TARGET_M)), MAX_DISTANCE_M),
         grasp_angle=kinematics.angle_between(grip_quat, grasp_quat, jp),
         upright_angle=kinematics.angle_between(grip_quat, jp.asarray(grasp_math.HAND_DOWN), jp),
     )
