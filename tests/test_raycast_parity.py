@@ -2,10 +2,6 @@
 
 import dataclasses
 import math
-import os
-from collections.abc import Iterator
-
-os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
 
 import mujoco
 import numpy as np
@@ -78,7 +74,10 @@ def _robot_camera(seed: int) -> Camera:
     return Camera(FY, FY, WIDTH / 2, HEIGHT / 2, HEIGHT, WIDTH, T)
 
 
-SCENES = [pytest.param(_every_type, _camera, id="every_type"), pytest.param(_robot, _robot_camera, id="robot")]
+SCENES = [
+    pytest.param(_every_type, _camera, id="every_type"),
+    pytest.param(_robot, _robot_camera, id="robot"),
+]
 
 
 def _edges(segmentation: np.ndarray) -> np.ndarray:
@@ -91,13 +90,17 @@ def _edges(segmentation: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def open_gl() -> Iterator[type]:
-    """A context manager class for mujoco.Renderer, or a skip where there is no OpenGL."""
+def open_gl(monkeypatch: pytest.MonkeyPatch) -> type[mujoco.Renderer]:
+    """mujoco.Renderer over EGL, whatever MUJOCO_GL was when mujoco was imported; or a skip."""
     try:
+        from mujoco.egl import GLContext
+        from mujoco.rendering.classic import gl_context
+
+        monkeypatch.setattr(gl_context, "GLContext", GLContext, raising=False)
         mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
     except Exception as error:  # the back ends raise whatever their loaders do
-        pytest.skip(f"no OpenGL context (MUJOCO_GL={os.environ['MUJOCO_GL']}): {error}")
-    yield mujoco.Renderer
+        pytest.skip(f"no OpenGL context could be made through EGL: {type(error).__name__} {error}")
+    return mujoco.Renderer
 
 
 def _aim(renderer: mujoco.Renderer, data: mujoco.MjData, camera: Camera) -> None:
@@ -204,7 +207,7 @@ def test_vmap_and_crop_give_the_window_of_the_whole_picture() -> None:
 def _one_sphere() -> tuple[mujoco.MjModel, mujoco.MjData, Camera]:
     """A 0.1 m sphere 1 m in front of a camera that looks along world +x."""
     model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><geom type="sphere" size="0.1" pos="1 0 0" rgba="1 0.5 0 1"/></worldbody></mujoco>'
+        '<mujoco><worldbody><geom type="sphere" size="0.1" pos="1 0 0"/></worldbody></mujoco>'
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
