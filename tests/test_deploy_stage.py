@@ -212,3 +212,18 @@ def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):
     outcome = "rig_success" if values["student_rig"]["success"]["successes"] else "rig_failure"
     assert (run_dir / "deploy" / f"{outcome}.png").read_bytes()[:4] == b"\x89PNG"
     assert artifact.manifest.parents.keys() == {"export"}
+
+
+def test_loop_moves_the_arm_as_the_training_environment_does(policy):
+    from mjx_envs.rig import RigWorld
+    from sensors.stage import act
+
+    world = RigWorld(objects=("apple",))
+    trial = Trial(1, "apple")
+    rng = np.random.default_rng([CONFIG.seed, rig_eval._STREAM, trial.index])
+    world.reset(int(rng.integers(2**31)), trial.object_name)
+    for _ in range(CONFIG.world.episode_steps):
+        act(world, np.array([0, 0.2, 0, 0, 0, 0, 0, -1.0], np.float32))
+    rig = rig_eval.Rig(CONFIG, policy)
+    rig.run(trial)
+    np.testing.assert_allclose(rig._world.data.qpos, world.data.qpos, atol=1e-6)
