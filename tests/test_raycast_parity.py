@@ -33,20 +33,22 @@ EVERY_TYPE = """
   </worldbody>
 </mujoco>
 """
-MOVED = range(2, 7)
+MOVED = list(range(2, 7))
 HIDDEN = (7, 8)  # collision group, transparent
 
 
 def _every_type(seed: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """Solids at random poses above two planes."""
     rng = np.random.default_rng(seed)
-    model = mujoco.MjModel.from_xml_string(EVERY_TYPE)
+    spec = mujoco.MjSpec.from_string(EVERY_TYPE)
     for geom_id in MOVED:
-        model.geom_pos[geom_id] = rng.uniform([-0.25, -0.25, 0.0], [0.25, 0.25, 0.3])
+        spec.geoms[geom_id].pos = rng.uniform([-0.25, -0.25, 0.0], [0.25, 0.25, 0.3])
         quat = rng.normal(size=4)
-        model.geom_quat[geom_id] = quat / np.linalg.norm(quat)
+        spec.geoms[geom_id].quat = quat / np.linalg.norm(quat)
+    model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    assert np.ptp(data.geom_xpos[MOVED], axis=0).min() > 0.05
     return model, data
 
 
