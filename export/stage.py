@@ -75,8 +75,8 @@ def measure(
     bound = config.export.max_abs_diff
     if not difference <= bound:
         raise UserError(
-            f"The ONNX policy differs from JAX by {difference:.2e}, more than export.max_abs_diff = {bound:g}: "
-            "nothing was written. Train the student longer, or raise the bound if that much is acceptable."
+            f"The ONNX policy differs from JAX by {difference:.2e}, more than export.max_abs_diff = "
+            f"{bound:g}; nothing was written. Train longer, or raise the bound if so much is acceptable."
         )
     inputs = parity.random_inputs(rng, 1, student, profile, dtype, _pick(frames_m, 1, rng))
     return {

@@ -135,7 +135,8 @@ class Stem(nn.Module):
         config = self.config
         if config.stem == "conv7":
             x = nn.relu(ConvNorm(config.width, 7, 2, config.norm, name="conv7")(x))
-            return nn.max_pool(x, window_shape=(3, 3), strides=(2, 2), padding=((1, 1), (1, 1)))
+            x = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))  # after relu zeros pad as well as -inf
+            return nn.max_pool(x, window_shape=(3, 3), strides=(2, 2), padding="VALID")
         patches = space_to_depth(x, STEM_STRIDE)
         x = nn.Dense(config.width, use_bias=config.norm == "none", name="patch")(patches)
         return nn.relu(GroupNorm(name="norm")(x) if config.norm == "group" else x)

@@ -7,7 +7,7 @@
     eps = policy.apply({"params": params}, noisy_action, k, seen.cond, method="denoise")
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -110,10 +110,9 @@ def init_params(key: jax.Array, config: StudentConfig, profile: CameraProfile) -
     """Fresh parameters (a dict of float32 arrays)."""
     depth = jnp.zeros((1, contract.DEPTH_FRAMES, profile.height_px, profile.width_px))
     action = jnp.zeros((1, config.chunk, contract.ACTION_SIZE))
-    policy = StudentPolicy(config, profile)
-    return policy.init(key, depth, jnp.zeros((1, contract.STATE_SIZE)), action, jnp.zeros((1,), jnp.int32))[
-        "params"
-    ]
+    state, k = jnp.zeros((1, contract.STATE_SIZE)), jnp.zeros((1,), jnp.int32)
+    init = jax.jit(StudentPolicy(config, profile).init)  # one program; op by op it takes many times longer
+    return dict(init(key, depth, state, action, k)["params"])
 
 
 def param_shapes(config: StudentConfig, profile: CameraProfile) -> dict:
@@ -138,7 +137,7 @@ def sample_from_cond(
     policy = StudentPolicy(config, profile)
 
     def predict(x: jax.Array, k: jax.Array) -> jax.Array:
-        return policy.apply({"params": params}, x, k, cond, method="denoise")
+        return cast(jax.Array, policy.apply({"params": params}, x, k, cond, method="denoise"))
 
     return diffusion.ddim_sample(predict, noise, alpha_bar(config), steps or config.ddim_steps)
 
@@ -155,5 +154,5 @@ def sample_actions(
 ) -> jax.Array:
     """The whole policy: (B, 3, H, W) metres, (B, 8), (B, chunk, 8) noise -> (B, chunk, 8) in [-1, 1]."""
     policy = StudentPolicy(config, profile)
-    seen = policy.apply({"params": params}, depth_m, state, crop_rc, method="encode")
+    seen = cast(Seen, policy.apply({"params": params}, depth_m, state, crop_rc, method="encode"))
     return sample_from_cond(params, seen.cond, noise, config, profile, steps)

@@ -1,0 +1,81 @@
+"""Metadata of exported policies: what is written, and one-line errors for what is not ours. No JAX."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ddgrasp import contract
+from ddgrasp.config import ExportConfig, StudentConfig
+from ddgrasp.errors import UserError
+from export import metadata
+
+PROFILE = contract.D455.scaled(0.25)
+GOOD = metadata.describe(StudentConfig(), ExportConfig(), PROFILE, student_manifest_hash="abc")
+
+
+def properties(**changes) -> dict[str, str]:
+    return {contract.ONNX_METADATA_KEY: json.dumps(json.loads(GOOD.to_json()) | changes)}
+
+
+def test_what_is_written_is_read_back():
+    read = metadata.validate(properties())
+    assert read.joint_names == contract.ARM_JOINTS
+    assert (read.depth_height, read.depth_width, read.depth_frames) == (180, 320, 3)
+    assert read.crop == {"row": 34, "column": 87, "height": 112, "width": 145}
+    assert read.camera["position"] == list(contract.CAMERA_POSITION_M)
+    assert read.student_manifest_hash == "abc"
+    assert read.to_json() == GOOD.to_json()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"contract_version": 99}, "contract version 99, this code has 1: export it again"),
+        ({"depth_dtype": "uint8"}, "depth_dtype is 'uint8', expected one of uint16_mm, float32_m"),
+        ({"depth_height": "180"}, "depth_height is '180', expected a positive integer"),
+        ({"execute_steps": 5, "chunk": 4}, "execute_steps is 5, more than the chunk of 4"),
+        ({"control_hz": 30.0}, "control_hz is 30.0, this code expects 10.0"),
+        ({"joint_names": ["a"]}, "joint_names"),
+    ],
+)
+def test_contradictions_are_one_line_errors(changes, message):
+    with pytest.raises(UserError, match=message) as caught:
+        metadata.validate(properties(**changes), "policy.onnx")
+    assert "policy.onnx" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_files_of_others_and_damaged_ones():
+    with pytest.raises(UserError, match="yolo.onnx has no 'ddgrasp' metadata"):
+        metadata.validate({"author": "someone"}, "yolo.onnx")
+    with pytest.raises(UserError, match="damaged metadata"):
+        metadata.validate({contract.ONNX_METADATA_KEY: "{"})
+    with pytest.raises(UserError, match="expected a JSON object"):
+        metadata.validate({contract.ONNX_METADATA_KEY: "[]"})
+    short = dataclasses.asdict(GOOD)
+    del short["chunk"]
+    with pytest.raises(UserError, match="metadata without 'chunk'"):
+        metadata.validate({contract.ONNX_METADATA_KEY: json.dumps(short)})
+
+
+def test_graph_shapes_must_be_those_promised():
+    shapes = {
+        "depth": ["batch", 3, 180, 320], "state": ["batch", 8],
+        "noise": ["batch", GOOD.chunk, 8], "action": ["batch", GOOD.chunk, 8],
+    }  # fmt: skip
+    metadata.validate_shapes(GOOD, shapes)
+    with pytest.raises(UserError, match="'depth' has shape"):
+        metadata.validate_shapes(GOOD, shapes | {"depth": ["batch", 3, 90, 160]})
+    del shapes["noise"]
+    with pytest.raises(UserError, match="no input or output 'noise'"):
+        metadata.validate_shapes(GOOD, shapes)
+
+
+def test_reading_metadata_needs_neither_jax_nor_onnx():
+    code = "import sys, export.metadata; print(sorted({'jax', 'onnx', 'flax'} & set(sys.modules)))"
+    root = Path(__file__).parents[1]
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
+    assert out.stdout.strip() == "[]"

@@ -1,0 +1,140 @@
+"""The ONNX file computes what JAX computes, for every option, unit, batch size and kind of bad pixel."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from ddgrasp import contract
+from ddgrasp.config import ExportConfig, StudentConfig
+from ddgrasp.errors import UserError
+from export import graph, metadata, parity
+from student_jax import diffusion, policy
+
+PROFILE = contract.D455.scaled(0.125)
+SMALL = StudentConfig(
+    input_height_px=56, input_width_px=72, width=8, stage_blocks=(1, 1), keypoints=8, feature_size=32,
+    state_features=16, denoiser_width=48, denoiser_blocks=2, time_features=16, chunk=3,
+)  # fmt: skip
+OPTIONS = {
+    "keypoints, trimmed crop": (SMALL, ExportConfig(depth_dtype="uint16_mm")),
+    "keypoints, resized, floats, padded cells": (
+        replace(SMALL, input_height_px=40, input_width_px=52, output_stride=16, stage_blocks=(1, 1, 1)),
+        ExportConfig(depth_dtype="float32_m", ddim_steps=4),
+    ),
+    "tokens, conv7, concat, all channels": (
+        replace(
+            SMALL, pooling="tokens", stem="conv7", conditioning="concat", keypoints=2,
+            channels=("depth", "relief", "valid"), input_height_px=48, input_width_px=64,
+        ),
+        ExportConfig(depth_dtype="float32_m"),
+    ),
+    "mean, no norm, no auxiliary": (
+        replace(SMALL, pooling="mean", norm="none", aux_to_head=False),
+        ExportConfig(depth_dtype="uint16_mm"),
+    ),
+}  # fmt: skip
+
+
+def jittered(params: dict, seed: int = 0) -> dict:
+    """No parameter keeps a special value such as zero or one, which could hide a mistake."""
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda a: np.asarray(a + rng.normal(0, 0.05, a.shape), np.float32), params)
+
+
+def trained_head(params: dict, config: StudentConfig) -> dict:
+    """Denoiser trained on moderate actions: an untrained one saturates at +-1, where all policies agree."""
+    net = policy.StudentPolicy(config, PROFILE)
+    shapes = jax.eval_shape(
+        lambda: net.apply({"params": params}, jnp.zeros((1, 3, 90, 160)), jnp.zeros((1, 8)), method="encode")
+    )
+    size, schedule = shapes.cond.shape[-1], policy.alpha_bar(config)
+    optimiser = optax.adam(3e-3)
+
+    def loss(head, key):
+        keys = jax.random.split(key, 4)
+        cond = jax.random.normal(keys[0], (64, size))
+        action = 0.6 * jnp.tanh(cond[:, :8])[:, None] * jnp.ones((1, config.chunk, 1))
+        k = jax.random.randint(keys[1], (64,), 0, config.diffusion_steps)
+        noise = jax.random.normal(keys[2], action.shape)
+        noisy = diffusion.q_sample(action, noise, k, schedule)
+        predicted = net.apply({"params": {**params, "denoiser": head}}, noisy, k, cond, method="denoise")
+        return jnp.mean((predicted - noise) ** 2)
+
+    @jax.jit
+    def train(head):
+        def body(carry, key):
+            head, moments = carry
+            update, moments = optimiser.update(jax.grad(loss)(head, key), moments, head)
+            return (optax.apply_updates(head, update), moments), None
+
+        keys = jax.random.split(jax.random.key(3), 300)
+        return jax.lax.scan(body, (head, optimiser.init(head)), keys)[0][0]
+
+    return {**params, "denoiser": jax.tree.map(np.asarray, train(params["denoiser"]))}
+
+
+def export(config: StudentConfig, options: ExportConfig, params: dict):
+    described = metadata.describe(config, options, PROFILE)
+    model = graph.build_model(params, config, options, PROFILE, described)
+    return parity.open_session(model.SerializeToString())
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_onnx_equals_jax(name):
+    config, options = OPTIONS[name]
+    params = trained_head(jittered(policy.init_params(jax.random.key(0), config, PROFILE)), config)
+    session = export(config, options, params)
+    reference = parity.jax_policy(params, config, PROFILE, options.ddim_steps)
+    rng = np.random.default_rng(0)
+    inputs = [parity.random_inputs(rng, n, config, PROFILE, options.depth_dtype) for n in [4] * 12 + [1] * 4]
+    inputs[0].depth[0] = 0  # nothing seen at all
+    actions = np.concatenate([parity.run_onnx(session, one) for one in inputs])
+    assert actions.shape == (52, config.chunk, 8)
+    assert np.mean(np.abs(actions) < 0.95) > 0.5  # a saturated policy would agree with anything
+    assert parity.max_abs_diff(session, reference, iter(inputs)) <= 1e-4
+
+
+def test_parity_check_sees_one_changed_weight():
+    config, options = OPTIONS["keypoints, trimmed crop"]
+    params = trained_head(jittered(policy.init_params(jax.random.key(0), config, PROFILE)), config)
+    reference = parity.jax_policy(params, config, PROFILE)
+    changed = jax.tree.map(np.copy, params)
+    changed["encoder"]["features"]["kernel"] *= 1.05
+    rng = np.random.default_rng(0)
+    inputs = [parity.random_inputs(rng, 4, config, PROFILE, options.depth_dtype)]
+    assert parity.max_abs_diff(export(config, options, changed), reference, iter(inputs)) > 1e-4
+
+
+def test_units_agree_and_bad_pixels_are_the_same_as_none():
+    """500 mm is 0.5 m; NaN, infinity, negative and absurd readings all act like 0."""
+    params = jittered(policy.init_params(jax.random.key(0), SMALL, PROFILE))
+    millimetres = export(SMALL, ExportConfig(depth_dtype="uint16_mm"), params)
+    metres = export(SMALL, ExportConfig(depth_dtype="float32_m"), params)
+    rng = np.random.default_rng(0)
+    raw = parity.random_inputs(rng, 2, SMALL, PROFILE, "uint16_mm")
+    floats = replace(raw, depth=parity.depth_in_metres(raw.depth))
+    for number, value in enumerate(parity.NOT_FINITE):
+        row = 20 + 5 * number
+        floats.depth[:, :, row] = value
+        raw.depth[:, :, row] = 0
+    np.testing.assert_allclose(parity.run_onnx(millimetres, raw), parity.run_onnx(metres, floats), atol=1e-6)
+
+
+def test_options_and_parameters_that_do_not_fit_are_refused():
+    params = policy.init_params(jax.random.key(0), SMALL, PROFILE)
+
+    def build(config, options):
+        graph.build_model(params, config, options, PROFILE, metadata.describe(SMALL, ExportConfig(), PROFILE))
+
+    with pytest.raises(UserError, match="Did you mean 'tokens'"):
+        build(replace(SMALL, pooling="token"), ExportConfig())
+    with pytest.raises(UserError, match="'uint8'; expected one of uint16_mm, float32_m"):
+        build(SMALL, ExportConfig(depth_dtype="uint8"))
+    with pytest.raises(UserError, match="ddim_steps is 51; expected 1 to 50"):
+        build(SMALL, ExportConfig(ddim_steps=51))
+    with pytest.raises(UserError, match=r"aux_hidden/bias has shape \(32,\), expected \(24,\)"):
+        build(replace(SMALL, feature_size=24), ExportConfig())

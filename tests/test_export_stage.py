@@ -1,0 +1,71 @@
+"""The export stage: from a student's artefact to a checked file."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import onnxruntime as ort
+import pytest
+
+from ddgrasp import artifacts
+from ddgrasp.config import Config, ExportConfig, StudentConfig, WorldConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from export import metadata, stage
+from student_jax import policy
+
+CONFIG = Config(
+    preset="test",
+    world=WorldConfig(camera_scale=0.125),
+    student=StudentConfig(
+        input_height_px=56, input_width_px=72, width=8, stage_blocks=(1,), keypoints=4, feature_size=16,
+        state_features=16, denoiser_width=16, denoiser_blocks=1, time_features=8,
+        output_stride=4, ddim_steps=3,
+    ),
+    export=ExportConfig(parity_batches=2, latency_runs=5),
+)  # fmt: skip
+
+
+def finish_student(run_dir, config):
+    params = policy.init_params(jax.random.key(0), config.student, config.world.profile)
+    artifacts.save_params(run_dir / "student" / policy.PARAMS_FILE, params)
+    return artifacts.finish(run_dir / "student", "student", config, seconds=0.0, metrics={})
+
+
+def test_a_student_becomes_a_file_that_describes_itself(tmp_path):
+    student = finish_student(tmp_path, CONFIG)
+    artifact = stage.run(CONFIG, tmp_path, resume=False, progress=Progress(quiet=True))
+    metrics = artifact.manifest.metrics
+    assert metrics["max_abs_diff"] <= 1e-4
+    assert 0 < metrics["latency_ms"]["p50"] <= metrics["latency_ms"]["p99"]
+    session = ort.InferenceSession(tmp_path / "export" / stage.POLICY_FILE)
+    described = metadata.validate(session.get_modelmeta().custom_metadata_map)
+    shapes = {node.name: node.shape for node in (*session.get_inputs(), *session.get_outputs())}
+    metadata.validate_shapes(described, shapes)
+    assert described.student_manifest_hash == student.hash
+    assert described.ddim_steps == 3
+
+
+def test_a_missed_bound_writes_nothing_and_keeps_the_old_file(tmp_path):
+    config = replace(CONFIG, export=replace(CONFIG.export, max_abs_diff=-1.0))
+    finish_student(tmp_path, config)
+    old = tmp_path / "export" / stage.POLICY_FILE
+    artifacts.atomic_write_bytes(old, b"old")
+    with pytest.raises(UserError, match="differs from JAX by"):
+        stage.run(config, tmp_path, resume=False, progress=Progress(quiet=True))
+    assert old.read_bytes() == b"old"
+    assert not artifacts.is_finished(tmp_path / "export")
+
+
+def test_no_student_is_said(tmp_path):
+    with pytest.raises(UserError, match="no finished stage 'student'"):
+        stage.run(CONFIG, tmp_path, resume=False, progress=Progress(quiet=True))
+
+
+def test_real_frames_are_used_when_given():
+    params = policy.init_params(jax.random.key(0), CONFIG.student, CONFIG.world.profile)
+    model = stage.export_policy(CONFIG, jax.tree.map(np.asarray, params))
+    frames = np.full((2, 3, 90, 160), 0.7, np.float32)
+    metrics = stage.measure(CONFIG, params, model, frames, Progress(quiet=True))
+    assert metrics["parity_frames"] == "demonstrations"
+    assert metrics["parity_samples"] == 2 * 4 + 4
