@@ -82,7 +82,7 @@ class Rig:
         self._policy = OnnxPolicy(
             policy_path, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None
         )
-        self._world = RigWorld(objects=config.world.objects, randomise=True)
+        self._world = RigWorld(config.world.objects, randomise=True, random=config.world.random)
         self._camera = RigCamera(self._world.model, config.record.stereo, config.world.profile)
 
     def run(self, trial: Trial) -> tuple[TrialResult, Film]:

@@ -107,17 +107,16 @@ def _devices(
 
 
 def _rig(config: Config, options: SessionOptions, info: PolicyMetadata, clock: Clock) -> tuple[Robot, Camera]:
-    from mjx_envs.rig import RigWorld
-
     from deploy.rig_eval import camera_pose
     from deploy.sim_robot import SimRobot
     from deploy.stereo_camera import StereoCamera
     from mjx_envs.objects import get_object
+    from mjx_envs.rig import RigWorld
     from sensors.rig_camera import RigCamera
 
     name = get_object(options.object_name or config.world.objects[0]).name
     rng = np.random.default_rng(config.seed)
-    world = RigWorld(objects=(name,), randomise=True)
+    world = RigWorld((name,), randomise=True, random=config.world.random)
     world.reset(config.seed, name)
     robot = SimRobot(world, clock, 1.0 / info.control_hz)
     if options.camera == "realsense":
