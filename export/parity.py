@@ -17,6 +17,7 @@ from student_jax import denoiser, preprocess
 HOLE_SHARE = 0.1
 """Share of invalid pixels in random frames."""
 HOLE_SIZE_PX = 6
+WARM_UP_RUNS = 5
 NOT_FINITE = (np.nan, np.inf, -np.inf, -1.0, 100.0)
 """What a float depth map may hold besides depth: all of it means invalid."""
 
@@ -139,7 +140,7 @@ def max_abs_diff(
 def latency_ms(session: ort.InferenceSession, inputs: Inputs, runs: int) -> dict[str, float]:
     """p50 and p99 of one inference, milliseconds, after a warm-up."""
     feed = inputs.feed()
-    for _ in range(5):
+    for _ in range(WARM_UP_RUNS):
         session.run(None, feed)
     times = np.empty(runs)
     for index in range(runs):

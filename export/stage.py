@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddgrasp import artifacts
+from ddgrasp import artifacts, contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
@@ -59,7 +59,8 @@ def measure(
     """Parity with JAX and latency on one thread. UserError if parity misses the configured bound.
 
     Args:
-        frames_m: (N, 3, H, W) depth of demonstrations, metres; None uses random frames.
+        frames_m: (N, 3, H, W) depth of demonstrations, metres, used in every second batch; the others, or
+            all if it is None, are random frames full of holes.
     """
     student, profile, dtype = config.student, config.world.profile, config.export.depth_dtype
     session = parity.open_session(model)
@@ -68,8 +69,9 @@ def measure(
     sizes = [BATCH] * config.export.parity_batches + [1] * BATCH_ONE_CHECKS
 
     def batches():
-        for size in progress.track(sizes, "parity", len(sizes)):
-            yield parity.random_inputs(rng, size, student, profile, dtype, _pick(frames_m, size, rng))
+        for index, size in enumerate(progress.track(sizes, "parity", len(sizes))):
+            frames = _pick(frames_m, size, rng) if index % 2 == 0 else None
+            yield parity.random_inputs(rng, size, student, profile, dtype, frames)
 
     difference = parity.max_abs_diff(session, reference, batches())
     bound = config.export.max_abs_diff
@@ -82,7 +84,7 @@ def measure(
     return {
         "max_abs_diff": difference,
         "parity_samples": sum(sizes),
-        "parity_frames": "demonstrations" if frames_m is not None else "random",
+        "parity_frames": "demonstrations and random" if frames_m is not None else "random",
         "latency_ms": parity.latency_ms(session, inputs, config.export.latency_runs),
         "file_mb": len(model) / 1e6,
     }
@@ -93,5 +95,18 @@ def _pick(frames_m: np.ndarray | None, size: int, rng: np.random.Generator) -> n
 
 
 def demo_frames(run_dir: Path, config: Config, count: int = 64) -> np.ndarray | None:
-    """(N, 3, H, W) metres: frame triples of the run's demonstrations; None if it has none of this size."""
-    return None
+    """(N, 3, H, W) metres: frame triples of the run's first demonstrations; None if it has none."""
+    from demos.stage import STORE
+    from demos.store import EpisodeStore
+
+    path = Path(run_dir) / "demos" / STORE
+    if not path.exists():
+        return None
+    depth_mm = EpisodeStore(path).steps("depth_mm", 0, count + contract.DEPTH_FRAMES - 1)
+    profile = config.world.profile
+    usable = depth_mm.shape[1:] == (profile.height_px, profile.width_px)
+    if len(depth_mm) < contract.DEPTH_FRAMES or not usable:
+        return None
+    depth_m = parity.depth_in_metres(depth_mm)
+    triples = np.lib.stride_tricks.sliding_window_view(depth_m, contract.DEPTH_FRAMES, axis=0)
+    return np.moveaxis(triples, -1, 1)

@@ -11,6 +11,8 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config, ExportConfig, StudentConfig, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from demos.stage import STORE
+from demos.store import EpisodeStore
 from export import metadata, stage
 from student_jax import policy
 
@@ -62,10 +64,20 @@ def test_no_student_is_said(tmp_path):
         stage.run(CONFIG, tmp_path, resume=False, progress=Progress(quiet=True))
 
 
+def test_frame_triples_come_from_the_run_s_demonstrations(tmp_path):
+    assert stage.demo_frames(tmp_path, CONFIG) is None
+    depth_mm = np.arange(5, dtype=np.uint16)[:, None, None] * np.ones((1, 90, 160), np.uint16)
+    EpisodeStore(tmp_path / "demos" / STORE, create=True).append({"depth_mm": depth_mm}, {"n": np.array(5)})
+    frames = stage.demo_frames(tmp_path, CONFIG)
+    np.testing.assert_allclose(
+        frames[:, :, 0, 0], np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]]) / 1000, atol=1e-6
+    )
+
+
 def test_real_frames_are_used_when_given():
     params = policy.init_params(jax.random.key(0), CONFIG.student, CONFIG.world.profile)
     model = stage.export_policy(CONFIG, jax.tree.map(np.asarray, params))
     frames = np.full((2, 3, 90, 160), 0.7, np.float32)
     metrics = stage.measure(CONFIG, params, model, frames, Progress(quiet=True))
-    assert metrics["parity_frames"] == "demonstrations"
+    assert metrics["parity_frames"] == "demonstrations and random"
     assert metrics["parity_samples"] == 2 * 4 + 4
