@@ -25,6 +25,8 @@ PARAMS_FILE = "params.msgpack"
 X_LIMIT = 1.0
 """|x_0| of the diffusion space: predictions are clipped to it."""
 SAMPLERS = ("ddim", "ddpm")
+SHARED = 2**31 - 1
+"""Stands for the frame number in the key of the noise that an episode's frames share."""
 _ASPECT_TOLERANCE = 0.02
 
 
@@ -65,17 +67,20 @@ def frame_noise(
     """Standard normal noise (B, H, W): sqrt(r) g_episode + sqrt(1 - r) g_frame, r = `correlation`.
 
     Frames of one episode share g_episode, so holes stay where they are between frames, as on a camera; every
-    frame's noise depends on (key, episode, frame) alone, however the frames are batched. episode, frame:
-    (B,) int.
+    frame's noise depends on (key, episode, frame) alone, however the frames are batched.
+
+    Args:
+      episode: its number, a scalar if all frames are of one episode (cheaper), else (B,).
+      frame: (B,) int, numbers within the episode.
     """
 
-    def one(e: Array, t: Array) -> Array:
-        episode_key = jax.random.fold_in(key, e)
-        shared = jax.random.normal(jax.random.fold_in(episode_key, 0), shape)
-        own = jax.random.normal(jax.random.fold_in(episode_key, t + 1), shape)
-        return jnp.sqrt(correlation) * shared + jnp.sqrt(1 - correlation) * own
+    def own(e: Array, t: Array) -> Array:
+        return jax.random.normal(jax.random.fold_in(jax.random.fold_in(key, e), t), shape)
 
-    return jax.vmap(one)(episode, frame)
+    over_episodes = None if jnp.ndim(episode) == 0 else 0
+    shared = own(episode, SHARED) if over_episodes is None else jax.vmap(own, (0, None))(episode, SHARED)
+    single = jax.vmap(own, (over_episodes, 0))(episode, frame)
+    return jnp.sqrt(correlation) * shared + jnp.sqrt(1 - correlation) * single
 
 
 # --- the reverse process --------------------------------------------------------------------------
@@ -88,7 +93,7 @@ def sample(
     """Generated maps in diffusion space (see ddg_jax/normalise.py), (B, H, W) float32.
 
     Args:
-      key: the whole data set's key; c: (B, H, W); episode, frame: (B,) int, see `frame_noise`.
+      key: the whole data set's key; c: (B, H, W); episode, frame: see `frame_noise`.
       steps: network evaluations per map.
     """
     if config.sampler not in SAMPLERS:
@@ -96,7 +101,11 @@ def sample(
     made = config_schedule(config)
     visited = diffusion.timesteps(made.steps, steps, "trailing")
     noise = partial(
-        frame_noise, episode=episode, frame=frame, shape=(c.shape[1], c.shape[2]), correlation=config.frame_correlation
+        frame_noise,
+        episode=episode,
+        frame=frame,
+        shape=(c.shape[1], c.shape[2]),
+        correlation=config.frame_correlation,
     )
     prior_key, start_key, step_key = jax.random.split(key, 3)
     c = c + config.prior_noise * noise(prior_key)
@@ -134,24 +143,28 @@ def generate(
     depth_m: np.ndarray,
     rgb: np.ndarray | None = None,
     *,
-    episode: int = 0,
+    episode: int | np.ndarray = 0,
+    frame: np.ndarray | None = None,
     steps: int | None = None,
 ) -> Generated:
-    """Gives the frames of one simulated episode the camera's artefacts.
+    """Gives simulated frames the camera's artefacts: one episode, or a batch from many environments.
 
     Args:
-      depth_m: (T, H, W) clean planar depth in time order, 0 = nothing within range. Any size with the
-        generator's aspect ratio; the artefacts are made at the generator's size.
-      rgb: (T, h, w, 3) uint8, for priors that need it.
-      episode: number of the episode, which decides its noise.
+      depth_m: (B, H, W) clean planar depth, 0 = nothing within range; in time order if of one episode. Any
+      size
+        with the generator's aspect ratio; the artefacts are made at the generator's size.
+      rgb: (B, h, w, 3) uint8, for priors that need it.
+      episode: number of the episode, which decides its noise; (B,) if every frame has its own.
+      frame: (B,) numbers within the episode, 0, 1, ... by default.
       steps: network evaluations per map, the configuration's by default.
 
     Raises UserError for depth of another type, rank or aspect ratio.
     """
     config = generator.config
     _check_depth(depth_m, config)
-    c = generator.prior.from_sim(_at_size(depth_m, (config.height_px, config.width_px)), rgb)
-    x = predict(key, generator, c, episode=episode, steps=steps)
+    clean = _at_size(depth_m, (config.height_px, config.width_px))
+    c = _prior(generator.prior, clean, rgb, one_episode=np.ndim(episode) == 0)
+    x = predict(key, generator, c, episode=episode, frame=frame, steps=steps)
     mask = np.asarray(artefact_mask(x, config.noise_threshold))
     predicted = np.asarray(normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold))
     mask, predicted = (_at_size(a, depth_m.shape[1:]) for a in (mask, predicted))
@@ -160,28 +173,47 @@ def generate(
 
 
 def predict(
-    key: Array, generator: Generator, c: np.ndarray, *, episode: int = 0, steps: int | None = None
+    key: Array,
+    generator: Generator,
+    c: np.ndarray,
+    *,
+    episode: int | np.ndarray = 0,
+    frame: np.ndarray | None = None,
+    steps: int | None = None,
 ) -> np.ndarray:
-    """Maps in diffusion space for one episode's priors c (T, H, W), in batches of one compiled size."""
-    config = generator.config
-    size = config.sample_batch
+    """Maps in diffusion space for priors c (B, H, W), in batches of one compiled size. Arguments of
+    `generate`.
+    """
+    config, size = generator.config, generator.config.sample_batch
+    frame = np.arange(len(c)) if frame is None else np.asarray(frame)
     parts = []
     for start in range(0, len(c), size):
-        part = np.asarray(c[start : start + size], np.float32)
-        count = len(part)
-        part = np.concatenate([part, np.zeros((size - count, *c.shape[1:]), np.float32)])
-        frames = jnp.arange(start, start + size)
+        now = slice(start, start + size)
         x = sample(
             config,
             key,
             generator.params,
-            jnp.clip(part, -C_LIMIT, C_LIMIT),
-            jnp.full(size, episode),
-            frames,
+            jnp.clip(_filled_up(c[now], size), -C_LIMIT, C_LIMIT),
+            jnp.asarray(episode if np.ndim(episode) == 0 else _filled_up(episode[now], size)),
+            jnp.asarray(_filled_up(frame[now], size)),
             steps=steps or config.sample_steps,
         )
-        parts.append(np.asarray(x)[:count])
+        parts.append(np.asarray(x)[: len(c[now])])
     return np.concatenate(parts)
+
+
+def _prior(prior: Prior, clean_m: np.ndarray, rgb: np.ndarray | None, one_episode: bool) -> np.ndarray:
+    """c of one sequence, or of frames that have nothing to do with each other."""
+    if one_episode:
+        return prior.from_sim(clean_m, rgb)
+    single = [prior.from_sim(clean_m[i : i + 1], None if rgb is None else rgb[i : i + 1]) for i in
+    range(len(clean_m))] return np.concatenate(single)
+
+
+def _filled_up(values: np.ndarray, size: int) -> np.ndarray:
+    """`values` (n <= size, ...) with zeros behind them up to `size`; float32 if floating."""
+    values = np.asarray(values, np.float32 if np.issubdtype(values.dtype, np.floating) else np.int32)
+    return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype)])
 
 
 def generate_episodes(

@@ -10,13 +10,13 @@ from ddgrasp.errors import UserError
 class RewardConfig:
     """Weights of the reward terms (paper Eq. 2 and its terms; `ours` marks what the paper lacks)."""
 
-    reach: float = 5.0
+    reach: float = 10.0
     """w1, per metre."""
     lift: float = 10.0
     """w2, per metre."""
     orient: float = 0.5
     """w3, per radian, once lifted."""
-    accel: float = 3e-4
+    accel: float = 3e-5
     """w4, per (rad/s^2)^2."""
     bonus_base: float = 1.1
     """c1 > 1."""
@@ -26,10 +26,12 @@ class RewardConfig:
     """N_success is capped here, which keeps the bonus finite."""
     align: float = 0.5
     """Ours: per radian of misalignment with the grasp pose removed before the lift."""
-    saturation: float = 0.05
+    saturation: float = 0.01
     """Ours: penalty on the squared part of an action beyond 0.8 of its range."""
-    toggle: float = 0.05
-    """Ours: penalty on each change of the gripper's command."""
+    grasp: float = 1.0
+    """Ours: for closing on the object, taken back on losing it."""
+    toggle: float = 0.005
+    """Ours: penalty on each change of the gripper's command; 0.05 kept the gripper open for good."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class RandomConfig:
 
     joint_rad: float = 0.1
     """Initial arm joints around home."""
+    pregrasp_share: float = 0.0
+    """Share of episodes that start with the hand above the object (exploring starts, for training only)."""
     size: float = 0.05
     """Relative size of the object."""
     object_mass: float = 0.3
@@ -101,13 +105,16 @@ class TeacherConfig:
     """Adam's step size at the start; decays linearly to a tenth."""
     discount: float = 0.97
     gae_lambda: float = 0.95
-    entropy_cost: float = 2e-3
+    entropy_cost: float = 1e-2
     clip: float = 0.2
     """PPO's clipping range."""
-    reward_scaling: float = 0.1
+    reward_scaling: float = 0.5
     max_grad_norm: float = 1.0
     hidden: tuple[int, ...] = (256, 128)
     """Layers of policy and value networks."""
+    pregrasp_share: float = 0.5
+    """Share of training episodes that start with the hand above the object. Without these exploring
+    starts 6 M steps brought no grasp."""
     eval_every: int = 20
     """Updates between deterministic evaluations."""
     checkpoint_every: int = 20
@@ -121,6 +128,17 @@ class TeacherConfig:
 @dataclass(frozen=True)
 class DemosConfig:
     """Teacher episodes for the student."""
+
+    episodes: int = 240
+    """Successful episodes to keep (the paper: about 1200)."""
+    parallel: int = 60
+    """Environments rolled out together."""
+    action_noise: float = 0.4
+    """Standard deviation of the perturbations of the executed actions; labels stay the teacher's."""
+    noise_share: float = 0.05
+    """Probability per step that a perturbation of four steps starts."""
+    rgb: bool = True
+    """Keep colour as well."""
 
 
 @dataclass(frozen=True)
@@ -239,8 +257,8 @@ class DDGConfig:
     """AdamW's step size after the warm-up; falls to a twentieth along a cosine."""
     weight_decay: float = 1e-4
     """AdamW's weight decay."""
-    loss_weight: str = "velocity"
-    """Weight of a diffusion step's error: uniform (the paper's) or velocity (more weight on noisy steps,
+    loss_weight: str = "truncated"
+    """Weight of a diffusion step's error: uniform (the paper's) or truncated (more weight on noisy steps,
     which few-step sampling needs)."""
     ema_decay: float = 0.995
     """Decay of the averaged parameters, which are the ones used."""
@@ -320,6 +338,40 @@ class StudentConfig:
     """Steps K of the forward process."""
     ddim_steps: int = 10
     """Denoising iterations when acting."""
+    # --- training (student_jax/train.py) ---
+    train_steps: int = 1500
+    """Optimiser steps on the demos."""
+    batch_size: int = 64
+    """Samples per step."""
+    noise_draws: int = 8
+    """Diffusion steps and noises drawn for each encoded sample: the encoder is what costs."""
+    learning_rate: float = 1e-3
+    """AdamW's step size after the warm-up; falls to a fiftieth along a cosine."""
+    weight_decay: float = 1e-4
+    """AdamW's weight decay."""
+    ema_decay: float = 0.995
+    """Decay of the averaged parameters, which are the ones used."""
+    aux_weight: float = 1.0
+    """Weight of the privileged auxiliary losses against the diffusion loss."""
+    clean_share: float = 0.2
+    """Share of the episodes that keep clean depth."""
+    crop_shift_px: int = 6
+    """Random shift of the crop window in training, pixels of the scaled picture, each way."""
+    # --- DAgger (student_jax/dagger.py) ---
+    dagger_rounds: int = 4
+    """Rounds of acting with the student and labelling by the teacher."""
+    dagger_episodes: int = 64
+    """Episodes per round."""
+    dagger_steps: int = 600
+    """Optimiser steps after each round, on all frames so far."""
+    dagger_teacher_share: float = 0.3
+    """Share of the first round's actions that the teacher takes; falls linearly to none."""
+    head_steps: int = 4000
+    """Steps of the action head alone at the end, on cached features."""
+    head_batch_size: int = 512
+    """Samples per head step."""
+    init_from: str = ""
+    """Run directory or pretrained folder whose student to start from; empty starts from nothing."""
 
 
 @dataclass(frozen=True)

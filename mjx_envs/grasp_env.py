@@ -54,12 +54,16 @@ class GraspEnv(mjx_env.MjxEnv):
 
     def reset(self, rng: jax.Array) -> mjx_env.State:
         """A new episode: object, pose, dynamics and joints drawn from `rng`."""
-        k_object, k_params, k_qpos, k_next = jax.random.split(rng, 4)
+        k_object, k_params, k_qpos, k_start, k_next = jax.random.split(rng, 5)
         index = jax.random.randint(k_object, (), 0, len(self.table.names))
         params, size = randomize.sample_params(k_params, self.config.random, self.table, index)
         rest = jp.asarray(self.table.rest_height, jp.float32)[index] * size
-        state = physics.initial_state(randomize.sample_qpos(k_qpos, self.config.random, rest))
-        branch = grasp_math.yaw_branch(state.qpos[12:16], self._symmetry(index), jp)
+        qpos = randomize.sample_qpos(k_qpos, self.config.random, rest)
+        branch = grasp_math.yaw_branch(qpos[12:16], self._symmetry(index), jp)
+        if self.config.random.pregrasp_share > 0:
+            grasp = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], self._symmetry(index), branch, jp)
+            qpos = randomize.maybe_pregrasp(k_start, self.config.random, qpos, *grasp)
+        state = physics.initial_state(qpos)
         episode = Episode(
             params=params,
             object_index=index,
@@ -95,7 +99,7 @@ class GraspEnv(mjx_env.MjxEnv):
             rewards.Transition(
                 before=episode.distances, after=distances, action=action, last_action=episode.action,
                 acceleration=(new.qvel[:7] - old.qvel[:7]) / contract.CONTROL_DT_S,
-                grasped=grasped, lifted=grasped & (object_pos[2] > episode.rest_height + LIFTED_M),
+                was_grasped=episode.grasped.astype(jp.float32), grasped=grasped, lifted=grasped & (object_pos[2] > episode.rest_height + LIFTED_M),
                 hold_count=hold_count,
             ),
         )  # fmt: skip

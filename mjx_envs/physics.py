@@ -68,9 +68,7 @@ class Physics(Protocol):
 
 def initial_state(qpos: jax.Array) -> PhysicsState:
     """At rest in `qpos` (16,), touching nothing."""
-    return PhysicsState(
-        qpos=qpos, qvel=jp.zeros(scene.NV), warmstart=jp.zeros(scene.NV), touch=jp.zeros(2)
-    )
+    return PhysicsState(qpos=qpos, qvel=jp.zeros(scene.NV), warmstart=jp.zeros(scene.NV), touch=jp.zeros(2))
 
 
 def touch_from_sensors(sensordata, xp):

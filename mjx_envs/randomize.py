@@ -6,9 +6,11 @@ import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
-from mjx_envs import kinematics, scene
+from mjx_envs import inverse_kinematics, kinematics, scene
 from mjx_envs.objects import get_object
 from mjx_envs.physics import ModelParams
+
+PREGRASP_HEIGHT_M = 0.15
 
 
 class ObjectTable:
@@ -35,7 +37,9 @@ def _around(key, half_range, shape=()):
     return 1.0 + half_range * jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
 
-def sample_params(key: jax.Array, config: RandomConfig, table: ObjectTable, index) -> tuple[ModelParams, jax.Array]:
+def sample_params(
+    key: jax.Array, config: RandomConfig, table: ObjectTable, index
+) -> tuple[ModelParams, jax.Array]:
     """Model parameters of one episode with object `index`; also the object's size factor ()."""
     keys = jax.random.split(key, 7)
     size = _around(keys[0], config.size)
@@ -63,10 +67,23 @@ def sample_qpos(key: jax.Array, config: RandomConfig, rest_height_m) -> jax.Arra
         k_joint, (scene.N_ARM,), minval=-1.0, maxval=1.0
     )
     half = jp.asarray(contract.WORKSPACE_SIZE_M) / 2
-    xy = jp.asarray(contract.WORKSPACE_CENTER_M) + half * jax.random.uniform(k_xy, (2,), minval=-1.0, maxval=1.0)
+    xy = jp.asarray(contract.WORKSPACE_CENTER_M) + half * jax.random.uniform(
+        k_xy, (2,), minval=-1.0, maxval=1.0
+    )
     yaw = jax.random.uniform(k_yaw, (), minval=-jp.pi, maxval=jp.pi)
     fingers = jp.full(2, contract.GRIPPER_MAX_WIDTH_M / 2)
     return jp.concatenate([joints, fingers, xy, rest_height_m[None], kinematics.quat_about_z(yaw, jp)])
+
+
+def maybe_pregrasp(key: jax.Array, config: RandomConfig, qpos: jax.Array, grasp_pos, grasp_quat) -> jax.Array:
+    """qpos (16,) with the hand, in a share of the episodes, up to PREGRASP_HEIGHT_M above the grasp pose."""
+    k_choice, k_offset = jax.random.split(key)
+    offset = jax.random.uniform(k_offset, (3,), minval=-1.0, maxval=1.0)
+    height = PREGRASP_HEIGHT_M * (0.5 + 0.5 * offset[2])
+    target = grasp_pos + jp.stack([0.005 * offset[0], 0.005 * offset[1], height])
+    joints = inverse_kinematics.solve(qpos[:7], target, grasp_quat)
+    chosen = jax.random.uniform(k_choice) < config.pregrasp_share
+    return qpos.at[:7].set(jp.where(chosen, joints, qpos[:7]))
 
 
 def sample_camera(key: jax.Array, config: RandomConfig, T_world_cam) -> jax.Array:

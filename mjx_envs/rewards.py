@@ -8,9 +8,13 @@ from ddgrasp import contract
 from ddgrasp.config import RewardConfig
 from mjx_envs import grasp_math, kinematics
 
-TERMS = ("reach", "lift", "orient", "bonus", "accel", "align", "saturation", "toggle")
-FUNNEL_HEIGHT_M = 0.10
+TERMS = ("reach", "lift", "orient", "bonus", "accel", "align", "grasp", "saturation", "toggle")
+FUNNEL_HEIGHT_M = 0.07
+FUNNEL_SLOPE = 0.7
+"""Below 1, so that moving sideways towards the object always shortens the way."""
 FUNNEL_FREE_M = 0.01
+MAX_APPROACH_M = 0.03
+"""Bound of one step's change: an object knocked away must not teach the hand to keep off."""
 MAX_DISTANCE_M = 1.0
 """Bounds the reward should an object be thrown."""
 
@@ -39,6 +43,7 @@ class Transition:
     last_action: jax.Array
     acceleration: jax.Array
     """(7,) rad/s^2 of the arm's joints, from velocities one control step apart."""
+    was_grasped: jax.Array
     grasped: jax.Array
     lifted: jax.Array
     hold_count: jax.Array
@@ -62,7 +67,7 @@ def approach_distance(grip_pos, grasp_pos) -> jax.Array:
     from the side; this funnel makes the teacher come from above, which a camera can watch.
     """
     lateral = jp.linalg.norm(grip_pos[:2] - grasp_pos[:2] + 1e-6)
-    above = jp.minimum(FUNNEL_HEIGHT_M, 2.0 * jp.maximum(lateral - FUNNEL_FREE_M, 0.0))
+    above = jp.minimum(FUNNEL_HEIGHT_M, FUNNEL_SLOPE * jp.maximum(lateral - FUNNEL_FREE_M, 0.0))
     height = grip_pos[2] - (grasp_pos[2] + above)
     return lateral + jp.abs(height)
 
@@ -74,12 +79,15 @@ def terms(weights: RewardConfig, t: Transition) -> dict[str, jax.Array]:
     excess = jp.maximum(jp.abs(t.action[:7]) - 0.8, 0.0)
     toggled = (t.action[7] > 0) != (t.last_action[7] > 0)
     return {
-        "reach": weights.reach * (t.before.hand - t.after.hand) * (1 - grasped),
+        "reach": weights.reach
+        * jp.clip(t.before.hand - t.after.hand, -MAX_APPROACH_M, MAX_APPROACH_M)
+        * (1 - grasped),
         "lift": weights.lift * grasped * (t.before.object - t.after.object),
         "orient": weights.orient * lifted * (t.before.upright_angle - t.after.upright_angle),
         "bonus": (t.hold_count > 0) * weights.bonus_base * weights.bonus_growth**count,
         "accel": -weights.accel * jp.sum(t.acceleration**2),
         "align": weights.align * (t.before.grasp_angle - t.after.grasp_angle) * (1 - lifted),
+        "grasp": weights.grasp * (grasped - t.was_grasped),
         "saturation": -weights.saturation * jp.sum((excess / 0.2) ** 2),
         "toggle": -weights.toggle * toggled,
     }

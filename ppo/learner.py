@@ -62,7 +62,9 @@ def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
     """A fresh learner and its environments."""
     k_policy, k_value, k_env, k_next = jax.random.split(key, 4)
     networks = make_networks(config)
-    params = ppo_losses.PPONetworkParams(networks.policy_network.init(k_policy), networks.value_network.init(k_value))
+    params = ppo_losses.PPONetworkParams(
+        networks.policy_network.init(k_policy), networks.value_network.init(k_value)
+    )
     normalizer = running_statistics.init_state(specs.Array((contract.OBSERVATION_SIZE,), jp.dtype("float32")))
     return LearnerState(
         params=params,

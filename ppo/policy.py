@@ -46,7 +46,9 @@ def from_learner(normalizer, policy_params) -> TeacherPolicy:
     """The policy of a learner's current parameters; works on traced arrays."""
     layers = policy_params["params"]
     ordered = [layers[f"hidden_{i}"] for i in range(len(layers))]
-    return TeacherPolicy(normalizer.mean, normalizer.std, [(layer["kernel"], layer["bias"]) for layer in ordered])
+    return TeacherPolicy(
+        normalizer.mean, normalizer.std, [(layer["kernel"], layer["bias"]) for layer in ordered]
+    )
 
 
 def load(directory: Path | str) -> TeacherPolicy:
@@ -56,7 +58,9 @@ def load(directory: Path | str) -> TeacherPolicy:
         if candidate.exists():
             break
     else:
-        raise UserError(f"{directory} holds no teacher ({PARAMS_FILE}): train one with `ddgrasp teacher train`.")
+        raise UserError(
+            f"{directory} holds no teacher ({PARAMS_FILE}): train one with `ddgrasp teacher train`."
+        )
     state = artifacts.load_params(candidate)
     if state["mean"].shape != (contract.OBSERVATION_SIZE,):
         raise UserError(

@@ -1,5 +1,6 @@
 """Training loop: iterations, evaluations, checkpoints, curves."""
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from ddgrasp.config import Config
+from ddgrasp.config import Config, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import AutoReset, GraspEnv
@@ -25,7 +26,8 @@ def train(config: Config, directory: Path, progress: Progress) -> learner.Learne
     """Trains in `directory`, going on from its newest checkpoint if it has one."""
     teacher = config.teacher
     _check(config)
-    env = AutoReset(GraspEnv(config.world))
+    env = AutoReset(GraspEnv(training_world(config)))
+    test_env = GraspEnv(config.world)
     iterate = jax.jit(partial(learner.iteration, teacher, env), donate_argnums=0)
     total = learner.iterations(teacher)
     options = ocp.CheckpointManagerOptions(max_to_keep=_KEPT, enable_async_checkpointing=False)
@@ -40,7 +42,7 @@ def train(config: Config, directory: Path, progress: Progress) -> learner.Learne
                     _log(i, metrics, progress, task)
                 task.advance()
                 if i % teacher.eval_every == 0:
-                    rate = _evaluate(env.env, state, config, i, progress)
+                    rate = _evaluate(test_env, state, config, i, progress)
                     good_evaluations = good_evaluations + 1 if rate >= teacher.stop_at else 0
                 if i % teacher.checkpoint_every == 0 or i == total:
                     manager.save(i, args=ocp.args.StandardSave(state), force=True)
@@ -53,11 +55,17 @@ def train(config: Config, directory: Path, progress: Progress) -> learner.Learne
 
 def restore(config: Config, directory: Path) -> learner.LearnerState:
     """The newest checkpoint in `directory`; UserError if there is none."""
-    env = AutoReset(GraspEnv(config.world))
+    env = AutoReset(GraspEnv(training_world(config)))
     with ocp.CheckpointManager((directory / CHECKPOINTS).absolute()) as manager:
         if manager.latest_step() is None:
             raise UserError(f"{directory} holds no checkpoint of a teacher.")
         return _start(config, env, manager)
+
+
+def training_world(config: Config) -> WorldConfig:
+    """The world with the exploring starts that only training has."""
+    random = dataclasses.replace(config.world.random, pregrasp_share=config.teacher.pregrasp_share)
+    return dataclasses.replace(config.world, random=random)
 
 
 def policy_of(state: learner.LearnerState) -> TeacherPolicy:

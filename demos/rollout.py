@@ -1,0 +1,192 @@
+"""Lock-step episodes of many environments with pictures: for demos, DAgger and evaluation alike."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jp
+import numpy as np
+
+from ddgrasp import contract
+from ddgrasp.config import Config
+from mjx_envs import randomize
+from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.visual import Viewer, to_mm
+from ppo.policy import TeacherPolicy
+
+Actor = Callable[["Scene"], np.ndarray]
+"""What moves the robots: sees a `Scene`, returns actions (B, 8)."""
+
+
+@dataclass
+class Scene:
+    """One control step of B environments, before the action is taken."""
+
+    depth_mm: np.ndarray
+    """(B, H, W) uint16, clean."""
+    state: np.ndarray
+    """(B, 8) joint positions and gripper width."""
+    expert: np.ndarray
+    """(B, 8) the teacher's action here: the label."""
+    observation: np.ndarray
+    """(B, 40)."""
+    held: np.ndarray
+    """(B,) bool, object in the hand."""
+    step: int
+    rgb: np.ndarray | None = None
+    """(B, H, W, 3) uint8."""
+
+
+@dataclass
+class Episodes:
+    """B episodes of equal allotted length T; `length` says how many steps of each count."""
+
+    depth_mm: np.ndarray
+    """(B, T, H, W) uint16."""
+    state: np.ndarray
+    """(B, T, 8)."""
+    action: np.ndarray
+    """(B, T, 8) the teacher's labels."""
+    observation: np.ndarray
+    """(B, T, 40)."""
+    held: np.ndarray
+    """(B, T) bool."""
+    length: np.ndarray
+    """(B,)."""
+    success: np.ndarray
+    """(B,) bool."""
+    object_index: np.ndarray
+    """(B,)."""
+    T_world_cam: np.ndarray
+    """(B, 4, 4)."""
+    rgb: np.ndarray | None = None
+
+
+class Roller:
+    """Compiled pieces for rolling out `count` environments at a time.
+
+    Args:
+      config: world, camera and randomisation.
+      teacher: gives the labels.
+      count: environments in lock-step.
+      with_rgb: draw colour as well (slow).
+    """
+
+    def __init__(self, config: Config, teacher: TeacherPolicy, count: int, with_rgb: bool = False):
+        self.env = GraspEnv(config.world)
+        self.viewer = Viewer(config.world.profile)
+        self.count, self.steps = count, config.world.episode_steps
+        self._teacher, self._random, self._with_rgb = teacher, config.world.random, with_rgb
+        self._begin = jax.jit(self._begin_batch)
+        self._look = jax.jit(self._look_batch)
+        self._advance = jax.jit(jax.vmap(self.env.step))
+
+    def run(self, key: jax.Array, actor: Actor, on_step: Callable[[int], None] = lambda _: None) -> Episodes:
+        """One episode in each environment under `actor`."""
+        state, cameras = self._begin(key)
+        alive = np.ones(self.count, bool)
+        length = np.zeros(self.count, int)
+        success = np.zeros(self.count, bool)
+        scenes = []
+        for t in range(self.steps):
+            scene = self._scene(state, cameras, t)
+            scenes.append(scene)
+            length += alive
+            state = self._advance(state, jp.asarray(actor(scene), jp.float32))
+            success |= alive & (np.asarray(state.metrics["success"]) > 0)
+            alive &= np.asarray(state.done) == 0
+            on_step(t)
+            if not alive.any():
+                break
+
+        def stack(name):
+            return np.stack([getattr(s, name) for s in scenes], axis=1)
+
+        return Episodes(
+            stack("depth_mm"), stack("state"), stack("expert"), stack("observation"), stack("held"),
+            length, success, np.asarray(state.info["episode"].object_index), np.asarray(cameras),
+            stack("rgb") if self._with_rgb else None,
+        )  # fmt: skip
+
+    def _scene(self, state, cameras, t: int) -> Scene:
+        seen = jax.tree.map(np.asarray, self._look(state, cameras))
+        return Scene(step=t, **seen)
+
+    def _begin_batch(self, key):
+        k_env, k_cam = jax.random.split(key)
+        state = jax.vmap(self.env.reset)(jax.random.split(k_env, self.count))
+        camera = partial(randomize.sample_camera, config=self._random, T_world_cam=self.viewer.nominal_pose)
+        return state, jax.vmap(camera)(jax.random.split(k_cam, self.count))
+
+    def _look_batch(self, state, cameras):
+        episode, qpos = state.info["episode"], state.data.qpos
+
+        def depth(args):
+            return to_mm(self.viewer.depth_m(*args))
+
+        seen = {
+            "depth_mm": jax.lax.map(depth, (qpos, episode.params, cameras)),
+            "state": student_state(qpos),
+            "expert": self._teacher(state.obs, jp),
+            "observation": state.obs,
+            "held": episode.grasped,
+        }
+        if self._with_rgb:
+            colours = jp.asarray(self.env.table.rgb, jp.float32)[episode.object_index]
+
+            def rgb(args):
+                return jp.round(255 * self.viewer.rgb(*args)).astype(jp.uint8)
+
+            seen["rgb"] = jax.lax.map(rgb, (qpos, episode.params, cameras, colours))
+        return seen
+
+
+def student_state(qpos):
+    """(..., 8) what the student knows of the joints: seven positions and the gripper's width."""
+    return jp.concatenate([qpos[..., :7], qpos[..., 7:8] + qpos[..., 8:9]], axis=-1)
+
+
+def noisy_teacher(rng: np.random.Generator, count: int, noise: float, share: float) -> Actor:
+    """Acts as the teacher with held random perturbations, so that labels cover recoveries.
+
+    Args:
+      rng: source of the perturbations.
+      count: environments.
+      noise: standard deviation of the perturbation of each joint action.
+      share: probability that a perturbation of four steps starts in a step.
+    """
+    left = np.zeros(count, int)
+    push = np.zeros((count, contract.ACTION_SIZE))
+
+    def actor(scene: Scene) -> np.ndarray:
+        start = (left == 0) & (rng.random(count) < share)
+        left[start] = 4
+        push[start, :7] = noise * rng.standard_normal((int(start.sum()), 7))
+        active = left > 0
+        left[active] -= 1
+        return np.clip(scene.expert + push * active[:, None], -1.0, 1.0)
+
+    return actor
+
+
+def successful(episodes: Episodes) -> Iterator[tuple[dict[str, np.ndarray], dict[str, np.ndarray]]]:
+    """(per-step arrays, per-episode arrays) of each successful episode, for `EpisodeStore.append`."""
+    for i in np.flatnonzero(episodes.success):
+        n = int(episodes.length[i])
+        steps = {
+            "depth_mm": episodes.depth_mm[i, :n],
+            "state": episodes.state[i, :n].astype(np.float32),
+            "action": episodes.action[i, :n].astype(np.float32),
+            "observation": episodes.observation[i, :n].astype(np.float32),
+            "held": episodes.held[i, :n],
+        }
+        if episodes.rgb is not None:
+            steps["rgb"] = episodes.rgb[i, :n]
+        yield (
+            steps,
+            {
+                "object_index": np.int32(episodes.object_index[i]),
+                "T_world_cam": episodes.T_world_cam[i].astype(np.float32),
+            },
+        )

@@ -1,0 +1,70 @@
+"""Stage `demos`: teacher -> successful episodes with clean depth on disk (paper III-C1)."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from demos.rollout import Roller, noisy_teacher, successful
+from demos.store import EpisodeStore
+from ppo import policy as teacher_policy
+
+STAGE = "demos"
+STORE = "episodes.zarr"
+_SEED = 30_000
+_MAX_TRIES = 4
+"""Give up when less than one attempt in this many succeeds."""
+
+
+def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+    """Collects `config.demos.episodes` successful episodes, going on from what is there."""
+    teacher_artifact = artifacts.require(run_dir, "teacher", config)
+    directory = run_dir / STAGE
+    store = EpisodeStore(directory / STORE, create=True)
+    tried = collect(config, teacher_policy.load(teacher_artifact.directory), store, progress)
+    _picture(store, config, progress)
+    metrics = {"episodes": len(store), "steps": int(store.ends[-1]), "tried_now": tried}
+    return artifacts.finish(
+        directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=[teacher_artifact]
+    )
+
+
+def collect(config: Config, teacher, store: EpisodeStore, progress: Progress) -> int:
+    """Fills `store` up to the configured number; returns how many episodes were tried."""
+    demos = config.demos
+    tried = 0
+    with progress.task("demos", demos.episodes) as task:
+        task.start_at(len(store))
+        roller = Roller(config, teacher, demos.parallel, with_rgb=demos.rgb)
+        while (have := len(store)) < demos.episodes:
+            # Keyed by what is there, so that a resumed collection does not repeat episodes.
+            key = jax.random.fold_in(jax.random.PRNGKey(_SEED + config.seed), have)
+            rng = np.random.default_rng([config.seed, _SEED, have])
+            actor = noisy_teacher(rng, demos.parallel, demos.action_noise, demos.noise_share)
+            episodes = roller.run(key, actor)
+            tried += demos.parallel
+            for steps, episode in successful(episodes):
+                if len(store) < demos.episodes:
+                    store.append(steps, episode)
+                    task.advance()
+            if tried > _MAX_TRIES * (len(store) - have + demos.episodes) or len(store) == have:
+                raise UserError(
+                    f"The teacher succeeded in {len(store) - have} of {demos.parallel} episodes: train it "
+                    "longer (teacher.total_steps) before collecting demos."
+                )
+    return tried
+
+
+def _picture(store: EpisodeStore, config: Config, progress: Progress) -> None:
+    """A film strip of the first episode."""
+    end = int(store.ends[0])
+    shown = np.linspace(0, end - 1, 6).astype(int)
+    panels = {"clean depth": store.steps("depth_mm", 0, end)[shown]}
+    if "rgb" in store.fields:
+        panels["colour"] = store.steps("rgb", 0, end)[shown]
+    progress.picture("demos", **panels)

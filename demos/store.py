@@ -1,0 +1,89 @@
+"""Episodes on disk: Zarr, laid out like diffusion_policy's ReplayBuffer.
+
+`data/<field>` holds all steps one after another, `meta/episode_ends` the index behind each episode's
+last step, `meta/<field>` one row per episode. An episode counts once `episode_ends` names it, which
+is written last: what a crash left behind it is cut off at the next opening.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import zarr
+from zarr.codecs import BloscCodec
+
+from ddgrasp.errors import UserError
+
+_CODEC = BloscCodec(cname="zstd", clevel=3)
+_IMAGE_CHUNK = 16
+_ROW_CHUNK = 4096
+
+
+class EpisodeStore:
+    """Append-only list of episodes; a folder."""
+
+    def __init__(self, path: Path | str, *, create: bool = False):
+        path = Path(path)
+        if not create and not (path / "zarr.json").exists():
+            raise UserError(f"{path} is no episode store: collect one with `ddgrasp demos collect`.")
+        try:
+            self._root = zarr.open_group(str(path), mode="a" if create else "r")
+            self._data = self._root.require_group("data") if create else self._root["data"]
+            self._meta = self._root.require_group("meta") if create else self._root["meta"]
+        except (KeyError, ValueError, OSError) as error:
+            raise UserError(
+                f"The episode store {path} is damaged ({error}): delete it and collect again."
+            ) from None
+        self.path = path
+        self._writable = create
+
+    @property
+    def ends(self) -> np.ndarray:
+        """(E,) index behind each episode's last step."""
+        if "episode_ends" not in self._meta:
+            return np.zeros(0, np.int64)
+        return np.asarray(self._meta["episode_ends"][:])
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the per-step arrays."""
+        return tuple(sorted(self._data.array_keys()))
+
+    def steps(self, field: str, first: int = 0, last: int | None = None) -> np.ndarray:
+        """Per-step array of the complete episodes, or rows first..last of it."""
+        ends = self.ends
+        count = int(ends[-1]) if len(ends) else 0
+        try:
+            return np.asarray(self._data[field][first : count if last is None else min(last, count)])
+        except (KeyError, ValueError, OSError, RuntimeError) as error:
+            raise UserError(f"{self.path}: steps of {field!r} cannot be read ({error}).") from None
+
+    def episodes(self, field: str) -> np.ndarray:
+        """Per-episode array."""
+        return np.asarray(self._meta[field][: len(self)])
+
+    def append(self, steps: Mapping[str, np.ndarray], episode: Mapping[str, np.ndarray]) -> None:
+        """Adds one episode: arrays (T, ...) per step and (...) per episode."""
+        ends = self.ends
+        start, length = (int(ends[-1]) if len(ends) else 0), len(next(iter(steps.values())))
+        for name, value in steps.items():
+            _put(self._data, name, start, value)
+        for name, value in episode.items():
+            _put(self._meta, name, len(ends), np.asarray(value)[None])
+        _put(self._meta, "episode_ends", len(ends), np.array([start + length], np.int64))
+
+
+def _put(group, name: str, start: int, rows: np.ndarray) -> None:
+    """Writes rows at `start`, cutting off whatever an interrupted append left from there on."""
+    if name not in group:
+        image = rows.ndim >= 3
+        chunks = (_IMAGE_CHUNK if image else _ROW_CHUNK, *rows.shape[1:])
+        group.create_array(
+            name, shape=(0, *rows.shape[1:]), chunks=chunks, dtype=rows.dtype, compressors=[_CODEC]
+        )
+    array = group[name]
+    array.resize((start + len(rows), *rows.shape[1:]))
+    array[start:] = rows

@@ -1,0 +1,71 @@
+"""What a depth camera sees of a batch of environments: physics state to pictures by the JAX ray caster."""
+
+import jax
+import jax.numpy as jp
+import numpy as np
+
+from ddgrasp import contract
+from mjx_envs import kinematics, scene
+from mjx_envs.camera import Camera, nominal_camera
+from mjx_envs.physics import ModelParams
+from mjx_envs.raycast import Geoms, render, render_depth
+from mjx_envs.visible_geoms import visible_geoms
+
+
+class Viewer:
+    """Draws one environment; vmap its methods, or use `depth_mm` for a batch.
+
+    Args:
+      profile: the camera at the scale wanted.
+    """
+
+    def __init__(self, profile: contract.CameraProfile):
+        self.profile = profile
+        model = scene.build_model()
+        table = visible_geoms(model)
+        self._types = table.types
+        self._size, self._rgb = table.size, table.rgb
+        self._pos, self._quat = model.geom_pos[table.ids], model.geom_quat[table.ids]
+        names = [model.geom(i).name for i in table.ids]
+        self._slots = np.array([names.index(name) for name in scene.SLOT_NAMES])
+        self._bodies = [model.body(int(b)).name for b in model.geom_bodyid[table.ids]]
+        self._camera = nominal_camera(profile)
+
+    @property
+    def nominal_pose(self) -> np.ndarray:
+        """(4, 4) T_world_cam of the contract's camera."""
+        return self._camera.T_world_cam
+
+    def geoms(self, qpos: jax.Array, params: ModelParams, object_rgb) -> Geoms:
+        """World geometry of the configuration qpos (16,) with object colour (3,)."""
+        poses = kinematics.body_poses(qpos, jp)
+        poses["world"] = (jp.zeros(3), jp.asarray([1.0, 0.0, 0.0, 0.0]))
+        body_pos = jp.stack([poses[name][0] for name in self._bodies])
+        body_quat = jp.stack([poses[name][1] for name in self._bodies])
+        local_pos = jp.asarray(self._pos, jp.float32).at[self._slots].set(params.slot_pos)
+        local_quat = jp.asarray(self._quat, jp.float32).at[self._slots].set(params.slot_quat)
+        quat = kinematics.quat_mul(body_quat, local_quat, jp)
+        return Geoms(
+            types=self._types,
+            pos_w=body_pos + kinematics.rotate(body_quat, local_pos, jp),
+            rot_w=kinematics.quat_to_mat(quat, jp),
+            size=jp.asarray(self._size).at[self._slots].set(params.slot_size),
+            rgb=jp.asarray(self._rgb).at[self._slots].set(jp.asarray(object_rgb, jp.float32)),
+        )
+
+    def depth_m(self, qpos: jax.Array, params: ModelParams, T_world_cam: jax.Array) -> jax.Array:
+        """(H, W) planar depth in metres, 0 where nothing is hit."""
+        return render_depth(self.geoms(qpos, params, jp.zeros(3)), self._seen_from(T_world_cam))
+
+    def rgb(self, qpos: jax.Array, params: ModelParams, T_world_cam: jax.Array, object_rgb) -> jax.Array:
+        """(H, W, 3) colour in [0, 1]."""
+        return render(self.geoms(qpos, params, object_rgb), self._seen_from(T_world_cam)).rgb
+
+    def _seen_from(self, T_world_cam: jax.Array) -> Camera:
+        c = self._camera
+        return Camera(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.height_px, c.width_px, T_world_cam)  # pyright: ignore
+
+
+def to_mm(depth_m: jax.Array) -> jax.Array:
+    """Metres to the uint16 millimetres that cameras and disks use."""
+    return jp.round(depth_m / contract.DEPTH_UNIT_M).astype(jp.uint16)

@@ -1,0 +1,103 @@
+"""The student at the wheel of many simulated environments, on clean or generated depth."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ddg_jax import graft, normalise
+from ddg_jax.sample import Generator, sample
+from ddgrasp import contract
+from ddgrasp.config import StudentConfig
+from demos.rollout import Scene
+from student_jax.policy import sample_actions
+
+Corrupt = Callable[[np.ndarray, int], np.ndarray]
+"""(B, H, W) uint16 clean depth of B environments and the control step -> depth as the student sees it."""
+
+
+def keep_clean(depth_mm: np.ndarray, step: int) -> np.ndarray:
+    """Ideal camera."""
+    del step
+    return depth_mm
+
+
+class DDGCamera:
+    """Generated artefacts for environments in lock-step: environment i is episode `first + i` of the generator.
+
+    Frames of one environment share noise over time, as the generator's episodes do.
+    """
+
+    def __init__(self, generator: Generator, key: jax.Array, first: int = 0):
+        self._generator, self._key, self._first = generator, key, first
+
+    def __call__(self, depth_mm: np.ndarray, step: int) -> np.ndarray:
+        config, size = self._generator.config, self._generator.config.sample_batch
+        depth_m = depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
+        x = np.concatenate(
+            [self._predict(depth_m[i : i + size], i, step) for i in range(0, len(depth_m), size)]
+        )
+        predicted = normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold)
+        mask = graft.artefact_mask(x, config.noise_threshold)
+        final = np.asarray(graft.graft_mask(depth_m, np.asarray(predicted), np.asarray(mask)))
+        return np.round(final / contract.DEPTH_UNIT_M).astype(np.uint16)
+
+    def _predict(self, depth_m: np.ndarray, first: int, step: int) -> np.ndarray:
+        config, count = self._generator.config, len(depth_m)
+        c = self._generator.prior.from_sim(depth_m, None)
+        c = np.concatenate([c, np.zeros((config.sample_batch - count, *c.shape[1:]), np.float32)])
+        episode = self._first + first + jnp.arange(config.sample_batch)
+        frames = jnp.full(config.sample_batch, step)
+        x = sample(
+            config,
+            self._key,
+            self._generator.params,
+            jnp.asarray(c),
+            episode,
+            frames,
+            steps=config.sample_steps,
+        )
+        return np.asarray(x)[:count]
+
+
+class StudentActor:
+    """Acts in `demos.rollout.Roller` and keeps what the student saw.
+
+    Args:
+      teacher_share: probability that an action is the teacher's instead.
+    """
+
+    def __init__(
+        self,
+        params,
+        config: StudentConfig,
+        profile: contract.CameraProfile,
+        corrupt: Corrupt,
+        rng: np.random.Generator,
+        teacher_share: float = 0.0,
+    ):
+        self._act = partial(_act, config, profile, params)
+        self._config, self._corrupt, self._rng, self._teacher_share = config, corrupt, rng, teacher_share
+        self._chunk = np.zeros(0)
+        self.seen_mm: list[np.ndarray] = []
+
+    def __call__(self, scene: Scene) -> np.ndarray:
+        """(B, 8) actions for the scene."""
+        self.seen_mm.append(self._corrupt(scene.depth_mm, scene.step))
+        position = scene.step % self._config.execute_steps
+        if position == 0:
+            frames = [self.seen_mm[max(0, scene.step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)]
+            shape = (len(scene.state), self._config.chunk, contract.ACTION_SIZE)
+            noise = self._rng.standard_normal(shape).astype(np.float32)
+            self._chunk = np.asarray(self._act(np.stack(frames, axis=1), scene.state, noise))
+        action = self._chunk[:, position]
+        taught = self._rng.random(len(action)) < self._teacher_share
+        return np.where(taught[:, None], scene.expert, action)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _act(config, profile, params, depth_mm, state, noise):
+    depth_m = depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
+    return sample_actions(params, depth_m, state, noise, config, profile)

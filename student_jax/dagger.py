@@ -1,0 +1,203 @@
+"""The student's training plan: demos, then rounds of DAgger (Ross et al. 2011), then the head alone.
+
+Phases in order: `demos`, `dagger-1` ... `dagger-n`, `head`. `plan.json` names the finished ones; within
+a fit the optimiser's state is saved now and then. All draws are keyed by seed, phase and step, so a
+resumed plan goes the way an uninterrupted one would.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import serialization
+
+from ddg_jax.sample import Generator
+from ddgrasp import artifacts
+from ddgrasp.config import Config
+from ddgrasp.progress import Progress
+from demos.rollout import Roller
+from demos.store import EpisodeStore
+from ppo.policy import TeacherPolicy
+from student_jax import frames_io, train
+from student_jax.act import DDGCamera, StudentActor
+from student_jax.data import Frames, random_crops, sharpen_gripper
+from student_jax.policy import PARAMS_FILE, init_params
+
+PLAN = "plan.json"
+PARTIAL = "partial.msgpack"
+SAVE_EVERY = 200
+LOG_EVERY = 20
+_DAGGER_SEED = 40_000
+_ENCODE_BATCH = 64
+
+
+class Trainer:
+    """Runs the plan in `directory`."""
+
+    def __init__(
+        self,
+        config: Config,
+        teacher: TeacherPolicy,
+        generator: Generator,
+        directory: Path,
+        progress: Progress,
+    ):
+        self._config, self._student, self._profile = config, config.student, config.world.profile
+        self._teacher, self._generator = teacher, generator
+        self._directory, self._progress = directory, progress
+        self._done: list[str] = []
+        self.history: list[dict[str, Any]] = []
+        self.params: Any = None
+
+    def run(self, demos: EpisodeStore) -> None:
+        """Every phase that is not finished; `params` is then the student."""
+        self._restore()
+        self._store = EpisodeStore(self._directory / frames_io.CACHE, create=True)
+        frames_io.add_noisy_demos(demos, self._store, self._generator, self._config, self._progress)
+        self._phase("demos", lambda: self._fit("demos", self._student.train_steps))
+        for i in range(1, self._student.dagger_rounds + 1):
+            self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))
+        self._phase("head", self._fit_head)
+
+    @property
+    def frame_count(self) -> int:
+        """Frames trained on."""
+        return int(self._store.ends[-1])
+
+    # --- phases ---
+
+    def _phase(self, name: str, work) -> None:
+        if name in self._done:
+            return
+        measured = work() or {}
+        self._done.append(name)
+        self.history.append({"phase": name, "frames": self.frame_count} | measured)
+        artifacts.save_params(self._directory / PARAMS_FILE, self.params)
+        artifacts.atomic_write_json(self._directory / PLAN, {"done": self._done, "history": self.history})
+        (self._directory / PARTIAL).unlink(missing_ok=True)
+
+    def _restore(self) -> None:
+        plan = self._directory / PLAN
+        if plan.exists():
+            state = json.loads(plan.read_text())
+            self._done, self.history = state["done"], state["history"]
+            self.params = artifacts.load_params(self._directory / PARAMS_FILE)
+            self._progress.note(f"going on after phase {self._done[-1]!r}")
+        elif self._student.init_from:
+            source = Path(self._student.init_from)
+            source = source if (source / PARAMS_FILE).exists() else source / "student"
+            fresh = init_params(jax.random.key(0), self._student, self._profile)
+            self.params = artifacts.load_params(source / PARAMS_FILE, fresh)
+
+    def _dagger(self, number: int, demo_count: int) -> dict[str, float]:
+        """One round: roll out if that was not done yet, then fit on everything."""
+        student = self._student
+        wanted = demo_count + number * student.dagger_episodes
+        rate = float("nan")
+        if len(self._store) < wanted:
+            first = len(self._store)
+            share = student.dagger_teacher_share * (1 - (number - 1) / max(1, student.dagger_rounds - 1))
+            key = jax.random.key(self._config.seed)
+            rng = np.random.default_rng([self._config.seed, _DAGGER_SEED, number])
+            camera = DDGCamera(self._generator, key, first=first)
+            actor = StudentActor(self.params, student, self._profile, camera, rng, share)
+            roller = Roller(self._config, self._teacher, wanted - first)
+            with self._progress.task(f"acting, round {number}", roller.steps) as task:
+                key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
+                episodes = roller.run(key, actor, lambda _: task.advance())
+            frames_io.add_rollouts(self._store, episodes, actor.seen_mm)
+            rate = float(episodes.success.mean())
+            self._progress.note(f"round {number}: {rate:.0%} success with the teacher taking {share:.0%}")
+        self._fit(f"dagger-{number}", student.dagger_steps)
+        return {"rollout_success": rate}
+
+    def _fit(self, phase: str, steps: int) -> dict[str, float]:
+        """`steps` optimiser steps on all frames, from the current parameters."""
+        if steps == 0:
+            self.params = self.params or init_params(
+                jax.random.key(self._config.seed), self._student, self._profile
+            )
+            return {}
+        student, profile = self._student, self._profile
+        frames = frames_io.load(self._directory / frames_io.CACHE)
+        state = train.init_state(student, profile, steps, self._config.seed, self.params)
+        state = self._load_partial(phase, state)
+        terms = {}
+        with self._progress.task(f"student, {phase}", steps) as task:
+            task.start_at(int(state.step))
+            for i in range(int(state.step), steps):
+                rng = np.random.default_rng([self._config.seed, _phase_number(phase), i])
+                index = rng.integers(0, len(frames), student.batch_size)
+                batch = train.make_batch(frames, index, rng, student, profile)
+                state, terms = train.train_step(student, profile, steps, state, batch)
+                if (i + 1) % LOG_EVERY == 0:
+                    self._log(phase, i + 1, terms, task)
+                task.advance()
+                if (i + 1) % SAVE_EVERY == 0:
+                    self._save_partial(phase, state)
+        self.params = jax.tree.map(np.asarray, state.ema)
+        return {name: float(value) for name, value in terms.items()}
+
+    def _fit_head(self) -> dict[str, float]:
+        """The denoiser alone, on conditions computed once for every frame."""
+        student, profile = self._student, self._profile
+        steps = student.head_steps
+        if steps == 0:
+            return {}
+        frames = frames_io.load(self._directory / frames_io.CACHE)
+        rng = np.random.default_rng([self._config.seed, 1])
+        conditions = self._encode_all(frames, rng)
+        chunks = sharpen_gripper(frames.action_chunks(np.arange(len(frames)), student.chunk))
+        head = self.params["denoiser"]
+        state = train.init_state(student, profile, steps, self._config.seed, head)
+        loss = 0.0
+        with self._progress.task("action head", steps) as task:
+            for i in range(steps):
+                index = rng.integers(0, len(frames), student.head_batch_size)
+                cond, action = jnp.asarray(conditions[index]), jnp.asarray(chunks[index])
+                state, loss = train.head_step(student, profile, steps, state, cond, action)
+                if (i + 1) % (5 * LOG_EVERY) == 0:
+                    self._progress.scalars(i + 1, head_loss=float(loss))
+                    task.advance(0, loss=float(loss))
+                task.advance()
+        self.params = self.params | {"denoiser": jax.tree.map(np.asarray, state.ema)}
+        return {"head_loss": float(loss)}
+
+    def _encode_all(self, frames: Frames, rng: np.random.Generator) -> np.ndarray:
+        """(N, D) conditions of all frames, each under one random crop."""
+        student, profile, parts = self._student, self._profile, []
+        batches = range(0, len(frames), _ENCODE_BATCH)
+        for start in self._progress.track(batches, "features", len(batches)):
+            index = np.minimum(np.arange(start, start + _ENCODE_BATCH), len(frames) - 1)
+            crops = random_crops(rng, _ENCODE_BATCH, profile, student.crop_shift_px)
+            depth = frames.depth_stack(index)
+            seen = train.encode(student, profile, self.params, depth, frames.state[index], crops)
+            parts.append(np.asarray(seen.cond))
+        return np.concatenate(parts)[: len(frames)]
+
+    # --- within a fit ---
+
+    def _log(self, phase: str, step: int, terms, task) -> None:
+        values = {name: float(value) for name, value in terms.items()}
+        self._progress.scalars(_phase_number(phase) * 100_000 + step, **values)
+        task.advance(0, action=values["action"], position_mm=values["position_error_mm"])
+
+    def _save_partial(self, phase: str, state: train.TrainState) -> None:
+        saved = serialization.to_state_dict(state) | {"phase": np.int32(_phase_number(phase))}
+        artifacts.save_params(self._directory / PARTIAL, saved)
+
+    def _load_partial(self, phase: str, fresh: train.TrainState) -> train.TrainState:
+        path = self._directory / PARTIAL
+        if not path.exists():
+            return fresh
+        saved = artifacts.load_params(path)
+        if int(saved.pop("phase")) != _phase_number(phase):
+            return fresh
+        return serialization.from_state_dict(fresh, jax.tree.map(jnp.asarray, saved))
+
+
+def _phase_number(phase: str) -> int:
+    return 0 if phase == "demos" else int(phase.split("-")[1])

@@ -1,0 +1,115 @@
+"""The student's training frames: noisy depth, joints, labels and privileged targets, in memory."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddgrasp import contract
+from ddgrasp.config import StudentConfig
+from ddgrasp.errors import UserError
+
+_OBJECT_POS = slice(25, 28)
+_GRASP_QUAT = slice(35, 39)
+YAW_MULTIPLE = 2
+"""The gripper looks the same after half a turn: the auxiliary target is the angle's double."""
+
+
+@dataclass
+class Frames:
+    """N control steps of many episodes, one after another."""
+
+    depth_mm: list[np.ndarray]
+    """Per episode (T, H, W) uint16 as the student sees it, holes 0."""
+    state: np.ndarray
+    """(N, 8)."""
+    action: np.ndarray
+    """(N, 8) the teacher's labels."""
+    position_m: np.ndarray
+    """(N, 3) object in the world."""
+    yaw: np.ndarray
+    """(N, 2) cosine and sine of YAW_MULTIPLE times the grasp yaw."""
+    held: np.ndarray
+    """(N,) float, object in the hand."""
+    episode: np.ndarray
+    """(N,) index into `depth_mm`."""
+    step: np.ndarray
+    """(N,) index within the episode."""
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def extend(self, other: "Frames") -> "Frames":
+        """These frames and then the other's."""
+        return Frames(
+            self.depth_mm + other.depth_mm,
+            *(np.concatenate([getattr(self, n), getattr(other, n)]) for n in _ROW_FIELDS[:-2]),
+            np.concatenate([self.episode, other.episode + len(self.depth_mm)]),
+            np.concatenate([self.step, other.step]),
+        )
+
+    def depth_stack(self, index: np.ndarray) -> np.ndarray:
+        """(B, 3, H, W) uint16: the last three frames at each index, the first repeated at the start."""
+        return np.stack([self._stack_one(self.episode[i], self.step[i]) for i in index])
+
+    def _stack_one(self, episode: int, step: int) -> np.ndarray:
+        frames = self.depth_mm[episode]
+        return np.stack([frames[max(0, step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)])
+
+    def action_chunks(self, index: np.ndarray, chunk: int) -> np.ndarray:
+        """(B, chunk, 8) labels from each index on, the episode's last one repeated at its end."""
+        ahead = index[:, None] + np.arange(chunk)[None]
+        ahead = np.minimum(ahead, len(self) - 1)
+        inside = self.episode[ahead] == self.episode[index][:, None]
+        last = np.where(inside, ahead, 0).max(axis=1, keepdims=True)
+        return self.action[np.where(inside, ahead, last)]
+
+
+_ROW_FIELDS = ("state", "action", "position_m", "yaw", "held", "episode", "step")
+
+
+def make_frames(
+    depth_mm: Sequence[np.ndarray],
+    states: Sequence[np.ndarray],
+    actions: Sequence[np.ndarray],
+    observations: Sequence[np.ndarray],
+    held: Sequence[np.ndarray],
+) -> Frames:
+    """Frames of whole episodes; each argument has one array (T, ...) per episode."""
+    lengths = [len(s) for s in states]
+    observation = np.concatenate(observations)
+    quat = observation[:, _GRASP_QUAT]
+    yaw = 2.0 * np.arctan2(quat[:, 2], quat[:, 1]) * YAW_MULTIPLE
+    return Frames(
+        depth_mm=list(depth_mm),
+        state=np.concatenate(states).astype(np.float32),
+        action=np.clip(np.concatenate(actions), -1, 1).astype(np.float32),
+        position_m=observation[:, _OBJECT_POS].astype(np.float32),
+        yaw=np.stack([np.cos(yaw), np.sin(yaw)], axis=1).astype(np.float32),
+        held=np.concatenate(held).astype(np.float32),
+        episode=np.repeat(np.arange(len(lengths)), lengths),
+        step=np.concatenate([np.arange(n) for n in lengths]),
+    )
+
+
+def sharpen_gripper(action: np.ndarray) -> np.ndarray:
+    """Labels with the gripper command at -1 or 1: the robot only looks at its sign."""
+    sharp = np.array(action)
+    sharp[..., 7] = np.where(sharp[..., 7] > 0, 1.0, -1.0)
+    return sharp
+
+
+def random_crops(
+    rng: np.random.Generator, count: int, profile: contract.CameraProfile, shift_px: int
+) -> np.ndarray:
+    """(count, 2) int32 crop origins, the centred one shifted by up to `shift_px` pixels each way."""
+    shift = rng.integers(-shift_px, shift_px + 1, (count, 2))
+    return (np.array(profile.crop_origin_px) + shift).astype(np.int32)
+
+
+def check_chunk(config: StudentConfig) -> None:
+    """UserError if more actions are to be executed than a chunk holds."""
+    if not 1 <= config.execute_steps <= config.chunk:
+        raise UserError(
+            f"student.execute_steps is {config.execute_steps}: expected 1 to student.chunk = {config.chunk}."
+        )

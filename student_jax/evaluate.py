@@ -1,0 +1,53 @@
+"""Closed-loop success of a student in its own simulation, on clean and on generated depth."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from ddg_jax.sample import Generator
+from ddgrasp.config import Config
+from ddgrasp.progress import Progress
+from demos.rollout import Episodes, Roller
+from ppo.policy import TeacherPolicy
+from student_jax.act import DDGCamera, StudentActor, keep_clean
+
+_SEED = 50_000
+_FIRST_EPISODE = 1_000_000
+"""Numbers of the generator's episodes here, far from those of training."""
+
+
+def closed_loop(
+    config: Config, teacher: TeacherPolicy, generator: Generator, params: Any, progress: Progress
+) -> dict[str, Any]:
+    """`student_clean` and `student_ddg`: counts in total and per object, on the same seeds."""
+    roller = Roller(config, teacher, config.evaluation.student_trials)
+    cameras = {
+        "student_clean": keep_clean,
+        "student_ddg": DDGCamera(generator, jax.random.key(config.seed), first=_FIRST_EPISODE),
+    }
+    metrics = {}
+    for name, camera in cameras.items():
+        rng = np.random.default_rng([config.seed, _SEED])
+        actor = StudentActor(params, config.student, config.world.profile, camera, rng)
+        with progress.task(f"trials, {name}", roller.steps) as task:
+            episodes = roller.run(jax.random.PRNGKey(_SEED + config.seed), actor, lambda _: task.advance())  # noqa: B023
+        metrics[name] = _counts(episodes, config.world.objects)
+        best = int(np.argmax(episodes.success))
+        shown = np.linspace(0, min(len(actor.seen_mm), int(episodes.length[best])) - 1, 6).astype(int)
+        strip = np.stack([actor.seen_mm[t][best] for t in shown])
+        progress.picture(name, **{"depth the student saw": strip})
+    return metrics
+
+
+def _counts(episodes: Episodes, names: tuple[str, ...]) -> dict[str, Any]:
+    success = {"successes": int(episodes.success.sum()), "n": len(episodes.success)}
+    objects = [
+        {
+            "object": name,
+            "successes": int(episodes.success[episodes.object_index == i].sum()),
+            "n": int((episodes.object_index == i).sum()),
+        }
+        for i, name in enumerate(names)
+    ]
+    return {"success": success, "per_object": objects}

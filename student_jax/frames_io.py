@@ -1,0 +1,71 @@
+"""Demos and DAgger episodes as the student sees them, on disk, so that a resumed stage finds them."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from ddg_jax.sample import Generator, generate
+from ddgrasp import contract
+from ddgrasp.config import Config
+from ddgrasp.progress import Progress
+from demos.rollout import Episodes
+from demos.store import EpisodeStore
+from student_jax.data import Frames, make_frames
+
+CACHE = "frames.zarr"
+_FIELDS = ("depth_mm", "state", "action", "observation", "held")
+
+
+def add_noisy_demos(
+    demos: EpisodeStore, frames: EpisodeStore, generator: Generator, config: Config, progress: Progress
+) -> None:
+    """Copies the demos into `frames` with generated artefacts on their depth, going on from what is there.
+
+    A share of `config.student.clean_share` keeps clean depth.
+    """
+    key = jax.random.key(config.seed)
+    ends = np.concatenate([[0], demos.ends])
+    keep_clean = np.random.default_rng(config.seed).random(len(demos)) < config.student.clean_share
+    with progress.task("artefacts on the demos", len(demos)) as task:
+        task.start_at(len(frames))
+        for i in range(len(frames), len(demos)):
+            steps = {name: demos.steps(name, ends[i], ends[i + 1]) for name in _FIELDS}
+            if not keep_clean[i]:
+                steps["depth_mm"] = corrupt_episode(generator, key, steps["depth_mm"], i)
+            frames.append(steps, {"from_demo": np.bool_(True)})
+            task.advance()
+
+
+def corrupt_episode(generator: Generator, key: jax.Array, depth_mm: np.ndarray, episode: int) -> np.ndarray:
+    """(T, H, W) uint16 clean depth to depth with generated artefacts."""
+    depth_m = depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
+    noisy = generate(key, generator, depth_m, episode=episode).depth_m
+    return np.round(noisy / contract.DEPTH_UNIT_M).astype(np.uint16)
+
+
+def add_rollouts(frames: EpisodeStore, episodes: Episodes, seen_mm: list[np.ndarray]) -> None:
+    """Adds DAgger episodes with the depth that the student saw."""
+    seen = np.stack(seen_mm, axis=1)
+    for i, length in enumerate(episodes.length):
+        n = min(int(length), seen.shape[1])
+        frames.append(
+            {
+                "depth_mm": seen[i, :n],
+                "state": episodes.state[i, :n].astype(np.float32),
+                "action": episodes.action[i, :n].astype(np.float32),
+                "observation": episodes.observation[i, :n].astype(np.float32),
+                "held": episodes.held[i, :n],
+            },
+            {"from_demo": np.bool_(False)},
+        )
+
+
+def load(path: Path) -> Frames:
+    """All episodes of a frame store, in memory."""
+    store = EpisodeStore(path)
+    ends = np.concatenate([[0], store.ends])
+    columns = {name: np.split(store.steps(name), ends[1:-1]) for name in _FIELDS}
+    return make_frames(
+        columns["depth_mm"], columns["state"], columns["action"], columns["observation"], columns["held"]
+    )

@@ -1,0 +1,48 @@
+"""Stage `student`: demos, generator and teacher -> depth-only diffusion policy.
+
+Fit on the demos with generated artefacts, then DAgger: the student acts, the teacher labels, and all
+frames so far are fitted again; last the action head alone on cached features. Each part leaves a
+checkpoint, so that an interrupted stage goes on from the last finished part.
+"""
+
+import shutil
+from pathlib import Path
+
+from ddg_jax.sample import Generator
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.progress import Progress
+from demos.stage import STORE
+from demos.store import EpisodeStore
+from ppo import policy as teacher_policy
+from student_jax import evaluate, frames_io
+from student_jax.dagger import Trainer
+from student_jax.data import check_chunk
+
+STAGE = "student"
+
+
+def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+    """Trains the student and evaluates it closed-loop on clean and on generated depth."""
+    check_chunk(config.student)
+    parents = {name: artifacts.require(run_dir, name, config) for name in ("teacher", "demos", "ddg")}
+    directory = run_dir / STAGE
+    generator = Generator.load(parents["ddg"].directory)
+    teacher = teacher_policy.load(parents["teacher"].directory)
+    trainer = Trainer(config, teacher, generator, directory, progress)
+    trainer.run(EpisodeStore(parents["demos"].directory / STORE))
+    metrics = evaluate.closed_loop(config, teacher, generator, trainer.params, progress)
+    metrics |= {"tried": trainer.history, "frames": trainer.frame_count}
+    shutil.rmtree(directory / frames_io.CACHE, ignore_errors=True)
+    return artifacts.finish(
+        directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=list(parents.values()),
+        origin="loaded" if config.student.init_from and not _trains(config) else "trained",
+    )  # fmt: skip
+
+
+def _trains(config: Config) -> bool:
+    student = config.student
+    return (
+        student.train_steps > 0 or student.dagger_rounds * student.dagger_steps > 0 or student.head_steps > 0
+    )
