@@ -28,8 +28,8 @@ class RewardConfig:
     """Ours: per radian of misalignment with the grasp pose removed before the lift."""
     saturation: float = 0.01
     """Ours: penalty on the squared part of an action beyond 0.8 of its range."""
-    grasp: float = 1.0
-    """Ours: for closing on the object, taken back on losing it."""
+    grasp: float = 0.1
+    """Ours: per step with the object in the hand."""
     toggle: float = 0.005
     """Ours: penalty on each change of the gripper's command; 0.05 kept the gripper open for good."""
 
@@ -74,8 +74,8 @@ class WorldConfig:
     """Physics: cpu (MuJoCo's C engine on all cores) or jax (MJX)."""
     episode_steps: int = 60
     """Control steps in an episode (10 Hz)."""
-    sim_dt_s: float = 0.01
-    """Physics time step; the pseudo-real rig steps at half of it."""
+    sim_dt_s: float = 0.005
+    """Physics time step; at 10 ms grasped objects are ejected (a scripted expert: 5 %, at 5 ms 97 %)."""
     camera_scale: float = 0.25
     """Size of the depth camera's picture relative to 1280 x 720."""
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -105,7 +105,9 @@ class TeacherConfig:
     """Adam's step size at the start; decays linearly to a tenth."""
     discount: float = 0.97
     gae_lambda: float = 0.95
-    entropy_cost: float = 1e-2
+    action_std: float = 0.35
+    """Standard deviation of the exploration noise at the start, before the tanh."""
+    entropy_cost: float = 2e-3
     clip: float = 0.2
     """PPO's clipping range."""
     reward_scaling: float = 0.5
@@ -122,7 +124,7 @@ class TeacherConfig:
     stop_at: float = 1.0
     """End early once two evaluations in a row reach this success rate."""
     init_from: str = ""
-    """Run directory or pretrained folder whose teacher to load instead of training; empty trains."""
+    """Run directory or pretrained folder whose policy to start from; with total_steps 0 it is used as it is."""
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ class GraspEnv(mjx_env.MjxEnv):
             rewards.Transition(
                 before=episode.distances, after=distances, action=action, last_action=episode.action,
                 acceleration=(new.qvel[:7] - old.qvel[:7]) / contract.CONTROL_DT_S,
-                was_grasped=episode.grasped.astype(jp.float32), grasped=grasped, lifted=grasped & (object_pos[2] > episode.rest_height + LIFTED_M),
+                grasped=grasped, lifted=grasped & (object_pos[2] > episode.rest_height + LIFTED_M),
                 hold_count=hold_count,
             ),
         )  # fmt: skip

@@ -13,10 +13,9 @@ FUNNEL_HEIGHT_M = 0.07
 FUNNEL_SLOPE = 0.7
 """Below 1, so that moving sideways towards the object always shortens the way."""
 FUNNEL_FREE_M = 0.01
-MAX_APPROACH_M = 0.03
-"""Bound of one step's change: an object knocked away must not teach the hand to keep off."""
-MAX_DISTANCE_M = 1.0
-"""Bounds the reward should an object be thrown."""
+MAX_DISTANCE_M = 0.5
+"""Bounds what a knocked-away object costs. Bounding the change per step instead was exploited: away
+in one big step, back in small ones."""
 
 
 @struct.dataclass
@@ -43,7 +42,6 @@ class Transition:
     last_action: jax.Array
     acceleration: jax.Array
     """(7,) rad/s^2 of the arm's joints, from velocities one control step apart."""
-    was_grasped: jax.Array
     grasped: jax.Array
     lifted: jax.Array
     hold_count: jax.Array
@@ -79,15 +77,13 @@ def terms(weights: RewardConfig, t: Transition) -> dict[str, jax.Array]:
     excess = jp.maximum(jp.abs(t.action[:7]) - 0.8, 0.0)
     toggled = (t.action[7] > 0) != (t.last_action[7] > 0)
     return {
-        "reach": weights.reach
-        * jp.clip(t.before.hand - t.after.hand, -MAX_APPROACH_M, MAX_APPROACH_M)
-        * (1 - grasped),
+        "reach": weights.reach * (t.before.hand - t.after.hand) * (1 - grasped),
         "lift": weights.lift * grasped * (t.before.object - t.after.object),
         "orient": weights.orient * lifted * (t.before.upright_angle - t.after.upright_angle),
         "bonus": (t.hold_count > 0) * weights.bonus_base * weights.bonus_growth**count,
         "accel": -weights.accel * jp.sum(t.acceleration**2),
         "align": weights.align * (t.before.grasp_angle - t.after.grasp_angle) * (1 - lifted),
-        "grasp": weights.grasp * (grasped - t.was_grasped),
+        "grasp": weights.grasp * grasped,
         "saturation": -weights.saturation * jp.sum((excess / 0.2) ** 2),
         "toggle": -weights.toggle * toggled,
     }

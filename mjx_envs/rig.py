@@ -14,7 +14,7 @@ from ddgrasp.errors import unknown_name
 from mjx_envs import grasp_math, kinematics, scene
 from mjx_envs.objects import ObjectSpec, get_object
 
-SIM_DT_S = 0.005
+SIM_DT_S = 0.0025
 
 
 class RigWorld:

@@ -163,7 +163,7 @@ def _touch_xml() -> str:
     )
 
 
-def scene_xml(sim_dt_s: float = 0.01) -> str:
+def scene_xml(sim_dt_s: float = 0.005) -> str:
     """MJCF of the whole scene.
 
     The solver rarely needs more than two iterations; capped at ten, a lying banana was thrown about.
@@ -206,7 +206,7 @@ def scene_xml(sim_dt_s: float = 0.01) -> str:
 </mujoco>"""
 
 
-def build_model(sim_dt_s: float = 0.01) -> mujoco.MjModel:
+def build_model(sim_dt_s: float = 0.005) -> mujoco.MjModel:
     """A new compiled model; change it freely."""
     model = mujoco.MjModel.from_xml_string(scene_xml(sim_dt_s))
     _widen_object_bounds(model)

@@ -4,13 +4,14 @@
 environments included, is one pytree, so that a checkpoint of it resumes exactly.
 """
 
+import math
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jp
 import optax
-from brax.training import acting
+from brax.training import acting, distribution
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
@@ -18,6 +19,7 @@ from flax import linen, struct
 
 from ddgrasp import contract
 from ddgrasp.config import TeacherConfig
+from ddgrasp.errors import UserError
 from mjx_envs.grasp_env import AutoReset
 
 
@@ -35,8 +37,12 @@ class LearnerState:
 
 
 def make_networks(config: TeacherConfig) -> ppo_networks.PPONetworks:
-    """Brax's PPO networks: tanh-squashed normal policy and value MLPs on normalised observations."""
-    return ppo_networks.make_ppo_networks(
+    """Brax's PPO networks: tanh-squashed normal policy and value MLPs on normalised observations.
+
+    `config.action_std` scales the exploration noise: at Brax's own 0.7 the hand jumps centimetres a
+    step and lets go of whatever it found.
+    """
+    networks = ppo_networks.make_ppo_networks(
         contract.OBSERVATION_SIZE,
         contract.ACTION_SIZE,
         preprocess_observations_fn=running_statistics.normalize,
@@ -44,6 +50,9 @@ def make_networks(config: TeacherConfig) -> ppo_networks.PPONetworks:
         value_hidden_layer_sizes=config.hidden,
         activation=linen.elu,
     )
+    scale = config.action_std / math.log(2.0)  # softplus(0) = log 2
+    noise = distribution.NormalTanhDistribution(contract.ACTION_SIZE, min_std=0.01, var_scale=scale)
+    return networks.replace(parametric_action_distribution=noise)
 
 
 def iterations(config: TeacherConfig) -> int:
@@ -74,6 +83,22 @@ def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
         key=k_next,
         iteration=jp.zeros((), jp.int32),
     )
+
+
+def warm_start(state: LearnerState, saved: dict) -> LearnerState:
+    """`state` with the policy and normaliser of `ppo.policy.load_state`; the value network stays fresh."""
+    policy = jax.tree.map(jp.asarray, {"params": saved["layers"]})
+    if jax.tree.map(jp.shape, policy) != jax.tree.map(jp.shape, state.params.policy):
+        raise UserError(
+            "The teacher of teacher.init_from has other layers than teacher.hidden asks for: use the same."
+        )
+    normalizer = state.normalizer.replace(
+        mean=jp.asarray(saved["mean"]),
+        std=jp.asarray(saved["std"]),
+        summed_variance=jp.asarray(saved["summed_variance"]),
+        count=jp.asarray(saved["count"]).astype(state.normalizer.count.dtype),
+    )
+    return state.replace(params=state.params.replace(policy=policy), normalizer=normalizer)
 
 
 def iteration(

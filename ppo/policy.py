@@ -37,6 +37,8 @@ def save(path: Path, normalizer, policy_params) -> None:
         {
             "mean": np.asarray(normalizer.mean),
             "std": np.maximum(np.asarray(normalizer.std), _STD_MIN),
+            "summed_variance": np.asarray(normalizer.summed_variance),
+            "count": np.asarray(normalizer.count, np.float32),
             "layers": {name: {k: np.asarray(v) for k, v in layer.items()} for name, layer in layers.items()},
         },
     )
@@ -51,22 +53,30 @@ def from_learner(normalizer, policy_params) -> TeacherPolicy:
     )
 
 
-def load(directory: Path | str) -> TeacherPolicy:
-    """The teacher in a stage directory, a run directory or a pretrained folder."""
+def find(directory: Path | str) -> Path:
+    """The parameter file in a stage directory, a run directory or a pretrained folder; UserError if none."""
     directory = Path(directory)
     for candidate in (directory / PARAMS_FILE, directory / "teacher" / PARAMS_FILE):
         if candidate.exists():
-            break
-    else:
-        raise UserError(
-            f"{directory} holds no teacher ({PARAMS_FILE}): train one with `ddgrasp teacher train`."
-        )
-    state = artifacts.load_params(candidate)
+            return candidate
+    raise UserError(f"{directory} holds no teacher ({PARAMS_FILE}): train one with `ddgrasp teacher train`.")
+
+
+def load_state(directory: Path | str) -> dict:
+    """The saved parameters: normaliser's mean, std, summed_variance and count, and the layers."""
+    path = find(directory)
+    state = artifacts.load_params(path)
     if state["mean"].shape != (contract.OBSERVATION_SIZE,):
         raise UserError(
-            f"The teacher in {candidate} takes {state['mean'].shape[0]} inputs, this contract "
+            f"The teacher in {path} takes {state['mean'].shape[0]} inputs, this contract "
             f"{contract.OBSERVATION_SIZE}: train a new one."
         )
+    return state
+
+
+def load(directory: Path | str) -> TeacherPolicy:
+    """The teacher in a stage directory, a run directory or a pretrained folder."""
+    state = load_state(directory)
     ordered = [state["layers"][f"hidden_{i}"] for i in range(len(state["layers"]))]
     return TeacherPolicy(state["mean"], state["std"], [(layer["kernel"], layer["bias"]) for layer in ordered])
 

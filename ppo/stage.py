@@ -20,12 +20,11 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
     """Trains a teacher (or loads one, `config.teacher.init_from`) and evaluates it."""
     directory = run_dir / STAGE
     path = directory / teacher_policy.PARAMS_FILE
-    if config.teacher.init_from:
+    loads = bool(config.teacher.init_from) and config.teacher.total_steps == 0
+    if loads:
         policy = teacher_policy.load(config.teacher.init_from)
-        source = Path(config.teacher.init_from)
-        source = source if (source / teacher_policy.PARAMS_FILE).exists() else source / STAGE
         with artifacts.atomic_path(path) as temporary:
-            shutil.copyfile(source / teacher_policy.PARAMS_FILE, temporary)
+            shutil.copyfile(teacher_policy.find(config.teacher.init_from), temporary)
     else:
         state = train(config, directory, progress)
         teacher_policy.save(path, state.normalizer, state.params.policy)
@@ -33,5 +32,5 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
     metrics = evaluate(GraspEnv(config.world), policy, config.evaluation.teacher_trials, _TEST_SEED)
     return artifacts.finish(
         directory, STAGE, config, seconds=progress.seconds, metrics=metrics,
-        origin="loaded" if config.teacher.init_from else "trained",
+        origin="loaded" if loads else "trained",
     )  # fmt: skip

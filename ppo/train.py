@@ -14,7 +14,7 @@ from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import learner
 from ppo.evaluate import evaluate
-from ppo.policy import TeacherPolicy, from_learner
+from ppo.policy import TeacherPolicy, from_learner, load_state
 
 CHECKPOINTS = "checkpoints"
 LOG_EVERY = 5
@@ -84,7 +84,8 @@ def _check(config: Config) -> None:
 def _start(config: Config, env: AutoReset, manager: ocp.CheckpointManager) -> learner.LearnerState:
     state = jax.jit(partial(learner.init, config.teacher, env))(jax.random.PRNGKey(config.seed))
     if manager.latest_step() is None:
-        return state
+        source = config.teacher.init_from
+        return learner.warm_start(state, load_state(source)) if source else state
     return manager.restore(manager.latest_step(), args=ocp.args.StandardRestore(state))
 
 

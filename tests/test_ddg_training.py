@@ -107,11 +107,21 @@ def test_generation_does_not_depend_on_batching_and_frames_of_an_episode_agree(f
 
 
 def test_frame_noise_is_standard_normal_with_the_stated_correlation():
-    episode, frame = np.array([0, 0, 1]), np.array([0, 1, 0])
-    noise = np.asarray(sample.frame_noise(jax.random.key(0), episode, frame, (200, 200), 0.9))
+    key, frame = jax.random.key(0), np.array([0, 1])
+    one, other = (sample.frame_noise(key, e, frame, (200, 200), 0.9) for e in (0, 1))
+    noise = np.concatenate([one, other])
     np.testing.assert_allclose(noise.std(axis=(1, 2)), 1, atol=0.02)
-    correlation = np.corrcoef(noise.reshape(3, -1))
+    correlation = np.corrcoef(noise.reshape(4, -1))
     assert abs(correlation[0, 1] - 0.9) < 0.01 and abs(correlation[0, 2]) < 0.02
+    mixed = sample.frame_noise(key, np.array([1, 0]), frame, (200, 200), 0.9)
+    np.testing.assert_allclose(mixed, [other[0], one[1]], atol=1e-6)
+
+
+def test_batch_of_environments_equals_their_episodes(fitted, scene):
+    key = jax.random.key(5)
+    batch = sample.generate(key, fitted, scene[:2], episode=np.array([4, 7]), frame=np.array([0, 0]))
+    alone = sample.generate(key, fitted, scene[:1], episode=7)
+    np.testing.assert_array_equal(batch.depth_m[1], alone.depth_m[0])
 
 
 def test_ancestral_sampler_and_bad_input(fitted, scene):

@@ -1,0 +1,67 @@
+"""Episodes on disk survive interruption; what is whole stays readable."""
+
+import numpy as np
+import pytest
+
+from ddgrasp.errors import UserError
+from demos.store import EpisodeStore
+
+
+def episode(length, value):
+    return {
+        "depth_mm": np.full((length, 6, 8), value, np.uint16),
+        "action": np.full((length, 8), value, np.float32),
+    }, {"object_index": np.int32(value)}
+
+
+def test_round_trip_in_replay_buffer_layout(tmp_path):
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    store.append(*episode(3, 7))
+    store.append(*episode(5, 9))
+    again = EpisodeStore(tmp_path / "s.zarr")
+    np.testing.assert_array_equal(again.ends, [3, 8])
+    assert (tmp_path / "s.zarr" / "data" / "action").is_dir()
+    assert (tmp_path / "s.zarr" / "meta" / "episode_ends").is_dir()
+    assert again.steps("depth_mm").shape == (8, 6, 8) and again.steps("depth_mm").dtype == np.uint16
+    np.testing.assert_array_equal(again.steps("action")[:, 0], [7, 7, 7, 9, 9, 9, 9, 9])
+    np.testing.assert_array_equal(again.episodes("object_index"), [7, 9])
+
+
+def test_a_half_written_episode_is_not_seen_and_is_overwritten(tmp_path, monkeypatch):
+    import demos.store as module
+
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    store.append(*episode(3, 1))
+    put = module._put
+
+    def fail_at_the_end(group, name, start, rows):
+        if name == "episode_ends":
+            raise KeyboardInterrupt
+        put(group, name, start, rows)
+
+    monkeypatch.setattr(module, "_put", fail_at_the_end)
+    with pytest.raises(KeyboardInterrupt):
+        store.append(*episode(4, 2))
+    monkeypatch.undo()
+    again = EpisodeStore(tmp_path / "s.zarr", create=True)
+    assert len(again) == 1 and len(again.steps("action")) == 3
+    again.append(*episode(2, 5))
+    np.testing.assert_array_equal(again.steps("action")[:, 0], [1, 1, 1, 5, 5])
+
+
+def test_a_damaged_chunk_names_the_store_and_spares_other_episodes(tmp_path):
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    for i in range(3):
+        store.append(*episode(16, i + 1))
+    chunks = sorted((tmp_path / "s.zarr" / "data" / "depth_mm" / "c").rglob("*"))
+    last = [c for c in chunks if c.is_file()][-1]
+    last.write_bytes(last.read_bytes()[:10])
+    again = EpisodeStore(tmp_path / "s.zarr")
+    np.testing.assert_array_equal(np.unique(again.steps("depth_mm", 0, 32)), [1, 2])
+    with pytest.raises(UserError, match="depth_mm"):
+        again.steps("depth_mm", 32, 48)
+
+
+def test_no_store_there(tmp_path):
+    with pytest.raises(UserError, match="no episode store"):
+        EpisodeStore(tmp_path / "nothing.zarr")

@@ -1,0 +1,71 @@
+"""PPO: exact resume, the saved policy is the trained one, warm start."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jp
+import numpy as np
+import pytest
+from brax.training.agents.ppo import networks as ppo_networks
+
+from ddgrasp.config import Config, EvalConfig, TeacherConfig, WorldConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from ppo import learner
+from ppo import policy as teacher_policy
+from ppo import train as ppo_train
+
+TEACHER = TeacherConfig(
+    total_steps=4 * 8 * 4, num_envs=8, unroll_steps=4, minibatches=2, epochs=1, hidden=(16,), eval_every=100,
+    checkpoint_every=2, pregrasp_share=0.0,
+)  # fmt: skip
+CONFIG = Config("test", world=WorldConfig(episode_steps=6), teacher=TEACHER, evaluation=EvalConfig(teacher_trials=4))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("whole")
+    return ppo_train.train(CONFIG, directory, Progress(quiet=True))
+
+
+def test_resume_equals_an_uninterrupted_run_to_the_bit(uninterrupted, tmp_path, monkeypatch):
+    rounds = learner.iterations(TEACHER)
+    assert rounds == 4
+    monkeypatch.setattr(ppo_train.learner, "iterations", lambda config: 2)
+    ppo_train.train(CONFIG, tmp_path, Progress(quiet=True))
+    monkeypatch.setattr(ppo_train.learner, "iterations", lambda config: rounds)
+    resumed = ppo_train.train(CONFIG, tmp_path, Progress(quiet=True))
+    for whole, again in zip(jax.tree.leaves(uninterrupted.params), jax.tree.leaves(resumed.params), strict=True):
+        np.testing.assert_array_equal(np.asarray(whole), np.asarray(again))
+
+
+def test_saved_policy_acts_as_braxs_deterministic_policy(uninterrupted, tmp_path):
+    path = tmp_path / teacher_policy.PARAMS_FILE
+    teacher_policy.save(path, uninterrupted.normalizer, uninterrupted.params.policy)
+    ours = teacher_policy.load(tmp_path)
+    networks = learner.make_networks(TEACHER)
+    params = (uninterrupted.normalizer, uninterrupted.params.policy)
+    theirs = ppo_networks.make_inference_fn(networks)(params, deterministic=True)
+    obs = np.random.default_rng(0).normal(size=(5, 40)).astype(np.float32)
+    np.testing.assert_allclose(ours(obs), theirs(jp.asarray(obs), jax.random.PRNGKey(0))[0], atol=1e-5)
+
+
+def test_warm_start_takes_the_policy_and_refuses_other_sizes(uninterrupted, tmp_path):
+    teacher_policy.save(tmp_path / teacher_policy.PARAMS_FILE, uninterrupted.normalizer, uninterrupted.params.policy)
+    saved = teacher_policy.load_state(tmp_path)
+    started = learner.warm_start(uninterrupted, saved)
+    for a, b in zip(
+        jax.tree.leaves(started.params.policy), jax.tree.leaves(uninterrupted.params.policy), strict=True
+    ):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    saved["layers"]["hidden_0"]["kernel"] = np.zeros((40, 3), np.float32)
+    with pytest.raises(UserError, match="teacher.hidden"):
+        learner.warm_start(uninterrupted, saved)
+
+
+def test_missing_teacher_and_indivisible_batch_are_named(tmp_path):
+    with pytest.raises(UserError, match="holds no teacher"):
+        teacher_policy.load(tmp_path)
+    odd = dataclasses.replace(CONFIG, teacher=dataclasses.replace(TEACHER, minibatches=3))
+    with pytest.raises(UserError, match="num_envs 8 is no multiple of teacher.minibatches 3"):
+        ppo_train.train(odd, tmp_path, Progress(quiet=True))
