@@ -147,7 +147,7 @@ def test_auxiliary_predictions_reach_the_head_and_stop_gradient_stops():
             seen = net.apply({"params": p}, picture, jnp.zeros((2, 8)), method="encode_picture")
             return seen.cond[:, -policy.AUX_SIZE :].sum()
 
-        return float(jnp.abs(jax.grad(loss)(params)["aux_output"]["bias"]).sum())
+        return float(jnp.abs(jax.jit(jax.grad(loss))(params)["aux_output"]["bias"]).sum())
 
     assert head_gradient(SMALL) == pytest.approx(2 * policy.AUX_SIZE)
     assert head_gradient(replace(SMALL, aux_stop_gradient=True)) == 0.0
@@ -179,16 +179,17 @@ def scene(rng: np.random.Generator, batch: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def test_the_encoder_learns_where_an_object_is_within_seconds():
-    """Chance is 10 cm; 80 steps of 16 pictures must bring unseen ones under 2 cm."""
+    """Chance is 10 cm; 80 steps of 32 pictures must bring unseen ones under 4 cm."""
     rng = np.random.default_rng(0)
-    net = policy.StudentPolicy(SMALL, PROFILE)
-    params = policy.init_params(jax.random.key(0), SMALL, PROFILE)
-    optimiser = optax.adam(1e-2)
+    config = replace(SMALL, width=16, keypoints=16, feature_size=64)
+    net = policy.StudentPolicy(config, PROFILE)
+    params = policy.init_params(jax.random.key(0), config, PROFILE)
+    optimiser = optax.adam(3e-3)
 
     @jax.jit
     def step(params, moments, frames, crop, place):
         def loss(p):
-            seen = net.apply({"params": p}, frames, jnp.zeros((16, 8)), crop, method="encode")
+            seen = net.apply({"params": p}, frames, jnp.zeros((32, 8)), crop, method="encode")
             error = seen.aux.position - policy.position_from_world(place)
             return jnp.mean(error**2), jnp.linalg.norm(error, axis=-1).mean() * encoder.POSITION_SCALE_M
 
@@ -196,9 +197,9 @@ def test_the_encoder_learns_where_an_object_is_within_seconds():
         update, moments = optimiser.update(gradient, moments, params)
         return optax.apply_updates(params, update), moments, error_m
 
-    batches = [scene(rng, 16) for _ in range(20)]
+    batches = [scene(rng, 32) for _ in range(20)]
     moments = optimiser.init(params)
     for index in range(80):
         params, moments, _ = step(params, moments, *batches[index % len(batches)])
-    unseen = scene(rng, 16)
-    assert float(step(params, moments, *unseen)[2]) < 0.02
+    unseen = scene(rng, 32)
+    assert float(step(params, moments, *unseen)[2]) < 0.04
