@@ -91,7 +91,7 @@ class WorldConfig:
 class TeacherConfig:
     """PPO on the privileged state."""
 
-    total_steps: int = 4_000_000
+    total_steps: int = 2_000_000
     """Control steps of experience."""
     num_envs: int = 512
     """Environments stepped together."""
@@ -101,22 +101,30 @@ class TeacherConfig:
     """Gradient steps per epoch; must divide num_envs."""
     epochs: int = 4
     """Passes over each batch of experience."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-4
     """Adam's step size at the start; decays linearly to a tenth."""
     discount: float = 0.97
     gae_lambda: float = 0.95
-    action_std: float = 0.35
+    action_std: float = 0.15
     """Standard deviation of the exploration noise at the start, before the tanh."""
-    entropy_cost: float = 2e-3
+    entropy_cost: float = 1e-3
     clip: float = 0.2
     """PPO's clipping range."""
     reward_scaling: float = 0.5
     max_grad_norm: float = 1.0
     hidden: tuple[int, ...] = (256, 128)
     """Layers of policy and value networks."""
-    pregrasp_share: float = 0.5
-    """Share of training episodes that start with the hand above the object. Without these exploring
-    starts 6 M steps brought no grasp."""
+    pregrasp_share: float = 0.2
+    """Share of training episodes that start with the hand above the object (exploring starts)."""
+    clone_rounds: int = 8
+    """DAgger rounds in which the policy network learns the guide (ppo/guide.py) before PPO; 0 starts
+    PPO from nothing."""
+    clone_envs: int = 192
+    """Episodes per such round."""
+    clone_steps: int = 500
+    """Optimiser steps per such round."""
+    critic_warmup: int = 10
+    """Iterations in which the critic alone learns, so that it does not mislead a cloned policy."""
     eval_every: int = 20
     """Updates between deterministic evaluations."""
     checkpoint_every: int = 20

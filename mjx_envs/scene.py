@@ -171,7 +171,7 @@ def scene_xml(sim_dt_s: float = 0.005) -> str:
     return f"""
 <mujoco model="franka_table">
   <compiler angle="radian" autolimits="true"/>
-  <option timestep="{sim_dt_s}" integrator="implicitfast" cone="elliptic" impratio="10"
+  <option timestep="{sim_dt_s}" integrator="implicitfast" cone="elliptic" impratio="3"
           iterations="50" ls_iterations="50"><flag eulerdamp="disable" midphase="disable"/></option>
   <default>
     <default class="arm"><geom contype="0" conaffinity="0" group="1" rgba="0.92 0.92 0.92 1"/></default>

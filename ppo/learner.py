@@ -23,6 +23,10 @@ from ddgrasp.errors import UserError
 from mjx_envs.grasp_env import AutoReset
 
 
+OBSERVATION_STD_MIN = 0.01
+"""Bounds the normalised size of components that hardly ever move, such as an upright object's tilt."""
+
+
 @struct.dataclass
 class LearnerState:
     """Everything training needs to go on: this is what a checkpoint holds."""
@@ -111,7 +115,9 @@ def iteration(
     env_state = env.refresh(state.env_state)
     policy = ppo_networks.make_inference_fn(networks)((state.normalizer, state.params.policy))
     env_state, data, outcome = _unroll(env, env_state, policy, k_unroll, config.unroll_steps)
-    normalizer = running_statistics.update(state.normalizer, data.observation)
+    normalizer = state.normalizer
+    if not (config.clone_rounds or config.init_from):  # a policy that acts already would be put off by new scales
+        normalizer = running_statistics.update(normalizer, data.observation, std_min_value=OBSERVATION_STD_MIN)
     (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state)
     new = LearnerState(params, normalizer, opt_state, env_state, state.key, state.iteration + 1)
     return new, losses | outcome
@@ -150,6 +156,8 @@ def _improve(config, networks, normalizer, data, key, state):
         params, opt_state = carry
         batch, k_loss = batch_and_key
         (_, terms), grads = jax.value_and_grad(loss_fn, has_aux=True)(params, normalizer, batch, k_loss)
+        learns = state.iteration >= config.critic_warmup
+        grads = grads.replace(policy=jax.tree.map(lambda g: jp.where(learns, g, 0.0), grads.policy))
         updates, opt_state = optimizer.update(grads, opt_state, params)
         return (optax.apply_updates(params, updates), opt_state), terms
 

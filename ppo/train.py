@@ -15,6 +15,7 @@ from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import learner
 from ppo.evaluate import evaluate
 from ppo.policy import TeacherPolicy, from_learner, load_state
+from ppo.warmup import clone_guide
 
 CHECKPOINTS = "checkpoints"
 LOG_EVERY = 5
@@ -32,8 +33,10 @@ def train(config: Config, directory: Path, progress: Progress) -> learner.Learne
     total = learner.iterations(teacher)
     options = ocp.CheckpointManagerOptions(max_to_keep=_KEPT, enable_async_checkpointing=False)
     with ocp.CheckpointManager((directory / CHECKPOINTS).absolute(), options=options) as manager:
-        state = _start(config, env, manager)
+        state = _start(config, env, manager, progress)
         good_evaluations = 0
+        if int(state.iteration) == 0:
+            _evaluate(test_env, state, config, 0, progress)
         with progress.task("PPO", total) as task:
             task.start_at(int(state.iteration))
             for i in range(int(state.iteration) + 1, total + 1):
@@ -51,15 +54,6 @@ def train(config: Config, directory: Path, progress: Progress) -> learner.Learne
                     progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
                     break
     return state
-
-
-def restore(config: Config, directory: Path) -> learner.LearnerState:
-    """The newest checkpoint in `directory`; UserError if there is none."""
-    env = AutoReset(GraspEnv(training_world(config)))
-    with ocp.CheckpointManager((directory / CHECKPOINTS).absolute()) as manager:
-        if manager.latest_step() is None:
-            raise UserError(f"{directory} holds no checkpoint of a teacher.")
-        return _start(config, env, manager)
 
 
 def training_world(config: Config) -> WorldConfig:
@@ -81,11 +75,18 @@ def _check(config: Config) -> None:
         )
 
 
-def _start(config: Config, env: AutoReset, manager: ocp.CheckpointManager) -> learner.LearnerState:
+def _start(
+    config: Config, env: AutoReset, manager: ocp.CheckpointManager, progress: Progress
+) -> learner.LearnerState:
     state = jax.jit(partial(learner.init, config.teacher, env))(jax.random.PRNGKey(config.seed))
     if manager.latest_step() is None:
-        source = config.teacher.init_from
-        return learner.warm_start(state, load_state(source)) if source else state
+        if config.teacher.init_from:
+            return learner.warm_start(state, load_state(config.teacher.init_from))
+        if config.teacher.clone_rounds:
+            state = clone_guide(config.teacher, GraspEnv(config.world), state, config.seed, progress)
+            manager.save(0, args=ocp.args.StandardSave(state), force=True)
+            manager.wait_until_finished()
+        return state
     return manager.restore(manager.latest_step(), args=ocp.args.StandardRestore(state))
 
 

@@ -1,0 +1,97 @@
+"""Clones the guide into the policy network by DAgger (Ross et al. 2011), before PPO starts."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jp
+import numpy as np
+import optax
+from brax.training.acme import running_statistics
+
+from ddgrasp.config import TeacherConfig
+from ddgrasp.progress import Progress
+from mjx_envs.grasp_env import GraspEnv
+from ppo import learner
+from ppo.guide import guide
+from ppo.policy import TeacherPolicy, from_learner
+
+BATCH = 1024
+LEARNING_RATE = 2e-3
+ACTION_NOISE = 0.2
+NOISE_SHARE = 0.3
+_SEED = 60_000
+
+
+def clone_guide(
+    config: TeacherConfig, env: GraspEnv, state: learner.LearnerState, seed: int, progress: Progress
+) -> learner.LearnerState:
+    """`state` with the guide's policy and its observations' statistics; critic and environments as they were."""
+    policy, normalizer = state.params.policy, state.normalizer
+    optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, config.clone_rounds * config.clone_steps))
+    opt_state = optimizer.init(policy)
+    observations, labels = [], []
+    rng = np.random.default_rng([seed, _SEED])
+    collect = _Collector(env, config.clone_envs)
+    fit = jax.jit(partial(_fit, optimizer))
+    with progress.task("cloning the guide", config.clone_rounds) as task:
+        for i in range(config.clone_rounds):
+            share = 0.5**i if i < config.clone_rounds - 1 else 0.0
+            numbers = jax.tree.map(np.asarray, (normalizer, policy))
+            seen, label = collect(from_learner(*numbers), _SEED + 1000 * seed + i, share)
+            observations.append(seen)
+            labels.append(label)
+            normalizer = running_statistics.update(
+                normalizer, jp.asarray(seen), std_min_value=learner.OBSERVATION_STD_MIN
+            )
+            everything, wanted = np.concatenate(observations), np.concatenate(labels)
+            index = rng.integers(0, len(everything), (config.clone_steps, BATCH))
+            policy, opt_state, loss = fit(normalizer, policy, opt_state, everything[index], wanted[index])
+            progress.scalars(i, clone_loss=float(loss))
+            task.advance(loss=float(loss))
+    return state.replace(params=state.params.replace(policy=policy), normalizer=normalizer)
+
+
+class _Collector:
+    """Whole episodes acted by a mix of guide and policy. Host loop: one program for all was 20 times slower."""
+
+    def __init__(self, env: GraspEnv, count: int):
+        self._count, self._steps = count, env.config.episode_steps
+        self._reset = jax.jit(jax.vmap(env.reset))
+        self._step = jax.jit(jax.vmap(env.step))
+        self._guide = jax.jit(jax.vmap(guide))
+
+    def __call__(self, policy: TeacherPolicy, seed: int, guide_share: float) -> tuple[np.ndarray, np.ndarray]:
+        """Observations (N, 40) and the guide's actions there (N, 8)."""
+        rng = np.random.default_rng(seed)
+        state = self._reset(jax.random.split(jax.random.PRNGKey(seed), self._count))
+        alive = np.ones(self._count, bool)
+        observations, labels = [], []
+        for _ in range(self._steps):
+            seen = np.asarray(state.obs)
+            label = np.asarray(self._guide(state.obs))
+            observations.append(seen[alive])
+            labels.append(label[alive])
+            guided = rng.random((self._count, 1)) < guide_share
+            noise = ACTION_NOISE * rng.standard_normal(label.shape) * (rng.random((self._count, 1)) < NOISE_SHARE)
+            noise[:, 7] = 0.0
+            action = np.clip(np.where(guided, label, policy(seen)) + noise, -1, 1)
+            state = self._step(state, action.astype(np.float32))
+            alive &= np.asarray(state.done) == 0
+        return np.concatenate(observations), np.concatenate(labels)
+
+
+def _fit(optimizer, normalizer, policy_params, opt_state, observations, labels):
+    """One optimiser step for each batch in observations (S, B, 40) and labels (S, B, 8)."""
+
+    def loss_fn(params, batch):
+        observation, label = batch
+        return jp.mean((from_learner(normalizer, params)(observation, jp) - label) ** 2)
+
+    def step(carry, batch):
+        params, opt_state = carry
+        loss, grads = jax.value_and_grad(loss_fn)(params, batch)
+        updates, opt_state = optimizer.update(grads, opt_state)
+        return (optax.apply_updates(params, updates), opt_state), loss
+
+    (params, opt_state), losses = jax.lax.scan(step, (policy_params, opt_state), (observations, labels))
+    return params, opt_state, losses[-10:].mean()
