@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ddg_jax import graft, normalise
-from ddg_jax.sample import Generator, sample
+from ddg_jax.sample import Generator, generate
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from demos.rollout import Scene
@@ -34,32 +33,12 @@ class DDGCamera:
         self._generator, self._key, self._first = generator, key, first
 
     def __call__(self, depth_mm: np.ndarray, step: int) -> np.ndarray:
-        config, size = self._generator.config, self._generator.config.sample_batch
+        """(B, H, W) uint16 with artefacts."""
+        episode = self._first + np.arange(len(depth_mm))
+        frame = np.full(len(depth_mm), step)
         depth_m = depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
-        x = np.concatenate(
-            [self._predict(depth_m[i : i + size], i, step) for i in range(0, len(depth_m), size)]
-        )
-        predicted = normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold)
-        mask = graft.artefact_mask(x, config.noise_threshold)
-        final = np.asarray(graft.graft_mask(depth_m, np.asarray(predicted), np.asarray(mask)))
-        return np.round(final / contract.DEPTH_UNIT_M).astype(np.uint16)
-
-    def _predict(self, depth_m: np.ndarray, first: int, step: int) -> np.ndarray:
-        config, count = self._generator.config, len(depth_m)
-        c = self._generator.prior.from_sim(depth_m, None)
-        c = np.concatenate([c, np.zeros((config.sample_batch - count, *c.shape[1:]), np.float32)])
-        episode = self._first + first + jnp.arange(config.sample_batch)
-        frames = jnp.full(config.sample_batch, step)
-        x = sample(
-            config,
-            self._key,
-            self._generator.params,
-            jnp.asarray(c),
-            episode,
-            frames,
-            steps=config.sample_steps,
-        )
-        return np.asarray(x)[:count]
+        noisy = generate(self._key, self._generator, depth_m, episode=episode, frame=frame)
+        return np.round(noisy.depth_m / contract.DEPTH_UNIT_M).astype(np.uint16)
 
 
 class StudentActor:
