@@ -76,7 +76,7 @@ that never succeeds leaves no demos."""
 
 DEMO = Config(
     preset="demo",
-    teacher=TeacherConfig(total_steps=600_000),
+    teacher=TeacherConfig(total_steps=300_000, eval_every=10),
     demos=DemosConfig(episodes=120),
     record=RecordConfig(trajectories=24),
     ddg=DDGConfig(train_steps=1000),
@@ -94,7 +94,7 @@ DEMO = Config(
 
 LAPTOP = Config(
     preset="laptop",
-    teacher=TeacherConfig(total_steps=1_500_000),
+    teacher=TeacherConfig(total_steps=500_000, eval_every=10),
     demos=DemosConfig(episodes=240),
     record=RecordConfig(trajectories=36),
     ddg=DDGConfig(train_steps=1500),

@@ -22,7 +22,6 @@ from ddgrasp.config import TeacherConfig
 from ddgrasp.errors import UserError
 from mjx_envs.grasp_env import AutoReset
 
-
 OBSERVATION_STD_MIN = 0.01
 """Bounds the normalised size of components that hardly ever move, such as an upright object's tilt."""
 
@@ -65,10 +64,15 @@ def iterations(config: TeacherConfig) -> int:
 
 
 def make_optimizer(config: TeacherConfig) -> optax.GradientTransformation:
-    """Adam with linearly decaying step size and clipped gradients."""
+    """Adam with linearly decaying step size and clipped gradients, for actor and critic apart."""
     updates = iterations(config) * config.epochs * config.minibatches
-    rate = optax.linear_schedule(config.learning_rate, 0.1 * config.learning_rate, updates)
-    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate))
+
+    def adam(rate: float) -> optax.GradientTransformation:
+        schedule = optax.linear_schedule(rate, 0.1 * rate, updates)
+        return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
+
+    parts = {"policy": adam(config.learning_rate), "value": adam(config.critic_learning_rate)}
+    return optax.multi_transform(parts, ppo_losses.PPONetworkParams("policy", "value"))  # pyright: ignore
 
 
 def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:

@@ -10,7 +10,7 @@ from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import GraspEnv
 from ppo import policy as teacher_policy
 from ppo.evaluate import evaluate
-from ppo.train import policy_of, train
+from ppo.train import train
 
 STAGE = "teacher"
 _TEST_SEED = 20_000
@@ -26,9 +26,8 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
         with artifacts.atomic_path(path) as temporary:
             shutil.copyfile(teacher_policy.find(config.teacher.init_from), temporary)
     else:
-        state = train(config, directory, progress)
-        teacher_policy.save(path, state.normalizer, state.params.policy)
-        policy = policy_of(state)
+        train(config, directory, progress)
+        policy = teacher_policy.load(directory)
     metrics = evaluate(GraspEnv(config.world), policy, config.evaluation.teacher_trials, _TEST_SEED)
     return artifacts.finish(
         directory, STAGE, config, seconds=progress.seconds, metrics=metrics,

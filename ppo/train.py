@@ -8,23 +8,29 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from ddgrasp import artifacts
 from ddgrasp.config import Config, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import learner
 from ppo.evaluate import evaluate
-from ppo.policy import TeacherPolicy, from_learner, load_state
+from ppo.policy import PARAMS_FILE, TeacherPolicy, from_learner, load_state, save
 from ppo.warmup import clone_guide
 
 CHECKPOINTS = "checkpoints"
+BEST_RATE = "best.json"
 LOG_EVERY = 5
 _KEPT = 2
 _EVAL_SEED = 10_000
 
 
 def train(config: Config, directory: Path, progress: Progress) -> learner.LearnerState:
-    """Trains in `directory`, going on from its newest checkpoint if it has one."""
+    """Trains in `directory`, going on from its newest checkpoint if it has one.
+
+    Leaves the policy that did best in an evaluation in `ppo.policy.PARAMS_FILE`, or the last one if there
+    was no evaluation.
+    """
     teacher = config.teacher
     _check(config)
     env = AutoReset(GraspEnv(training_world(config)))
@@ -35,8 +41,9 @@ def train(config: Config, directory: Path, progress: Progress) -> learner.Learne
     with ocp.CheckpointManager((directory / CHECKPOINTS).absolute(), options=options) as manager:
         state = _start(config, env, manager, progress)
         good_evaluations = 0
+        best = _Best(directory)
         if int(state.iteration) == 0:
-            _evaluate(test_env, state, config, 0, progress)
+            best.offer(_evaluate(test_env, state, config, 0, progress), state)
         with progress.task("PPO", total) as task:
             task.start_at(int(state.iteration))
             for i in range(int(state.iteration) + 1, total + 1):
@@ -46,6 +53,7 @@ def train(config: Config, directory: Path, progress: Progress) -> learner.Learne
                 task.advance()
                 if i % teacher.eval_every == 0:
                     rate = _evaluate(test_env, state, config, i, progress)
+                    best.offer(rate, state)
                     good_evaluations = good_evaluations + 1 if rate >= teacher.stop_at else 0
                 if i % teacher.checkpoint_every == 0 or i == total:
                     manager.save(i, args=ocp.args.StandardSave(state), force=True)
@@ -53,7 +61,24 @@ def train(config: Config, directory: Path, progress: Progress) -> learner.Learne
                 if good_evaluations >= 2:
                     progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
                     break
+        best.offer(0.0, state)
     return state
+
+
+class _Best:
+    """Keeps the policy of the best evaluation on disk; the later one of equals."""
+
+    def __init__(self, directory: Path):
+        self._directory = directory
+        self._rate = -1.0
+        if (directory / BEST_RATE).exists() and (directory / PARAMS_FILE).exists():
+            self._rate = float(artifacts.read_json(directory / BEST_RATE))
+
+    def offer(self, rate: float, state: learner.LearnerState) -> None:
+        if rate >= self._rate:
+            self._rate = rate
+            save(self._directory / PARAMS_FILE, state.normalizer, state.params.policy)
+            artifacts.atomic_write_json(self._directory / BEST_RATE, rate)
 
 
 def training_world(config: Config) -> WorldConfig:
