@@ -4,7 +4,7 @@ Stages are imported inside `run`, so that `--help` starts without JAX.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
@@ -84,6 +84,37 @@ class TeacherEval:
         result = evaluate(GraspEnv(config.world), policy, self.trials, self.seed)
         for name, counts in {**result["objects"], "all": result["success"]}.items():
             print(f"{name:<12} {wilson.describe(wilson.success(counts['successes'], counts['n']))}")
+
+
+@dataclass(frozen=True)
+class StudentEval:
+    """Measure a trained student again, closed loop in simulation: clean and generated depth, same seeds."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run."""
+    trials: int = 200
+    """Episodes per kind of depth."""
+    seed: int = 1
+    """Of the episodes."""
+
+    def run(self) -> None:
+        from ddg_jax.sample import Generator
+        from ddgrasp.progress import Progress
+        from evaluation import wilson
+        from ppo.policy import load_policy
+        from student_jax.evaluate import closed_loop
+        from student_jax.policy import PARAMS_FILE
+
+        config = load_config(self.run_dir, "student")
+        evaluation = replace(config.evaluation, student_trials=self.trials)
+        config = replace(config, seed=self.seed, evaluation=evaluation)
+        params = artifacts.load_params(self.run_dir / "student" / PARAMS_FILE)
+        generator = Generator.load(self.run_dir / "ddg")
+        teacher = load_policy(self.run_dir / "teacher")
+        result = closed_loop(config, teacher, generator, params, Progress(name="student eval"))
+        for name, counts in result.items():
+            success = counts["success"]
+            print(f"{name:<14} {wilson.describe(wilson.success(success['successes'], success['n']))}")
 
 
 @dataclass(frozen=True)
@@ -211,6 +242,7 @@ COMMANDS: dict[str, type] = {
     "ddg fit": DDGFit,
     "ddg sample": DDGSample,
     "student train": StudentTrain,
+    "student eval": StudentEval,
     "export": Export,
     "deploy": Deploy,
     "report": Report,

@@ -333,9 +333,9 @@ class StudentConfig:
     aux_stop_gradient: bool = False
     """Keep the action loss from changing the auxiliary predictions."""
     # --- action head (student_jax/denoiser.py) ---
-    chunk: int = 4
+    chunk: int = 2
     """Actions predicted at once."""
-    execute_steps: int = 2
+    execute_steps: int = 1
     """Actions of a chunk that are executed before the policy looks again."""
     state_features: int = 64
     """Width of the joint-state stream."""

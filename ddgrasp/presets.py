@@ -97,8 +97,8 @@ LAPTOP = Config(
     teacher=TeacherConfig(total_steps=500_000, eval_every=10),
     demos=DemosConfig(episodes=240),
     record=RecordConfig(trajectories=36),
-    ddg=DDGConfig(train_steps=1500),
-    student=StudentConfig(train_steps=2000, dagger_rounds=4, dagger_episodes=64, dagger_steps=500, head_steps=6000),
+    ddg=DDGConfig(train_steps=1200),
+    student=StudentConfig(train_steps=1200, dagger_rounds=2, dagger_episodes=48, dagger_steps=400, head_steps=3000),
     evaluation=EvalConfig(rig_trials=100),
 )
 """Everything trained from nothing on two cores."""

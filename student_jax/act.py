@@ -45,6 +45,7 @@ class StudentActor:
     """Acts in `demos.rollout.Roller` and keeps what the student saw.
 
     Args:
+      noise: start of the reverse diffusion, as in `DeployConfig.noise`: zero or normal.
       teacher_share: probability that an action is the teacher's instead.
     """
 
@@ -55,10 +56,12 @@ class StudentActor:
         profile: contract.CameraProfile,
         corrupt: Corrupt,
         rng: np.random.Generator,
+        noise: str = "zero",
         teacher_share: float = 0.0,
     ):
         self._act = partial(_act, config, profile, params)
         self._config, self._corrupt, self._rng, self._teacher_share = config, corrupt, rng, teacher_share
+        self._noise_scale = float(noise == "normal")
         self._chunk = np.zeros(0)
         self.seen_mm: list[np.ndarray] = []
 
@@ -69,8 +72,8 @@ class StudentActor:
         if position == 0:
             frames = [self.seen_mm[max(0, scene.step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)]
             shape = (len(scene.state), self._config.chunk, contract.ACTION_SIZE)
-            noise = self._rng.standard_normal(shape).astype(np.float32)
-            self._chunk = np.asarray(self._act(np.stack(frames, axis=1), scene.state, noise))
+            noise = self._noise_scale * self._rng.standard_normal(shape)
+            self._chunk = np.asarray(self._act(np.stack(frames, axis=1), scene.state, noise.astype(np.float32)))
         action = self._chunk[:, position]
         taught = self._rng.random(len(action)) < self._teacher_share
         return np.where(taught[:, None], scene.expert, action)

@@ -5,6 +5,7 @@ a fit the optimiser's state is saved now and then. All draws are keyed by seed, 
 resumed plan goes the way an uninterrupted one would.
 """
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -103,7 +104,9 @@ class Trainer:
             key = jax.random.key(self._config.seed)
             rng = np.random.default_rng([self._config.seed, _DAGGER_SEED, number])
             camera = DDGCamera(self._generator, key, first=first)
-            actor = StudentActor(self.params, student, self._profile, camera, rng, share)
+            actor = StudentActor(
+                self.params, student, self._profile, camera, rng, self._config.deploy.noise, share
+            )
             roller = Roller(self._config, self._teacher, wanted - first)
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
                 key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
@@ -143,7 +146,8 @@ class Trainer:
 
     def _fit_head(self) -> dict[str, float]:
         """The denoiser alone, on conditions computed once for every frame."""
-        student, profile = self._student, self._profile
+        # Conditions cost nothing here: more of them serve better than more noises for each.
+        student, profile = dataclasses.replace(self._student, noise_draws=1), self._profile
         steps = student.head_steps
         if steps == 0:
             return {}

@@ -29,7 +29,7 @@ def closed_loop(
     metrics = {}
     for name, camera in cameras.items():
         rng = np.random.default_rng([config.seed, _SEED])
-        actor = StudentActor(params, config.student, config.world.profile, camera, rng)
+        actor = StudentActor(params, config.student, config.world.profile, camera, rng, config.deploy.noise)
         with progress.task(f"trials, {name}", roller.steps) as task:
             episodes = roller.run(jax.random.PRNGKey(_SEED + config.seed), actor, lambda _: task.advance())  # noqa: B023
         metrics[name] = _counts(episodes, config.world.objects)
