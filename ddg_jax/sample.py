@@ -28,6 +28,8 @@ SAMPLERS = ("ddim", "ddpm")
 SHARED = 2**31 - 1
 """Stands for the frame number in the key of the noise that an episode's frames share."""
 _ASPECT_TOLERANCE = 0.02
+FARTHEST_SANE_M = 200.0
+"""Simulated depth beyond this is another unit."""
 
 
 @dataclass(frozen=True)
@@ -206,8 +208,8 @@ def _prior(prior: Prior, clean_m: np.ndarray, rgb: np.ndarray | None, one_episod
     """c of one sequence, or of frames that have nothing to do with each other."""
     if one_episode:
         return prior.from_sim(clean_m, rgb)
-    single = [prior.from_sim(clean_m[i : i + 1], None if rgb is None else rgb[i : i + 1]) for i in
-    range(len(clean_m))] return np.concatenate(single)
+    pictures = [None] * len(clean_m) if rgb is None else [picture[None] for picture in rgb]
+    return np.concatenate([prior.from_sim(d[None], p) for d, p in zip(clean_m, pictures, strict=True)])
 
 
 def _filled_up(values: np.ndarray, size: int) -> np.ndarray:
@@ -232,6 +234,11 @@ def _check_depth(depth_m: np.ndarray, config: DDGConfig) -> None:
     if depth_m.ndim != 3 or not np.issubdtype(depth_m.dtype, np.floating):
         raise UserError(
             f"Simulated depth is {depth_m.dtype} {depth_m.shape}; expected (T, H, W) floating-point metres."
+        )
+    if not np.isfinite(depth_m).all() or np.max(depth_m, initial=0) > FARTHEST_SANE_M:
+        raise UserError(
+            f"Simulated depth reaches {np.max(depth_m):g}; expected finite metres, 0 for nothing in range "
+            "(divide millimetres by 1000)."
         )
     aspect, wanted = depth_m.shape[2] / depth_m.shape[1], config.width_px / config.height_px
     if abs(aspect / wanted - 1) > _ASPECT_TOLERANCE:

@@ -120,10 +120,16 @@ def predict_x_0(schedule: Schedule, x_k: ArrayLike, step: ArrayLike, eps: ArrayL
     return jnp.asarray((x_k - jnp.sqrt(1 - a) * eps) / jnp.sqrt(a))
 
 
-def eps_from_velocity(schedule: Schedule, x_k: ArrayLike, step: ArrayLike, velocity: ArrayLike) -> Array:
-    """eps = sqrt(1 - alpha_bar) x_k + sqrt(alpha_bar) v (Salimans & Ho 2022, appendix D)."""
+def eps_from_x_0(schedule: Schedule, x_k: ArrayLike, step: ArrayLike, x_0: ArrayLike) -> Array:
+    """eps = (x_k - sqrt(alpha_bar) x_0) / sqrt(1 - alpha_bar): `q_sample` solved for eps."""
     a = alpha_bar_at(schedule, step, x_k)
-    return jnp.sqrt(1 - a) * x_k + jnp.sqrt(a) * velocity
+    return jnp.asarray((x_k - jnp.sqrt(a) * x_0) / jnp.sqrt(1 - a))
+
+
+def signal_to_noise(schedule: Schedule, step: ArrayLike) -> Array:
+    """alpha_bar / (1 - alpha_bar) at `step`, shaped like `step`."""
+    a = jnp.asarray(schedule.alpha_bars)[jnp.asarray(step)]
+    return a / (1 - a)
 
 
 def posterior_mean(

@@ -25,6 +25,7 @@ WARMUP_STEPS = 50
 FINAL_LEARNING_RATE = 0.05
 """Share of the learning rate left at the end."""
 MAX_GRAD_NORM = 1.0
+SNR_LIMITS = (1.0, 5.0)
 LOG_EVERY = 10
 _CHECKPOINTS_KEPT = 2
 
@@ -83,21 +84,26 @@ def config_schedule(config: DDGConfig) -> diffusion.Schedule:
 def predict_noise(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
     """eps_theta(d_k (+) c, k), (B, H, W).
 
-    The U-Net's output enters as a velocity, so that eps_theta starts as the best guess without a network
-    and the x_0 it implies stays accurate where x_k is nearly pure noise: the place where few-step sampling
-    starts.
+    The U-Net's output enters as the clean map that explains x_k, and eps is what remains: depth given c is
+    smooth but for its holes, so a small network can draw it, while white noise at full resolution would have
+    to pass through all of its bottlenecks.
     """
-    velocity: Any = make_unet(config).apply({"params": params}, x_k, c, step)
-    return diffusion.eps_from_velocity(config_schedule(config), x_k, step, velocity)
+    x_0: Any = make_unet(config).apply({"params": params}, x_k, c, step)
+    return diffusion.eps_from_x_0(config_schedule(config), x_k, step, x_0)
 
 
 def loss_weight(config: DDGConfig, step: Array) -> Array:
-    """Weight of each step's noise error: 1 (the paper) or 1 / alpha_bar (Salimans & Ho 2022, section 4)."""
+    """Weight of each step's noise error, (B,).
+
+    "uniform" is the paper's 1. "truncated" is clip(SNR, 1, 5) / SNR: per unit of error in x_0 no step weighs
+    less than the others' floor (Salimans & Ho 2022, section 4) nor more than a cap (Hang et al. 2023).
+    """
     if config.loss_weight == "uniform":
         return jnp.ones(step.shape)
-    if config.loss_weight == "velocity":
-        return 1 / jnp.asarray(config_schedule(config).alpha_bars)[step]
-    raise unknown_name("loss weight", config.loss_weight, ("uniform", "velocity"))
+    if config.loss_weight == "truncated":
+        snr = diffusion.signal_to_noise(config_schedule(config), step)
+        return jnp.clip(snr, *SNR_LIMITS) / snr
+    raise unknown_name("loss weight", config.loss_weight, ("uniform", "truncated"))
 
 
 def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Array, eps: Array) -> Array:

@@ -73,7 +73,7 @@ class SelfAttention(nn.Module):
 
 
 class UNet(nn.Module):
-    """Maps x_k and the prior c to one number per pixel; `ddg_jax/train.py` turns it into the noise.
+    """Maps x_k and the prior c to the clean map; `ddg_jax/train.py` turns it into the noise.
 
     Args:
       widths: channels per level; every level halves the one before in height and width.
@@ -94,14 +94,21 @@ class UNet(nn.Module):
         height, width = x_k.shape[1:]
         folded = space_to_depth(self._padded(jnp.stack([x_k, c], axis=-1)), self.factor).astype(self.dtype)
         time = self._time_embedding(step)
-        h, skips = self._encode(nn.Conv(self.widths[0], (3, 3), dtype=self.dtype)(folded), time)
+        h, skips = self._encode(nn.Dense(self.widths[0], dtype=self.dtype)(folded), time)
         h = ResBlock(self.widths[-1], self.dtype)(h, time)
         if self.heads:
             h = SelfAttention(self.heads, self.dtype)(h)
         h = ResBlock(self.widths[-1], self.dtype)(h, time)
-        h = nn.silu(self._decode(h, skips, time))
+        h = self._decode(h, skips, time)
+        # How much of x_k may reach the output past the bottlenecks depends on how noisy it is.
+        scale, shift = jnp.split(
+            nn.Dense(2 * self.widths[0], dtype=self.dtype)(time)[:, None, None], 2, axis=-1
+        )
+        h = nn.silu(h * (1 + scale) + shift)
         out = nn.Conv(self.factor**2, (3, 3), dtype=self.dtype, kernel_init=nn.initializers.zeros)(h)
-        out = out + nn.Dense(self.factor**2, dtype=self.dtype, kernel_init=nn.initializers.zeros)(folded)
+        out = out + nn.Dense(self.factor**2, dtype=self.dtype, kernel_init=nn.initializers.zeros)(
+            folded[..., 1::2]
+        )
         return depth_to_space(out, self.factor)[:, :height, :width, 0].astype(jnp.float32)
 
     def _padded(self, x: Array) -> Array:

@@ -100,12 +100,7 @@ def warm_start(state: LearnerState, saved: dict) -> LearnerState:
         raise UserError(
             "The teacher of teacher.init_from has other layers than teacher.hidden asks for: use the same."
         )
-    normalizer = state.normalizer.replace(
-        mean=jp.asarray(saved["mean"]),
-        std=jp.asarray(saved["std"]),
-        summed_variance=jp.asarray(saved["summed_variance"]),
-        count=jp.asarray(saved["count"]).astype(state.normalizer.count.dtype),
-    )
+    normalizer = state.normalizer.replace(mean=jp.asarray(saved["mean"]), std=jp.asarray(saved["std"]))
     return state.replace(params=state.params.replace(policy=policy), normalizer=normalizer)
 
 

@@ -37,8 +37,6 @@ def save(path: Path, normalizer, policy_params) -> None:
         {
             "mean": np.asarray(normalizer.mean),
             "std": np.maximum(np.asarray(normalizer.std), _STD_MIN),
-            "summed_variance": np.asarray(normalizer.summed_variance),
-            "count": np.asarray(normalizer.count, np.float32),
             "layers": {name: {k: np.asarray(v) for k, v in layer.items()} for name, layer in layers.items()},
         },
     )
@@ -63,7 +61,7 @@ def find(directory: Path | str) -> Path:
 
 
 def load_state(directory: Path | str) -> dict:
-    """The saved parameters: normaliser's mean, std, summed_variance and count, and the layers."""
+    """The saved parameters: normaliser's mean and std, and the layers."""
     path = find(directory)
     state = artifacts.load_params(path)
     if state["mean"].shape != (contract.OBSERVATION_SIZE,):

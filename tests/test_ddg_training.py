@@ -132,3 +132,5 @@ def test_ancestral_sampler_and_bad_input(fitted, scene):
         sample.generate(jax.random.key(0), fitted, (scene * 1000).astype(np.uint16))
     with pytest.raises(UserError, match="aspect"):
         sample.generate(jax.random.key(0), fitted, scene[:, :, :16])
+    with pytest.raises(UserError, match="millimetres"):
+        sample.generate(jax.random.key(0), fitted, scene * 1000)
