@@ -12,7 +12,7 @@ from ddgrasp import contract
 from ddgrasp.config import Config
 from mjx_envs import randomize
 from mjx_envs.grasp_env import GraspEnv
-from mjx_envs.visual import Viewer, to_mm
+from mjx_envs.visual import Viewer
 from ppo.policy import TeacherPolicy
 
 Actor = Callable[["Scene"], np.ndarray]
@@ -80,6 +80,9 @@ class Roller:
         self._teacher, self._random, self._with_rgb = teacher, config.world.random, with_rgb
         self._begin = jax.jit(self._begin_batch)
         self._look = jax.jit(self._look_batch)
+        self._pose = jax.jit(self._pose_batch)
+        self._draw_depth = jax.jit(self.viewer.depth_mm)
+        self._draw_rgb = jax.jit(self.viewer.rgb)
         self._advance = jax.jit(jax.vmap(self.env.step))
 
     def run(self, key: jax.Array, actor: Actor, on_step: Callable[[int], None] = lambda _: None) -> Episodes:
@@ -110,8 +113,10 @@ class Roller:
         )  # fmt: skip
 
     def _scene(self, state, cameras, t: int) -> Scene:
-        seen = jax.tree.map(np.asarray, self._look(state, cameras))
-        return Scene(step=t, **seen)
+        geoms = self._pose(state)
+        depth_mm = np.asarray(self._draw_depth(geoms, cameras))
+        rgb = np.asarray(self._draw_rgb(geoms, cameras)) if self._with_rgb else None
+        return Scene(depth_mm=depth_mm, step=t, rgb=rgb, **jax.tree.map(np.asarray, self._look(state)))
 
     def _begin_batch(self, key):
         k_env, k_cam = jax.random.split(key)
@@ -119,27 +124,18 @@ class Roller:
         camera = partial(randomize.sample_camera, config=self._random, T_world_cam=self.viewer.nominal_pose)
         return state, jax.vmap(camera)(jax.random.split(k_cam, self.count))
 
-    def _look_batch(self, state, cameras):
-        episode, qpos = state.info["episode"], state.data.qpos
-
-        def depth(args):
-            return to_mm(self.viewer.depth_m(*args))
-
-        seen = {
-            "depth_mm": jax.lax.map(depth, (qpos, episode.params, cameras)),
-            "state": student_state(qpos),
+    def _look_batch(self, state):
+        return {
+            "state": student_state(state.data.qpos),
             "expert": self._teacher(state.obs, jp),
             "observation": state.obs,
-            "held": episode.grasped,
+            "held": state.info["episode"].grasped,
         }
-        if self._with_rgb:
-            colours = jp.asarray(self.env.table.rgb, jp.float32)[episode.object_index]
 
-            def rgb(args):
-                return jp.round(255 * self.viewer.rgb(*args)).astype(jp.uint8)
-
-            seen["rgb"] = jax.lax.map(rgb, (qpos, episode.params, cameras, colours))
-        return seen
+    def _pose_batch(self, state):
+        episode = state.info["episode"]
+        colours = jp.asarray(self.env.table.rgb, jp.float32)[episode.object_index]
+        return jax.vmap(self.viewer.geoms)(state.data.qpos, episode.params, colours)
 
 
 def student_state(qpos):

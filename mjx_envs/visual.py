@@ -13,7 +13,8 @@ from mjx_envs.visible_geoms import visible_geoms
 
 
 class Viewer:
-    """Draws one environment; vmap its methods, or use `depth_mm` for a batch.
+    """Draws environments. Jit `geoms` and the drawing apart: in one program XLA repeats the kinematics
+    for every chunk of pixels.
 
     Args:
       profile: the camera at the scale wanted.
@@ -53,13 +54,17 @@ class Viewer:
             rgb=jp.asarray(self._rgb).at[self._slots].set(jp.asarray(object_rgb, jp.float32)),
         )
 
-    def depth_m(self, qpos: jax.Array, params: ModelParams, T_world_cam: jax.Array) -> jax.Array:
-        """(H, W) planar depth in metres, 0 where nothing is hit."""
-        return render_depth(self.geoms(qpos, params, jp.zeros(3)), self._seen_from(T_world_cam))
+    def depth_mm(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
+        """(B, H, W) uint16 planar depth of a batch of scenes, 0 where nothing is hit."""
+        return jax.lax.map(lambda a: to_mm(render_depth(a[0], self._seen_from(a[1]))), (geoms, T_world_cam))
 
-    def rgb(self, qpos: jax.Array, params: ModelParams, T_world_cam: jax.Array, object_rgb) -> jax.Array:
-        """(H, W, 3) colour in [0, 1]."""
-        return render(self.geoms(qpos, params, object_rgb), self._seen_from(T_world_cam)).rgb
+    def rgb(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
+        """(B, H, W, 3) uint8 colour of a batch of scenes."""
+
+        def draw(a):
+            return jp.round(255 * render(a[0], self._seen_from(a[1])).rgb).astype(jp.uint8)
+
+        return jax.lax.map(draw, (geoms, T_world_cam))
 
     def _seen_from(self, T_world_cam: jax.Array) -> Camera:
         c = self._camera

@@ -105,7 +105,7 @@ def diffusion_loss(config, policy, params, cond, action, key) -> Array:
 def aux_losses(seen: Aux, target: Aux) -> dict[str, Array]:
     """Position (Huber, network units), yaw (squared), held (cross-entropy)."""
     return {
-        "position": jnp.mean(optax.huber_loss(seen.position, target.position, 0.1)) * 10.0,
+        "position": jnp.mean(optax.huber_loss(seen.position, target.position, delta=0.1)) * 10.0,
         "yaw": jnp.mean((seen.yaw - target.yaw) ** 2),
         "held": jnp.mean(optax.sigmoid_binary_cross_entropy(seen.held_logit, target.held_logit)),
     }
