@@ -89,6 +89,15 @@ def test_ddim_with_eta_one_equals_ddpm():
         np.testing.assert_allclose(ddim, s.ddpm_step(made, x, k, previous, eps, noise, None), atol=2e-5)
 
 
+def test_stochastic_ddim_from_pure_noise_stays_finite():
+    made = s.make_schedule("cosine", 1000)
+    x = jax.random.normal(jax.random.key(0), (2, 3))
+    for count in (2, 3, 7):
+        visited = s.timesteps(made.steps, count, "trailing")
+        for k, previous in zip(visited, s.previous_steps(visited), strict=True):
+            assert np.isfinite(s.ddim_step(made, x, k, previous, x, 1.0, eta=1.0, noise=x)).all(), (count, k)
+
+
 def test_shift_moves_log_snr_by_the_amount():
     plain, moved = s.make_schedule("linear", 100), s.make_schedule("linear", 100, log_snr_shift=-1.5)
     log_snr = [np.log(a / (1 - a)) for a in (plain.alpha_bars, moved.alpha_bars)]
