@@ -188,6 +188,6 @@ def ddim_step(
     x_0 = x_0 if clip is None else jnp.clip(x_0, -clip, clip)
     a_prev = alpha_bar_at(schedule, previous, x_k)
     sigma = eta * jnp.sqrt(posterior_variance(schedule, step, previous, x_k))
-    # Rounding may push the remainder below 0 where a step from pure noise has sigma^2 = 1 - alpha_bar_previous.
+    # A step from pure noise has sigma^2 = 1 - alpha_bar_previous, and rounding may push the rest below 0.
     remainder = jnp.maximum(1 - a_prev - sigma**2, 0.0)
     return jnp.sqrt(a_prev) * x_0 + jnp.sqrt(remainder) * eps + sigma * noise
