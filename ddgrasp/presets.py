@@ -98,8 +98,10 @@ LAPTOP = Config(
     demos=DemosConfig(episodes=240),
     record=RecordConfig(trajectories=36),
     ddg=DDGConfig(train_steps=1200),
-    student=StudentConfig(train_steps=1200, dagger_rounds=2, dagger_episodes=48, dagger_steps=400, head_steps=3000),
-    evaluation=EvalConfig(rig_trials=100),
+    student=StudentConfig(
+        train_steps=800, dagger_rounds=1, dagger_episodes=48, dagger_steps=300, head_steps=2000, clean_share=0.5
+    ),
+    evaluation=EvalConfig(student_trials=60, rig_trials=60),
 )
 """Everything trained from nothing on two cores."""
 
