@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from ddg_jax import normalise
 from ddg_jax import schedule as diffusion
@@ -76,7 +77,7 @@ def frame_noise(
       frame: (B,) int, numbers within the episode.
     """
 
-    def own(e: Array, t: Array) -> Array:
+    def own(e: Array, t: ArrayLike) -> Array:
         return jax.random.normal(jax.random.fold_in(jax.random.fold_in(key, e), t), shape)
 
     over_episodes = None if jnp.ndim(episode) == 0 else 0
@@ -188,6 +189,7 @@ def predict(
     """
     config, size = generator.config, generator.config.sample_batch
     frame = np.arange(len(c)) if frame is None else np.asarray(frame)
+    number = np.asarray(episode)
     parts = []
     for start in range(0, len(c), size):
         now = slice(start, start + size)
@@ -196,7 +198,7 @@ def predict(
             key,
             generator.params,
             jnp.clip(_filled_up(c[now], size), -C_LIMIT, C_LIMIT),
-            jnp.asarray(episode if np.ndim(episode) == 0 else _filled_up(episode[now], size)),
+            jnp.asarray(number if number.ndim == 0 else _filled_up(number[now], size)),
             jnp.asarray(_filled_up(frame[now], size)),
             steps=steps or config.sample_steps,
         )

@@ -135,7 +135,7 @@ class TeacherConfig:
     stop_at: float = 1.0
     """End early once two evaluations in a row reach this success rate."""
     init_from: str = ""
-    """Run directory or pretrained folder whose policy to start from; with total_steps 0 it is used as it is."""
+    """Run directory or pretrained folder whose policy to start from; total_steps 0 uses it as it is."""
 
 
 @dataclass(frozen=True)
@@ -421,7 +421,7 @@ class DeployConfig:
     workspace_upper_m: tuple[float, float, float] = (0.80, 0.45, 0.80)
     """The box's other corner."""
     realtime_trials: int = 3
-    """Trials on the machine's own clock, which time keeping is measured on (success on evaluation.rig_trials)."""
+    """Trials on the machine's own clock, for time keeping (success comes from evaluation.rig_trials)."""
     workers: int = 2
     """Processes that run simulated-clock trials."""
     film_every: int = 6
@@ -445,8 +445,8 @@ class DeployConfig:
             )
         if any(low >= high for low, high in zip(self.workspace_lower_m, self.workspace_upper_m, strict=True)):
             raise UserError(
-                f"deploy.workspace is {self.workspace_lower_m} to {self.workspace_upper_m}; expected the lower "
-                "corner below the upper one in x, y and z."
+                f"deploy.workspace is {self.workspace_lower_m} to {self.workspace_upper_m}; expected the "
+                "lower corner below the upper one in x, y and z."
             )
 
 

@@ -99,7 +99,12 @@ LAPTOP = Config(
     record=RecordConfig(trajectories=36),
     ddg=DDGConfig(train_steps=1200),
     student=StudentConfig(
-        train_steps=800, dagger_rounds=1, dagger_episodes=48, dagger_steps=300, head_steps=2000, clean_share=0.5
+        train_steps=800,
+        dagger_rounds=1,
+        dagger_episodes=48,
+        dagger_steps=300,
+        head_steps=2000,
+        clean_share=0.5,
     ),
     evaluation=EvalConfig(student_trials=60, rig_trials=60),
 )
@@ -113,7 +118,8 @@ PAPER = Config(
     record=RecordConfig(trajectories=80),
     ddg=_PAPER_DDG,
     student=StudentConfig(
-        input_height_px=225, input_width_px=290, stem="conv7", width=64, stage_blocks=(2, 2, 2, 2), output_stride=16,
+        input_height_px=225, input_width_px=290, stem="conv7", width=64, stage_blocks=(2, 2, 2, 2),
+        output_stride=16,
         train_steps=40_000, batch_size=256, dagger_rounds=6, dagger_episodes=512, dagger_steps=5000,
         head_steps=20_000, crop_shift_px=12,
     ),

@@ -58,6 +58,11 @@ def look_at(position_m, target_m) -> np.ndarray:
 def nominal_camera(profile: contract.CameraProfile) -> Camera:
     """The contract's camera at its nominal place, with `profile`'s pixels."""
     return Camera(
-        profile.fx_px, profile.fy_px, profile.cx_px, profile.cy_px, profile.height_px, profile.width_px,
+        profile.fx_px,
+        profile.fy_px,
+        profile.cx_px,
+        profile.cy_px,
+        profile.height_px,
+        profile.width_px,
         look_at(contract.CAMERA_POSITION_M, contract.CAMERA_LOOK_AT_M),
     )

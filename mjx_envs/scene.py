@@ -93,8 +93,8 @@ def _arm_xml(depth: int = 0) -> str:
     return f"""
     <body name="{link.name}" pos="{_fmt(link.pos_m)}" quat="{_fmt(link.quat)}" gravcomp="1">
       <inertial mass="{link.mass_kg}" pos="{_fmt(link.com_m)}" fullinertia="{_fmt(link.fullinertia_kg_m2)}"/>
-      <joint name="{contract.ARM_JOINTS[depth]}" axis="0 0 1" range="{lower} {upper}" damping="{JOINT_DAMPING_NMS_RAD}"
-             frictionloss="0.1" armature="{ARM_ARMATURE_KG_M2}"/>
+      <joint name="{contract.ARM_JOINTS[depth]}" axis="0 0 1" range="{lower} {upper}"
+             damping="{JOINT_DAMPING_NMS_RAD}" frictionloss="0.1" armature="{ARM_ARMATURE_KG_M2}"/>
       {geoms}{_arm_xml(depth + 1)}
     </body>"""
 
@@ -177,11 +177,12 @@ def scene_xml(sim_dt_s: float = 0.005) -> str:
     <default class="arm"><geom contype="0" conaffinity="0" group="1" rgba="0.92 0.92 0.92 1"/></default>
     <default class="hand"><geom contype="1" conaffinity="0" group="1" rgba="0.85 0.85 0.85 1"/></default>
     <default class="pad">
-      <geom contype="1" conaffinity="0" group="1" condim="4" friction="{PAD_FRICTION} 0.01 0.0001" priority="0"
-            solref="{2 * sim_dt_s} 1" rgba="0.15 0.15 0.15 1"/>
+      <geom contype="1" conaffinity="0" group="1" condim="4"
+            friction="{PAD_FRICTION} 0.01 0.0001" solref="{2 * sim_dt_s} 1" rgba="0.15 0.15 0.15 1"/>
     </default>
     <default class="slot">
-      <geom contype="1" conaffinity="1" group="1" condim="4" friction="0.9 0.005 0.0001" solref="{2 * sim_dt_s} 1"/>
+      <geom contype="1" conaffinity="1" group="1" condim="4" friction="0.9 0.005 0.0001"
+            solref="{2 * sim_dt_s} 1"/>
     </default>
   </default>
   <visual><global offwidth="1280" offheight="720"/><map znear="0.02" zfar="20"/></visual>

@@ -115,8 +115,12 @@ def iteration(
     policy = ppo_networks.make_inference_fn(networks)((state.normalizer, state.params.policy))
     env_state, data, outcome = _unroll(env, env_state, policy, k_unroll, config.unroll_steps)
     normalizer = state.normalizer
-    if not (config.clone_rounds or config.init_from):  # a policy that acts already would be put off by new scales
-        normalizer = running_statistics.update(normalizer, data.observation, std_min_value=OBSERVATION_STD_MIN)
+    if not (
+        config.clone_rounds or config.init_from
+    ):  # a policy that acts already would be put off by new scales
+        normalizer = running_statistics.update(
+            normalizer, data.observation, std_min_value=OBSERVATION_STD_MIN
+        )
     (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state)
     new = LearnerState(params, normalizer, opt_state, env_state, state.key, state.iteration + 1)
     return new, losses | outcome

@@ -25,9 +25,11 @@ _SEED = 60_000
 def clone_guide(
     config: TeacherConfig, env: GraspEnv, state: learner.LearnerState, seed: int, progress: Progress
 ) -> learner.LearnerState:
-    """`state` with the guide's policy and its observations' statistics; critic and environments as they were."""
+    """`state` with the guide's policy and its observations' statistics; critic and environments stay."""
     policy, normalizer = state.params.policy, state.normalizer
-    optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, config.clone_rounds * config.clone_steps))
+    optimizer = optax.adam(
+        optax.cosine_decay_schedule(LEARNING_RATE, config.clone_rounds * config.clone_steps)
+    )
     opt_state = optimizer.init(policy)
     observations, labels = [], []
     rng = np.random.default_rng([seed, _SEED])
@@ -52,7 +54,7 @@ def clone_guide(
 
 
 class _Collector:
-    """Whole episodes acted by a mix of guide and policy. Host loop: one program for all was 20 times slower."""
+    """Whole episodes acted by a mix of guide and policy. A host loop over small programs."""
 
     def __init__(self, env: GraspEnv, count: int):
         self._count, self._steps = count, env.config.episode_steps
@@ -72,7 +74,9 @@ class _Collector:
             observations.append(seen[alive])
             labels.append(label[alive])
             guided = rng.random((self._count, 1)) < guide_share
-            noise = ACTION_NOISE * rng.standard_normal(label.shape) * (rng.random((self._count, 1)) < NOISE_SHARE)
+            noise = (
+                ACTION_NOISE * rng.standard_normal(label.shape) * (rng.random((self._count, 1)) < NOISE_SHARE)
+            )
             noise[:, 7] = 0.0
             action = np.clip(np.where(guided, label, policy(seen)) + noise, -1, 1)
             state = self._step(state, action.astype(np.float32))

@@ -24,7 +24,7 @@ def keep_clean(depth_mm: np.ndarray, step: int) -> np.ndarray:
 
 
 class DDGCamera:
-    """Generated artefacts for environments in lock-step: environment i is episode `first + i` of the generator.
+    """Generated artefacts for environments in lock-step: number i is episode `first + i` of the generator.
 
     Frames of one environment share noise over time, as the generator's episodes do.
     """
@@ -73,7 +73,9 @@ class StudentActor:
             frames = [self.seen_mm[max(0, scene.step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)]
             shape = (len(scene.state), self._config.chunk, contract.ACTION_SIZE)
             noise = self._noise_scale * self._rng.standard_normal(shape)
-            self._chunk = np.asarray(self._act(np.stack(frames, axis=1), scene.state, noise.astype(np.float32)))
+            self._chunk = np.asarray(
+                self._act(np.stack(frames, axis=1), scene.state, noise.astype(np.float32))
+            )
         action = self._chunk[:, position]
         taught = self._rng.random(len(action)) < self._teacher_share
         return np.where(taught[:, None], scene.expert, action)

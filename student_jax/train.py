@@ -1,4 +1,4 @@
-"""Training the student: diffusion loss on the teacher's labels, privileged auxiliary losses (paper III-C3)."""
+"""Training the student: diffusion loss on the teacher's labels, privileged auxiliary losses (III-C3)."""
 
 from functools import partial
 from typing import Any

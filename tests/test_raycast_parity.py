@@ -172,9 +172,7 @@ def test_numpy_and_jax_agree(make_scene, make_camera) -> None:
         off = np.abs(np.asarray(actual.normal_w) - expected.normal_w).max(axis=-1)[same] > 1e-3
         assert off.mean() < 1e-3  # creases of boxes and cylinders
         np.testing.assert_allclose(actual.rgb[same][~off], expected.rgb[same][~off], atol=1e-3)
-        np.testing.assert_array_equal(
-            raycast_numpy.render_depth(model, data, camera), expected.depth_m
-        )
+        np.testing.assert_array_equal(raycast_numpy.render_depth(model, data, camera), expected.depth_m)
         depth = raycast.render_depth(geoms, camera)
         assert (abs(depth - actual.depth_m) > 2e-5).mean() < 5e-4
 

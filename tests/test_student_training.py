@@ -32,7 +32,8 @@ def frames_of(lengths=(3, 2)):
         observation[:, 37] = np.sin(0.1)
         columns.append(
             (
-                np.full((n, PROFILE.height_px, PROFILE.width_px), 700, np.uint16) + numbers[:, None, None].astype(np.uint16),
+                np.full((n, PROFILE.height_px, PROFILE.width_px), 700, np.uint16)
+                + numbers[:, None, None].astype(np.uint16),
                 np.repeat(numbers[:, None], 8, axis=1),
                 np.repeat(numbers[:, None], 8, axis=1) / 10,
                 observation,
@@ -44,12 +45,16 @@ def frames_of(lengths=(3, 2)):
 
 def test_the_first_frame_is_repeated_and_episodes_do_not_mix():
     stack = frames_of().depth_stack(np.array([0, 2, 3, 4]))
-    np.testing.assert_array_equal(stack[:, :, 0, 0], [[700, 700, 700], [700, 701, 702], [703, 703, 703], [703, 703, 704]])
+    np.testing.assert_array_equal(
+        stack[:, :, 0, 0], [[700, 700, 700], [700, 701, 702], [703, 703, 703], [703, 703, 704]]
+    )
 
 
 def test_chunks_repeat_an_episodes_last_label():
     chunks = frames_of().action_chunks(np.array([0, 2, 4]), 3)
-    np.testing.assert_allclose(chunks[:, :, 0], [[0.0, 0.1, 0.2], [0.2, 0.2, 0.2], [0.4, 0.4, 0.4]], atol=1e-6)
+    np.testing.assert_allclose(
+        chunks[:, :, 0], [[0.0, 0.1, 0.2], [0.2, 0.2, 0.2], [0.4, 0.4, 0.4]], atol=1e-6
+    )
 
 
 def test_privileged_targets_come_from_the_observation():
@@ -80,7 +85,9 @@ def test_auxiliary_losses_by_hand():
     seen = Aux(jnp.array([[0.3, 0.0, 0.0]]), jnp.array([[1.0, 0.0]]), jnp.array([0.0]))
     target = Aux(jnp.array([[0.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0]]), jnp.array([1.0]))
     losses = train.aux_losses(seen, target)
-    assert float(losses["position"]) == pytest.approx(10 * 0.1 * (0.3 - 0.05) / 3, rel=1e-5)  # Huber, delta 0.1
+    assert float(losses["position"]) == pytest.approx(
+        10 * 0.1 * (0.3 - 0.05) / 3, rel=1e-5
+    )  # Huber, delta 0.1
     assert float(losses["yaw"]) == pytest.approx(1.0)
     assert float(losses["held"]) == pytest.approx(np.log(2), rel=1e-5)
 

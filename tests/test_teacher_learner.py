@@ -19,7 +19,9 @@ TEACHER = TeacherConfig(
     total_steps=4 * 8 * 4, num_envs=8, unroll_steps=4, minibatches=2, epochs=1, hidden=(16,), eval_every=100,
     checkpoint_every=2, pregrasp_share=0.0,
 )  # fmt: skip
-CONFIG = Config("test", world=WorldConfig(episode_steps=6), teacher=TEACHER, evaluation=EvalConfig(teacher_trials=4))
+CONFIG = Config(
+    "test", world=WorldConfig(episode_steps=6), teacher=TEACHER, evaluation=EvalConfig(teacher_trials=4)
+)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +37,9 @@ def test_resume_equals_an_uninterrupted_run_to_the_bit(uninterrupted, tmp_path, 
     ppo_train.train(CONFIG, tmp_path, Progress(quiet=True))
     monkeypatch.setattr(ppo_train.learner, "iterations", lambda config: rounds)
     resumed = ppo_train.train(CONFIG, tmp_path, Progress(quiet=True))
-    for whole, again in zip(jax.tree.leaves(uninterrupted.params), jax.tree.leaves(resumed.params), strict=True):
+    for whole, again in zip(
+        jax.tree.leaves(uninterrupted.params), jax.tree.leaves(resumed.params), strict=True
+    ):
         np.testing.assert_array_equal(np.asarray(whole), np.asarray(again))
 
 
@@ -51,7 +55,9 @@ def test_saved_policy_acts_as_braxs_deterministic_policy(uninterrupted, tmp_path
 
 
 def test_warm_start_takes_the_policy_and_refuses_other_sizes(uninterrupted, tmp_path):
-    teacher_policy.save(tmp_path / teacher_policy.PARAMS_FILE, uninterrupted.normalizer, uninterrupted.params.policy)
+    teacher_policy.save(
+        tmp_path / teacher_policy.PARAMS_FILE, uninterrupted.normalizer, uninterrupted.params.policy
+    )
     saved = teacher_policy.load_state(tmp_path)
     started = learner.warm_start(uninterrupted, saved)
     for a, b in zip(

@@ -88,7 +88,9 @@ def test_inverse_kinematics_reaches_the_pose():
 
 
 def test_randomisation_stays_in_range_and_moves_only_what_it_should(table):
-    config = RandomConfig(size=0.1, object_mass=0.0, object_friction=0.0, link_mass=0.0, damping=0.0, stiffness=0.0)
+    config = RandomConfig(
+        size=0.1, object_mass=0.0, object_friction=0.0, link_mass=0.0, damping=0.0, stiffness=0.0
+    )
     keys = jax.random.split(jax.random.PRNGKey(1), 200)
     params, size = jax.vmap(lambda k: randomize.sample_params(k, config, table, 0))(keys)
     assert 0.9 <= float(size.min()) < 0.92 and 1.08 < float(size.max()) <= 1.1

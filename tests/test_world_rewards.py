@@ -7,8 +7,8 @@ from ddgrasp.config import RewardConfig
 from mjx_envs import rewards
 
 W = RewardConfig(
-    reach=2.0, lift=3.0, orient=0.5, accel=0.1, bonus_base=1.5, bonus_growth=2.0, bonus_max_count=3, align=0.25,
-    grasp=1.0, saturation=0.01, toggle=0.2,
+    reach=2.0, lift=3.0, orient=0.5, accel=0.1, bonus_base=1.5, bonus_growth=2.0, bonus_max_count=3,
+    align=0.25, grasp=1.0, saturation=0.01, toggle=0.2,
 )  # fmt: skip
 
 
@@ -60,8 +60,13 @@ def test_saturation_and_toggle():
 
 def test_every_sideways_step_towards_the_object_shortens_the_way():
     grasp = jp.array([0.5, 0.0, 0.03])
-    way = [float(rewards.approach_distance(jp.array([0.5 + x, 0.0, 0.03 + 0.07]), grasp)) for x in (0.2, 0.15, 0.1)]
+    way = [
+        float(rewards.approach_distance(jp.array([0.5 + x, 0.0, 0.03 + 0.07]), grasp))
+        for x in (0.2, 0.15, 0.1)
+    ]
     assert way == sorted(way, reverse=True)
-    near = [float(rewards.approach_distance(jp.array([0.5 + x, 0.0, 0.06]), grasp)) for x in (0.05, 0.03, 0.01)]
+    near = [
+        float(rewards.approach_distance(jp.array([0.5 + x, 0.0, 0.06]), grasp)) for x in (0.05, 0.03, 0.01)
+    ]
     assert near == sorted(near, reverse=True)
     assert float(rewards.approach_distance(grasp, grasp)) < 1e-4

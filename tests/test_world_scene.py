@@ -76,7 +76,9 @@ def test_grasp_pose_closes_along_the_objects_y_axis():
     np.testing.assert_allclose(kinematics.rotate(grasp, np.array([0.0, 0, 1])), [0, 0, -1], atol=1e-9)
 
 
-@pytest.mark.parametrize(("yaw", "symmetry", "expected"), [(1.0, 4, 1.0 - np.pi / 2), (2.0, 2, 2.0 - np.pi), (2.0, 0, 0.0)])
+@pytest.mark.parametrize(
+    ("yaw", "symmetry", "expected"), [(1.0, 4, 1.0 - np.pi / 2), (2.0, 2, 2.0 - np.pi), (2.0, 0, 0.0)]
+)
 def test_the_hand_turns_least(yaw, symmetry, expected):
     quat = kinematics.quat_about_z(np.array(yaw))
     branch = grasp_math.yaw_branch(quat, np.array(symmetry))
