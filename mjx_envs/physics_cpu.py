@@ -76,4 +76,5 @@ class _HostBatch:
             if name not in self._expanded:
                 self._expanded[name] = self._batch.expand(name)
             self._expanded[name][changed] = value
+        self._batch.set_const(ids=np.flatnonzero(changed))  # inertia that MuJoCo precomputes for free bodies
         self._params = jax.tree.map(np.array, params)

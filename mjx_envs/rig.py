@@ -46,6 +46,7 @@ class RigWorld:
         self._spec = self.objects[object_name]
         size = self._set_object(rng)
         self._set_dynamics(rng)
+        mujoco.mj_setConst(self.model, self.data)  # inertia that MuJoCo precomputes for free bodies
         mujoco.mj_resetData(self.model, self.data)
         self._set_pose(rng, self._spec.rest_height_m * size)
         mujoco.mj_forward(self.model, self.data)

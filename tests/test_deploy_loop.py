@@ -204,6 +204,7 @@ def test_chunk_playback_runs_the_network_only_when_due(tmp_path):
 
 
 def test_ctrl_c_holds_and_stops_the_robot(tmp_path):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background
     clock = RealClock()
     loop, robot, camera = make_loop(tmp_path, [depth_mm()], clock, settings=LoopSettings(period_s=0.02))
     threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()

@@ -1,5 +1,6 @@
 """PPO: exact resume, the saved policy is the trained one, warm start."""
 
+import contextlib
 import dataclasses
 
 import jax
@@ -17,7 +18,7 @@ from ppo import train as ppo_train
 
 TEACHER = TeacherConfig(
     total_steps=4 * 8 * 4, num_envs=8, unroll_steps=4, minibatches=2, epochs=1, hidden=(16,), eval_every=100,
-    checkpoint_every=2, pregrasp_share=0.0,
+    checkpoint_every=2, pregrasp_share=0.0, clone_rounds=0, critic_warmup=0,
 )  # fmt: skip
 CONFIG = Config(
     "test", world=WorldConfig(episode_steps=6), teacher=TEACHER, evaluation=EvalConfig(teacher_trials=4)
@@ -30,16 +31,36 @@ def uninterrupted(tmp_path_factory):
     return ppo_train.train(CONFIG, directory, Progress(quiet=True))
 
 
-def test_resume_equals_an_uninterrupted_run_to_the_bit(uninterrupted, tmp_path, monkeypatch):
-    rounds = learner.iterations(TEACHER)
-    assert rounds == 4
-    monkeypatch.setattr(ppo_train.learner, "iterations", lambda config: 2)
-    ppo_train.train(CONFIG, tmp_path, Progress(quiet=True))
-    monkeypatch.setattr(ppo_train.learner, "iterations", lambda config: rounds)
+class _StopsAfter(Progress):
+    """Raises KeyboardInterrupt at the given advance of a bar."""
+
+    def __init__(self, advances):
+        super().__init__(quiet=True)
+        self.left = advances
+
+    @contextlib.contextmanager
+    def task(self, label, total):
+        with super().task(label, total) as task:
+            advance = task.advance
+
+            def counted(n=1, **shown):
+                self.left -= n
+                if self.left == 0:
+                    raise KeyboardInterrupt
+                advance(n, **shown)
+
+            task.advance = counted
+            yield task
+
+
+def test_resume_equals_an_uninterrupted_run_to_the_bit(uninterrupted, tmp_path):
+    assert learner.iterations(TEACHER) == 4
+    with pytest.raises(KeyboardInterrupt):
+        ppo_train.train(CONFIG, tmp_path, _StopsAfter(3))  # after the checkpoint of iteration 2
     resumed = ppo_train.train(CONFIG, tmp_path, Progress(quiet=True))
-    for whole, again in zip(
-        jax.tree.leaves(uninterrupted.params), jax.tree.leaves(resumed.params), strict=True
-    ):
+    assert int(resumed.iteration) == 4
+    pairs = zip(jax.tree.leaves(uninterrupted.params), jax.tree.leaves(resumed.params), strict=True)
+    for whole, again in pairs:
         np.testing.assert_array_equal(np.asarray(whole), np.asarray(again))
 
 
