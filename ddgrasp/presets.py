@@ -90,7 +90,7 @@ DEMO = Config(
         learning_rate=3e-4,
     ),
 )
-"""A real result in well under 45 minutes on two cores; the student starts from the laptop preset's."""
+"""For two cores within 45 minutes (not yet timed as a whole); the student starts from the pretrained one."""
 
 LAPTOP = Config(
     preset="laptop",

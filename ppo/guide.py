@@ -1,8 +1,8 @@
 """A hand-written controller that grasps from above: where PPO starts, not what is deployed.
 
 It reads the teacher's observation and walks waypoints by inverse kinematics. Cloned into the policy
-network it spares PPO the search (from scratch 6 M steps found no lift), and its motions are what a
-student can copy: from above, unhurried, the object in view.
+network it spares PPO the search (from scratch 6 M steps found no grasp, at the 10 ms physics of then),
+and its motions are what a student can copy: from above, unhurried, the object in view.
 """
 
 import jax
