@@ -10,8 +10,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ORDER = (
-    "ddgrasp", "mjx_envs", "ppo", "demos", "sensors", "ddg_jax", "student_jax", "export", "deploy",
-    "evaluation",
+    "ddgrasp", "mjx_envs", "ppo", "demos", "sensors", "foundation", "ddg_jax", "student_jax", "export",
+    "deploy", "evaluation",
 )  # fmt: skip
 """A package imports itself and those before it."""
 LAZY = {"ddgrasp.pipeline", "ddgrasp.commands", "ddgrasp.cli"}

@@ -1,0 +1,172 @@
+"""Converted weights on disk: a folder per network with an Orbax checkpoint and a manifest, written last.
+
+`manifest.json` says which published file the numbers came from (its SHA-256), under which licence, and which
+network they belong to. Reading it needs no JAX.
+"""
+
+import hashlib
+import json
+import shutil
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import artifacts
+from ddgrasp.errors import UserError
+from foundation import catalog
+
+MANIFEST = "manifest.json"
+CHECKPOINT = "variables"
+WEIGHTS_DIR = Path("weights")
+"""Where converted weights go and are looked for, unless told otherwise."""
+FORMAT_VERSION = 1
+_READ_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class WeightsManifest:
+    """Where converted weights came from."""
+
+    network: str
+    """A name of foundation/catalog.py."""
+    source_file: str
+    source_sha256: str
+    licence: str
+    published: str
+    parameters: int
+    """How many numbers."""
+    max_depth_m: float
+    """0, or the range of weights trained for metric depth."""
+    versions: dict[str, str]
+    created: str
+    """UTC time of the conversion."""
+    format_version: int = FORMAT_VERSION
+
+    def summary(self) -> dict[str, str]:
+        """What reports say about weights that were used."""
+        return {"network": self.network, "source_sha256": self.source_sha256, "licence": self.licence}
+
+
+BUILT_IN = "built-in"
+"""What reports say where no published weights were used."""
+
+
+def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float = 0.0) -> Path:
+    """Converts a published checkpoint into a folder of `weights_dir`, which is returned.
+
+    An earlier conversion of the same network is replaced once the new one is complete.
+
+    Args:
+      max_depth_m: range of the model if its weights are of a metric variant, whose keys are the same.
+
+    Raises UserError for a file that is damaged or does not fit a known network.
+    """
+    from foundation.checkpoint_files import read_checkpoint
+    from foundation.convert import convert, recognise
+
+    arrays = read_checkpoint(file)
+    network = recognise({key: tuple(array.shape) for key, array in arrays.items()})
+    _check_metric(file, network, max_depth_m)
+    variables = convert(network, arrays)
+    directory = weights_dir / network
+    (directory / MANIFEST).unlink(missing_ok=True)
+    _save(directory / CHECKPOINT, variables)
+    entry = catalog.get_entry(network)
+    manifest = WeightsManifest(
+        network=network,
+        source_file=file.name,
+        source_sha256=_sha256(file),
+        licence=catalog.METRIC_NOTE if max_depth_m else entry.licence,
+        published=entry.published,
+        parameters=_count(variables["params"]),
+        max_depth_m=max_depth_m,
+        versions=artifacts.library_versions(),
+        created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    )
+    artifacts.atomic_write_json(directory / MANIFEST, asdict(manifest))
+    return directory
+
+
+def read_manifest(directory: Path) -> WeightsManifest:
+    """The manifest of converted weights; UserError, with the remedy, if there are none."""
+    path = directory / MANIFEST
+    if not path.exists():
+        raise UserError(
+            f"{directory} holds no converted weights: get a file that `ddgrasp weights list` names and run "
+            "`ddgrasp weights convert FILE`."
+        )
+    value = json.loads(path.read_text())
+    if not isinstance(value, dict) or value.get("format_version") != FORMAT_VERSION:
+        raise UserError(f"{path} was written by another version of this project: convert the weights again.")
+    return WeightsManifest(**value)
+
+
+def load(directory: Path, families: tuple[str, ...] = ()) -> tuple[WeightsManifest, dict[str, Any]]:
+    """Manifest and Flax variables (NumPy float32) of converted weights.
+
+    Args:
+      families: networks, or families of depth networks, of which it must be one; any if empty.
+
+    Raises UserError if there are none, of another network, or damaged.
+    """
+    from foundation.convert import variable_shapes
+
+    manifest = read_manifest(directory)
+    if families and not any(manifest.network.startswith(family) for family in families):
+        raise UserError(f"{directory} holds weights of {manifest.network}; expected {' or '.join(families)}.")
+    return manifest, _restore(directory / CHECKPOINT, variable_shapes(manifest.network))
+
+
+def installed(weights_dir: Path = WEIGHTS_DIR) -> dict[str, WeightsManifest]:
+    """Network -> manifest of every conversion in `weights_dir`."""
+    found = (read_manifest(path.parent) for path in sorted(weights_dir.glob(f"*/{MANIFEST}")))
+    return {manifest.network: manifest for manifest in found}
+
+
+def _check_metric(file: Path, network: str, max_depth_m: float) -> None:
+    if max_depth_m and not network.startswith(catalog.IMAGE_DEPTH):
+        raise UserError(f"max_depth_m is {max_depth_m:g}, but {network} has no metric variant of this kind.")
+    if "metric" in file.name and network.startswith(catalog.IMAGE_DEPTH) and not max_depth_m:
+        raise UserError(
+            f"{file.name} looks like a metric depth model, whose range is not in the file: give "
+            "--max-depth-m (20 for indoor, 80 for outdoor models)."
+        )
+
+
+def _save(path: Path, variables: dict[str, Any]) -> None:
+    import orbax.checkpoint as ocp
+
+    shutil.rmtree(path, ignore_errors=True)
+    with ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(path.absolute(), variables)
+
+
+def _restore(path: Path, shapes: dict[str, Any]) -> dict[str, Any]:
+    import jax
+    import numpy as np
+    import orbax.checkpoint as ocp
+
+    target = jax.tree.map(lambda leaf: np.zeros((), np.float32), shapes)
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            variables = checkpointer.restore(path.absolute(), target)
+    except (ValueError, FileNotFoundError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{path} is damaged ({reason}): convert the weights again.") from None
+    wrong = jax.tree.map(lambda leaf, wanted: leaf.shape != wanted.shape, variables, shapes)
+    if any(jax.tree.leaves(wrong)):
+        raise UserError(f"{path} has arrays of other shapes than the network: convert the weights again.")
+    return variables
+
+
+def _count(tree: dict[str, Any]) -> int:
+    return sum(_count(value) if isinstance(value, dict) else int(value.size) for value in tree.values())
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while part := file.read(_READ_BYTES):
+            digest.update(part)
+    return digest.hexdigest()
