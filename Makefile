@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= runs/demo
 
-.PHONY: help setup lock test demo check format clean-venv
+.PHONY: help setup lock test test-parity demo check format clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -31,6 +31,9 @@ lock:  ## resolve requirements.lock anew (needs uv on PATH)
 
 test: setup  ## run the tests (trains the debug preset end to end)
 	$(BIN)/python -m pytest $(ARGS)
+
+test-parity: setup  ## foundation networks against recorded values (PARITY_DIR=folder of fixtures)
+	$(BIN)/python -m pytest tests/test_foundation_parity.py $(ARGS)
 
 demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)
