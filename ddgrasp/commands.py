@@ -218,6 +218,50 @@ class Deploy:
 
 
 @dataclass(frozen=True)
+class WeightsConvert:
+    """Convert a published checkpoint (.pth, .safetensors) of a depth network, ResNet-18 or FID Inception."""
+
+    file: tyro.conf.Positional[Path]
+    """File as `ddgrasp weights list` names it; what is pickled in it is not run."""
+    out: Path = Path("weights")
+    """Folder of converted weights; each network gets a folder in it."""
+    max_depth_m: float = 0.0
+    """Range of a metric depth model in metres (20 indoor, 80 outdoor); 0 for the relative ones."""
+
+    def run(self) -> None:
+        from foundation import store
+
+        directory = store.convert_file(self.file, self.out, self.max_depth_m)
+        manifest = store.read_manifest(directory)
+        print(
+            f"{directory}: {manifest.network}, {manifest.parameters:,} numbers\nLicence: {manifest.licence}"
+        )
+
+
+@dataclass(frozen=True)
+class WeightsList:
+    """List networks with published weights: where to get them, their licence, what is installed."""
+
+    out: Path = Path("weights")
+    """Folder of converted weights."""
+
+    def run(self) -> None:
+        from foundation import catalog, store
+
+        there = store.installed(self.out)
+        for name, entry in catalog.ENTRIES.items():
+            manifest = there.get(name)
+            state = (
+                f"installed in {self.out / name}, from {manifest.source_file}"
+                if manifest
+                else "not installed"
+            )
+            lines = {"file": entry.file, "published": entry.published, "licence": entry.licence}
+            lines |= {"used for": entry.used_for, "here": state}
+            print(name, *(f"  {title:<10} {text}" for title, text in lines.items()), "", sep="\n")
+
+
+@dataclass(frozen=True)
 class Report:
     """Write report.json and report.html of a run anew, and print the table."""
 
@@ -245,6 +289,8 @@ COMMANDS: dict[str, type] = {
     "student eval": StudentEval,
     "export": Export,
     "deploy": Deploy,
+    "weights convert": WeightsConvert,
+    "weights list": WeightsList,
     "report": Report,
 }
 

@@ -69,9 +69,9 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float
     network = recognise({key: tuple(array.shape) for key, array in arrays.items()})
     _check_metric(file, network, max_depth_m)
     variables = convert(network, arrays)
-    directory = weights_dir / network
-    (directory / MANIFEST).unlink(missing_ok=True)
-    _save(directory / CHECKPOINT, variables)
+    directory, fresh = weights_dir / network, weights_dir / f".tmp-{network}"
+    shutil.rmtree(fresh, ignore_errors=True)
+    _save(fresh / CHECKPOINT, variables)
     entry = catalog.get_entry(network)
     manifest = WeightsManifest(
         network=network,
@@ -84,7 +84,9 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float
         versions=artifacts.library_versions(),
         created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     )
-    artifacts.atomic_write_json(directory / MANIFEST, asdict(manifest))
+    artifacts.atomic_write_json(fresh / MANIFEST, asdict(manifest))
+    shutil.rmtree(directory, ignore_errors=True)
+    fresh.rename(directory)
     return directory
 
 
@@ -120,7 +122,7 @@ def load(directory: Path, families: tuple[str, ...] = ()) -> tuple[WeightsManife
 
 def installed(weights_dir: Path = WEIGHTS_DIR) -> dict[str, WeightsManifest]:
     """Network -> manifest of every conversion in `weights_dir`."""
-    found = (read_manifest(path.parent) for path in sorted(weights_dir.glob(f"*/{MANIFEST}")))
+    found = (read_manifest(path.parent) for path in sorted(weights_dir.glob(f"[!.]*/{MANIFEST}")))
     return {manifest.network: manifest for manifest in found}
 
 
@@ -137,7 +139,6 @@ def _check_metric(file: Path, network: str, max_depth_m: float) -> None:
 def _save(path: Path, variables: dict[str, Any]) -> None:
     import orbax.checkpoint as ocp
 
-    shutil.rmtree(path, ignore_errors=True)
     with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path.absolute(), variables)
 

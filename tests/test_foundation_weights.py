@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import checkpoint_support as files
 import parity_support as parity
 
+from ddgrasp.cli import main
 from ddgrasp.errors import UserError
 from foundation import catalog, convert, store
 from foundation.checkpoint_files import read_checkpoint
@@ -224,3 +225,24 @@ def test_the_catalog_states_licences():
         assert free != ("non-commercial" in entry.licence), name
     with pytest.raises(UserError, match="Did you mean 'resnet18'"):
         catalog.get_entry("resnet81")
+
+
+# --- the command line ----------------------------------------------------------------------------
+
+
+def test_convert_and_list(tmp_path, capsys, resnet18):
+    assert main(["weights", "list", "--out", str(tmp_path / "weights")]) == 0
+    listed = capsys.readouterr().out
+    assert listed.count("not installed") == len(catalog.ENTRIES)
+    for name, entry in catalog.ENTRIES.items():
+        assert name in listed and entry.file in listed and entry.licence in listed
+    file = tmp_path / "resnet18-f37072fd.pth"
+    files.write_pth(file, resnet18)
+    assert main(["weights", "convert", str(file), "--out", str(tmp_path / "weights")]) == 0
+    assert "resnet18, 11,689,512 numbers" in capsys.readouterr().out
+    assert main(["weights", "list", "--out", str(tmp_path / "weights")]) == 0
+    assert f"installed in {tmp_path / 'weights' / 'resnet18'}, from {file.name}" in capsys.readouterr().out
+    files.write_pth(file, resnet18 | {"layer9.weight": np.zeros(3, np.float32)})
+    assert main(["weights", "convert", str(file), "--out", str(tmp_path / "weights")]) == 2
+    assert "1 surplus: layer9.weight" in capsys.readouterr().err
+    assert "resnet18" in store.installed(tmp_path / "weights")
