@@ -1,11 +1,11 @@
 """The geometric prior c: clean relative depth that tells the generator what the scene is (paper III-B1).
 
-The paper takes c from a video depth network on RGB. Any such source fits the `Prior` protocol; the built-in
-one needs no network: affine-normalised inverse depth, from simulation directly, from recordings after
-filling the holes. Filling must not betray where the holes were, or the generator would look for traces of
-filling that clean simulated depth never has. Three things hide them: filled pixels take the background's
-depth of their own row (the true surface behind an occlusion shadow), c is blurred, and some frames are
-filled under decoy holes as well.
+The paper takes c from a video depth network on RGB (ddg_jax/depth_prior.py, for which the user brings
+weights). Any such source fits the `Prior` protocol; the built-in one needs no network: affine-normalised
+inverse depth, from simulation directly, from recordings after filling the holes. Filling must not betray
+where the holes were, or the generator would look for traces of filling that clean simulated depth never has.
+Three things hide them: filled pixels take the background's depth of their own row (the true surface behind an
+occlusion shadow), c is blurred, and some frames are filled under decoy holes as well.
 """
 
 from typing import Protocol
@@ -28,7 +28,9 @@ class Prior(Protocol):
 
     name: str
     needs_rgb: bool
-    """Whether `rgb` must be given; otherwise it is ignored and may be None."""
+    """Whether recordings must bring `rgb`; otherwise it is ignored and may be None."""
+    source: str | dict[str, str]
+    """For reports: "built-in", or which weights were used."""
 
     def from_recording(
         self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator
@@ -50,6 +52,7 @@ class InverseDepthPrior:
 
     name = "inverse_depth"
     needs_rgb = False
+    source: str | dict[str, str] = "built-in"
 
     def __init__(self, blur_px: float, decoy_share: float = 0.0):
         self.blur_px = blur_px
@@ -78,11 +81,14 @@ class InverseDepthPrior:
 
 
 def make_prior(config: DDGConfig) -> Prior:
-    """The prior that the configuration names."""
-    priors = {InverseDepthPrior.name: InverseDepthPrior}
-    if config.prior not in priors:
-        raise unknown_name("prior", config.prior, priors)
-    return priors[config.prior](config.prior_blur_px, config.decoy_holes)
+    """The prior that the configuration names; UserError for another name, or weights that are not there."""
+    from ddg_jax.depth_prior import NETWORKS, DepthNetworkPrior
+
+    if config.prior in NETWORKS:
+        return DepthNetworkPrior(config)
+    if config.prior != InverseDepthPrior.name:
+        raise unknown_name("prior", config.prior, (InverseDepthPrior.name, *NETWORKS))
+    return InverseDepthPrior(config.prior_blur_px, config.decoy_holes)
 
 
 def invert(depth_m: np.ndarray) -> np.ndarray:

@@ -53,6 +53,7 @@ def fit_folder(
     scored = held_out.part(np.linspace(0, len(held_out) - 1, min(SCORED_FRAMES, len(held_out))).astype(int))
     metrics = {
         "prior": prior.name,
+        "prior_source": prior.source,
         "frames": {"training": len(training), "held_out": len(held_out), "skipped": len(frames.skipped)},
         **_score(generator, scored, progress),
     }

@@ -236,7 +236,18 @@ class DDGConfig:
     """The paper's noise_threshold: below it a generated pixel is a hole (holes are -1, surfaces 0 to 1)."""
     # --- geometric prior c (ddg_jax/prior.py) ---
     prior: str = "inverse_depth"
-    """Where c comes from: inverse_depth (built in)."""
+    """Where c comes from: inverse_depth (built in), video_depth_anything (the paper's) or depth_anything_v2.
+    """
+    prior_weights: str = ""
+    """Folder of the network's converted weights; empty takes weights/<prior>_small."""
+    prior_in_sim: str = "depth"
+    """What a network's prior is in simulation: depth (simulated depth, normalised alike) or rgb (the
+    network).
+    """
+    prior_input_px: int = 518
+    """Shorter side of the pictures that the network sees."""
+    prior_dtype: str = "float32"
+    """The network's arithmetic: float32 or bfloat16."""
     prior_blur_px: float = 1.0
     """Gaussian blur of c in pixels: hides where a recording's holes were filled."""
     prior_noise: float = 0.03

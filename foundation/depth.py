@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ddgrasp.errors import UserError
+from ddgrasp.errors import UserError, unknown_name
 from foundation import pictures
 from foundation.dpt import CoarseHead, FineHead
 from foundation.resample import resize_corners
@@ -39,6 +39,10 @@ class DepthNetwork:
     """Of the arithmetic: float32, or bfloat16 (parameters stay float32; its error is in the README)."""
     frames_at_once: int = 8
     """Frames that the encoder and the finest layers work on together: bounds memory, changes no result."""
+
+    def __post_init__(self) -> None:
+        if self.dtype not in DTYPES:
+            raise unknown_name("dtype", self.dtype, DTYPES)
 
     @property
     def head(self) -> str:

@@ -43,15 +43,9 @@ def clip():
     return np.stack([np.roll(base, frame, 1) for frame in range(40)]).astype(np.uint8)
 
 
-def test_parts_of_any_size_give_the_same_depth(params, clip):
-    whole = predict(VIDEO, params, clip[None, :3], SIZE)
-    parts = predict(replace(VIDEO, frames_at_once=2), params, clip[None, :3], SIZE)
-    assert whole.shape == (1, 3, 30, 40) and whole.min() > 0 and whole.std() > 0.05
-    np.testing.assert_allclose(parts, whole, atol=3e-5)
-
-
-def test_a_batch_of_clips_is_one_clip_at_a_time(params, clip):
-    both = predict(VIDEO, params, np.stack([clip[:3], clip[10:13]]), SIZE)
+def test_clips_in_a_batch_and_in_parts_are_what_each_is_alone(params, clip):
+    both = predict(replace(VIDEO, frames_at_once=4), params, np.stack([clip[:3], clip[10:13]]), SIZE)
+    assert both.shape == (2, 3, 30, 40) and both.min() > 0 and both.std() > 0.05
     for index, start in enumerate((0, 10)):
         alone = predict(VIDEO, params, clip[None, start : start + 3], SIZE)[0]
         np.testing.assert_allclose(both[index], alone, atol=3e-5)
@@ -90,6 +84,8 @@ def test_wrong_shapes_are_named(params):
         IMAGE(params, jnp.zeros((1, 30, 40, 3)))
     with pytest.raises(UserError, match="33 frames"):
         VIDEO(params, jnp.zeros((1, 33, 28, 28, 3)))
+    with pytest.raises(UserError, match="Did you mean 'float32'"):
+        replace(VIDEO, dtype="float23")
     with pytest.raises(UserError, match="0 x 40"):
         pictures.network_size(0, 40, 518, video=False)
 

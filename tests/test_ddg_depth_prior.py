@@ -1,0 +1,83 @@
+"""The prior from a depth network: its weights, its two readings in simulation, its geometry."""
+
+import numpy as np
+import pytest
+
+from ddg_jax import depth_prior
+from ddg_jax.prior import InverseDepthPrior, invert, make_prior, normalise
+from ddgrasp.config import DDGConfig
+from ddgrasp.errors import UserError
+from foundation import convert, store
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """The small image network's folder, as `weights convert` would leave it; random weights."""
+    directory = tmp_path_factory.mktemp("weights") / "depth_anything_v2_small"
+    rng = np.random.default_rng(0)
+    arrays = {
+        key: (rng.normal(0, 0.3, target.shape) / max(1, np.prod(target.shape[1:])) ** 0.5).astype(np.float32)
+        for key, target in convert.targets("depth_anything_v2_small").items()
+    }
+    arrays["depth_head.scratch.output_conv2.2.bias"] += 1
+    store._save(directory / store.CHECKPOINT, convert.convert("depth_anything_v2_small", arrays))
+    manifest = store.WeightsManifest(
+        "depth_anything_v2_small", "x.pth", "ab12", "Apache-2.0", "here", 1, 0.0, {}, "today"
+    )
+    store.artifacts.atomic_write_json(directory / store.MANIFEST, vars(manifest))
+    return directory
+
+
+def config(weights, **changes) -> DDGConfig:
+    return DDGConfig(prior="depth_anything_v2", prior_weights=str(weights), prior_input_px=28, **changes)
+
+
+def test_recordings_and_simulation_on_rgb_see_the_network(weights):
+    prior = make_prior(config(weights, prior_in_sim="rgb"))
+    rgb = np.random.default_rng(1).integers(0, 256, (3, 40, 56, 3)).astype(np.uint8)
+    depth = np.ones((3, 20, 28), np.float32)
+    c = prior.from_recording(depth, rgb, np.random.default_rng(0))
+    assert c.shape == (3, 20, 28) and c.std() > 0.1 and abs(np.median(c)) < 0.1
+    np.testing.assert_array_equal(prior.from_sim(depth, rgb), c)
+    np.testing.assert_array_equal(prior.from_recording(2 * depth, rgb, np.random.default_rng(1)), c)
+    assert isinstance(prior.source, dict)
+    assert (prior.source["network"], prior.source["source_sha256"]) == ("depth_anything_v2_small", "ab12")
+    with pytest.raises(UserError, match="no RGB"):
+        prior.from_sim(depth, None)
+
+
+def test_simulated_depth_is_normalised_as_the_networks_output(weights):
+    depth = np.random.default_rng(0).uniform(0.5, 2, (2, 12, 16)).astype(np.float32)
+    prior = make_prior(config(weights))
+    assert prior.needs_rgb
+    np.testing.assert_array_equal(prior.from_sim(depth, None), normalise(invert(depth)))
+
+
+def test_what_was_used_is_said(weights):
+    assert make_prior(DDGConfig()).source == "built-in"
+    assert isinstance(make_prior(DDGConfig()), InverseDepthPrior)
+    with pytest.raises(UserError, match="weights convert"):
+        make_prior(config(weights.parent / "nothing"))
+    with pytest.raises(UserError, match="holds depth_anything_v2_small; ddg.prior is video_depth_anything"):
+        make_prior(DDGConfig(prior="video_depth_anything", prior_weights=str(weights)))
+    with pytest.raises(UserError, match="Did you mean 'video_depth_anything'"):
+        make_prior(DDGConfig(prior="video_depth_anythin"))
+    with pytest.raises(UserError, match="Did you mean 'depth'"):
+        make_prior(config(weights, prior_in_sim="deph"))
+
+
+def test_prior_and_depth_of_other_aspect_ratios_show_the_same_part():
+    ramp = np.tile(np.arange(64, dtype=np.float32), (36, 1))
+    np.testing.assert_allclose(depth_prior.at_size(ramp, (18, 32))[0], np.arange(32) * 2 + 0.5, atol=1e-5)
+    tall = np.tile(np.arange(64, dtype=np.float32), (64, 1)).T
+    np.testing.assert_allclose(depth_prior.at_size(tall, (16, 32))[:, 0], np.arange(16) * 2 + 16.5, atol=1e-5)
+
+
+def test_monocular_depth_is_fitted_to_the_measured_one():
+    rng = np.random.default_rng(0)
+    relative = rng.uniform(1, 4, (6, 8)).astype(np.float32)
+    truth = 1 / (0.5 * relative + 0.2)
+    measured = np.where(rng.random((6, 8)) < 0.5, truth, 0)
+    np.testing.assert_allclose(depth_prior.metric_depth(relative, measured, 10.0), truth, rtol=1e-5)
+    with pytest.raises(UserError, match="no two valid"):
+        depth_prior.metric_depth(relative, np.zeros((6, 8)), 10.0)
