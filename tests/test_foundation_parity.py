@@ -5,7 +5,8 @@
 
 import re
 import sys
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from pathlib import Path
 
 import jax
@@ -22,6 +23,7 @@ from foundation.resnet import ResNet18
 from foundation.vit import VisionTransformer, resize_positions
 
 MAP_RANK = 4
+CAPTURE = {"capture_intermediates": True, "mutable": ["intermediates"]}
 
 
 @pytest.fixture(autouse=True)
@@ -37,30 +39,46 @@ def fixtures(pattern: str):
     return pytest.mark.parametrize("name", found or [absent])
 
 
+def compute(fixture: parity.Fixture, function: Callable[..., dict], *args) -> dict:
+    """What the fixture recorded, of the dictionary that `function` gives, in one program."""
+
+    def chosen(*args):
+        found = function(*args)
+        return {stem: found[stem] for stem in {split(name, found)[0] for name in recorded(fixture)}}
+
+    return jax.jit(chosen)(*args)
+
+
+def recorded(fixture: parity.Fixture) -> list[str]:
+    """Names of the arrays under act/ and out/."""
+    return [key.partition("/")[2] for key in fixture.arrays if key.startswith(("act/", "out/"))]
+
+
 def check(fixture: parity.Fixture, made: dict, skip: tuple[str, ...] = ()) -> None:
     """Every array under act/ and out/ within its tolerance."""
-    compared, report = 0, []
+    report = []
     for key, wanted in fixture.arrays.items():
-        group, _, name = key.partition("/")
-        if group not in ("act", "out") or key in skip:
+        if not key.startswith(("act/", "out/")) or key in skip:
             continue
-        got = select(name, made, wanted.shape)
+        got = select(key.partition("/")[2], made, wanted.shape)
         assert got.shape == wanted.shape, (key, got.shape, wanted.shape)
         error = float(np.max(np.abs(np.asarray(got, np.float64) - wanted)))
         report.append((key, error, fixture.tolerance(key)))
-        compared += 1
-    assert compared > 0
-    for key, error, tolerance in report:
-        print(f"{fixture.name} {key}: {error:.1e} of {tolerance:.1e}")
+        print(f"{fixture.name} {key}: {error:.1e} of {fixture.tolerance(key):.1e}")
+    assert report
     assert [line for line in report if not line[1] <= line[2]] == []
+
+
+def split(name: str, made: dict) -> tuple[str, str]:
+    """(what was computed, how it is thinned out) of the array that a fixture calls `name`."""
+    stem, rule = (name, "") if name in made else (name.rpartition("_")[0], name.rpartition("_")[2])
+    assert stem in made, f"nothing computed is called {name}"
+    return stem, rule
 
 
 def select(name: str, made: dict, shape: tuple[int, ...]) -> np.ndarray:
     """The array a fixture calls `name`, thinned out or averaged as its suffix (or its shape) says."""
-    stem, rule = name, ""
-    if name not in made:
-        stem, _, rule = name.rpartition("_")
-    assert stem in made, f"nothing computed is called {name}"
+    stem, rule = split(name, made)
     array = np.asarray(made[stem])
     if rule == "mean":
         return array.mean((-2, -1))
@@ -109,41 +127,30 @@ def outputs(captured: dict) -> dict:
 
 def channels_first(found: dict) -> dict:
     """Maps (N, h, w, c) as (N, c, h, w); what has another rank stays."""
-    return {
-        key: np.moveaxis(np.asarray(value), -1, 1) if value.ndim == MAP_RANK else value
-        for key, value in found.items()
-        if not isinstance(value, tuple)
-    }
+    arrays = {key: value for key, value in found.items() if not isinstance(value, tuple)}
+    return {key: jnp.moveaxis(x, -1, 1) if x.ndim == MAP_RANK else x for key, x in arrays.items()}
 
 
 def run_depth(network: str, variables: dict, x: jax.Array) -> dict:
-    """Outputs of every module of a depth network, by path, and `depth`. x: (B, [T,] H, W, 3)."""
+    """Outputs of a depth network's modules by path and by their names in fixtures. x: (B, [T,] H, W, 3)."""
     net, params = convert.depth_network(network), variables["params"]
     frames = x.shape[1] if net.video else 1
-    capture = {"capture_intermediates": True, "mutable": ["intermediates"]}
     head = {"params": params[net.head]}
     taps, encoder = VisionTransformer(net.size).apply(
-        {"params": params["pretrained"]}, x.reshape(-1, *x.shape[-3:]), **capture
+        {"params": params["pretrained"]}, x.reshape(-1, *x.shape[-3:]), **CAPTURE
     )
-    maps, coarse = dpt.CoarseHead(net.size, net.video).apply(head, taps, frames, **capture)
-    depth, fine = dpt.FineHead(net.size).apply(head, *maps, **capture)
-    found = (
-        outputs(encoder["intermediates"]) | outputs(coarse["intermediates"]) | outputs(fine["intermediates"])
-    )
-    found |= {"depth": depth, "depth_prerelu": found["scratch.output_conv2.2"]}
+    maps, coarse = dpt.CoarseHead(net.size, net.video).apply(head, taps, frames, **CAPTURE)
+    depth, fine = dpt.FineHead(net.size).apply(head, *maps, **CAPTURE)
+    found = {"depth": depth}
+    for part in (encoder, coarse, fine):
+        found |= outputs(part["intermediates"])
     for number in range(4):
         place = found.get(f"resize_layers.{number}", found[f"projects.{number}"])
         found[f"layer_{number + 1}"] = place
         found[f"path_{4 - number}"] = found[f"scratch.refinenet{4 - number}"]
-        found[f"tap_{net.size.taps[number]}"] = taps[number].reshape(
-            taps[number].shape[0], -1, net.size.width
-        )
-    found |= (
-        {"patch_embed": found["patch_embed.proj"].reshape(x.shape[0], -1, net.size.width)}
-        if frames == 1
-        else {}
-    )
-    found["block0"] = found["blocks.0"]
+        found[f"tap_{net.size.taps[number]}"] = taps[number].reshape(len(place), -1, net.size.width)
+    found["patch_embed"] = found["patch_embed.proj"].reshape(len(taps[0]), -1, net.size.width)
+    found |= {"depth_prerelu": found["scratch.output_conv2.2"], "block0": found["blocks.0"]}
     return channels_first(found)
 
 
@@ -153,59 +160,73 @@ def test_depth_anything_v2(name):
     x = pictures.standardise(np.moveaxis(fixture.image(), 1, -1))
     if "in/x" in fixture.arrays:
         np.testing.assert_allclose(np.moveaxis(x, -1, 1), fixture.arrays["in/x"], atol=2e-6)
-    check(fixture, run_depth(fixture.network, variables, x))
+    check(fixture, compute(fixture, partial(run_depth, fixture.network), variables, x))
 
 
-@fixtures("vda_*")
-def test_video_depth_anything(name):
-    fixture, variables = load(name)
-    image = np.moveaxis(fixture.image(), 2, -1)
-    batch, frames = image.shape[:2]
-    x = pictures.standardise(image)
-    found = run_depth(fixture.network, variables, x)
-    places = {0: "layer_3", 1: "layer_4", 2: "path_4", 3: "path_3"}
-    for number, place in places.items():
+def run_video(network: str, variables: dict, x: jax.Array) -> dict:
+    """`run_depth` with the motion modules' insides; everything (B, T, ...)."""
+    found = run_depth(network, variables, x)
+    for number, place in enumerate(("layer_3", "layer_4", "path_4", "path_3")):
         found[f"mm{number}_in"] = found[place]
         found[f"mm{number}_out"] = found[f"motion_modules.{number}"]
     inside = "motion_modules.2.temporal_transformer"
     block = f"{inside}.transformer_blocks.0"
     found["mm2_groupnorm"] = found[f"{inside}.norm"]
+    batch, frames = x.shape[:2]
     made = {
-        key: np.asarray(value).reshape(batch, frames, *value.shape[1:])
+        key: value.reshape(batch, frames, *value.shape[1:])
         for key, value in found.items()
-        if value.shape[0] == batch * frames
+        if len(value) == batch * frames
     }
-    for ours, theirs in (
-        (f"{block}.attention_blocks.0", "mm2_attn0"),
-        (f"{block}.attention_blocks.1", "mm2_attn1"),
-        (f"{block}.ff", "mm2_ff"),
-        (block, "mm2_block"),
-    ):
-        value = np.asarray(found[ours])  # (B h w, T, C)
-        made[theirs] = value.reshape(batch, -1, *value.shape[1:]).swapaxes(1, 2)
-    check(fixture, made)
+    parts = {"block": block, "ff": f"{block}.ff"}
+    parts |= {f"attn{index}": f"{block}.attention_blocks.{index}" for index in range(2)}
+    for theirs, ours in parts.items():  # (B h w, T, C)
+        made[f"mm2_{theirs}"] = found[ours].reshape(batch, -1, *found[ours].shape[1:]).swapaxes(1, 2)
+    return made
+
+
+@fixtures("vda_*")
+def test_video_depth_anything(name):
+    fixture, variables = load(name)
+    x = pictures.standardise(np.moveaxis(fixture.image(), 2, -1))
+    check(fixture, compute(fixture, partial(run_video, fixture.network), variables, x))
+
+
+@fixtures("vda_*_b*")
+def test_video_depth_as_it_is_used(name):
+    fixture, variables = load(name)
+    x = pictures.standardise(np.moveaxis(fixture.image(), 2, -1))
+    network = convert.depth_network(fixture.network, frames_at_once=4)
+    depth = jax.jit(network)(variables["params"], x)
+    np.testing.assert_allclose(
+        depth, fixture.arrays["out/depth"], atol=fixture.tolerance("out/depth"), rtol=0
+    )
+
+
+def run_resnet18(variables: dict, x: jax.Array) -> dict:
+    (features, logits), captured = ResNet18().apply(variables, x, **CAPTURE)
+    found = outputs(captured["intermediates"])
+    found |= {f"layer{stage}": found[f"layer{stage}.1"] for stage in range(1, 5)}
+    return channels_first(found) | {"features": features, "logits": logits}
 
 
 @fixtures("resnet18_*")
 def test_resnet18(name):
     fixture, variables = load(name)
     x = pictures.standardise(np.moveaxis(fixture.image(), 1, -1))
-    (features, logits), captured = ResNet18().apply(
-        variables, x, capture_intermediates=True, mutable=["intermediates"]
-    )
-    found = outputs(captured["intermediates"])
-    found |= {f"layer{stage}": found[f"layer{stage}.1"] for stage in range(1, 5)}
-    check(fixture, channels_first(found) | {"features": features, "logits": logits})
+    check(fixture, compute(fixture, run_resnet18, variables, x))
+
+
+def run_inception(variables: dict, x: jax.Array) -> dict:
+    features, captured = FidInception().apply(variables, x, **CAPTURE)
+    return channels_first(outputs(captured["intermediates"])) | {"pool3": features}
 
 
 @fixtures("inception_*")
 def test_fid_inception(name):
     fixture, variables = load(name)
     x = jnp.asarray(np.moveaxis(fixture.image(), 1, -1), jnp.float32) / 255
-    features, captured = FidInception().apply(
-        variables, x, capture_intermediates=True, mutable=["intermediates"]
-    )
-    check(fixture, channels_first(outputs(captured["intermediates"])) | {"pool3": features})
+    check(fixture, compute(fixture, run_inception, variables, x))
 
 
 @fixtures("unit_posembed*")
