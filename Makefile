@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= runs/demo
 
-.PHONY: help setup lock test test-parity demo check format clean-venv
+.PHONY: help setup lock test test-parity bench-networks demo check format clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -34,6 +34,9 @@ test: setup  ## run the tests (trains the debug preset end to end)
 
 test-parity: setup  ## foundation networks against recorded values (PARITY_DIR=folder of fixtures)
 	$(BIN)/python -m pytest tests/test_foundation_parity.py $(ARGS)
+
+bench-networks: setup  ## frames/s of the foundation networks, against onnxruntime
+	$(BIN)/python -m benchmarks.networks $(ARGS)
 
 demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)
