@@ -339,6 +339,8 @@ class StudentConfig:
     """Keypoints of spatial_softmax, or channels per cell of tokens."""
     feature_size: int = 128
     """Length of the encoder's output vector."""
+    encoder_weights: str = ""
+    """Folder of converted ImageNet ResNet-18 weights that the encoder starts from; empty starts at random."""
     aux_to_head: bool = True
     """Give the predicted object position, grasp yaw and held probability to the action head."""
     aux_stop_gradient: bool = False

@@ -8,6 +8,7 @@ import numpy as np
 from flax import linen as nn
 from jax.typing import DTypeLike
 
+from foundation.attention import attend
 from foundation.vit import layer_norm
 
 MAX_FRAMES = 32
@@ -45,7 +46,7 @@ class TimeAttention(nn.Module):
             nn.Dense(channels, use_bias=False, dtype=self.dtype, name=name)(x).reshape(heads)
             for name in ("to_q", "to_k", "to_v")
         )
-        mixed = jax.nn.dot_product_attention(q, k, v)
+        mixed = attend(q, k, v)
         return nn.Dense(channels, dtype=self.dtype, name="to_out.0")(mixed.reshape(x.shape))
 
 

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jax.typing import DTypeLike
 
-from foundation.resample import cubic_matrix, resize
+from foundation.attention import attend
+from foundation.resample import resize_cubic
 from foundation.sizes import PATCH_PX, DepthSize
 
 TABLE_SIDE = 37
@@ -38,7 +39,7 @@ class Attention(nn.Module):
         batch, tokens, width = x.shape
         qkv = nn.Dense(3 * width, dtype=self.dtype, name="qkv")(x)
         q, k, v = jnp.moveaxis(qkv.reshape(batch, tokens, 3, self.heads, width // self.heads), 2, 0)
-        mixed = jax.nn.dot_product_attention(q, k, v)
+        mixed = attend(q, k, v)
         return nn.Dense(width, dtype=self.dtype, name="proj")(mixed.reshape(batch, tokens, width))
 
 
@@ -87,9 +88,9 @@ def resize_positions(table: jax.Array, grid: tuple[int, int]) -> jax.Array:
     """
     if grid == (TABLE_SIDE, TABLE_SIDE):
         return table
-    rows, columns = (cubic_matrix(TABLE_SIDE, side, TABLE_OFFSET) for side in grid)
     channels = table.shape[-1]
-    spatial = resize(table[:, 1:].reshape(1, TABLE_SIDE, TABLE_SIDE, channels), rows, columns)
+    spatial = table[:, 1:].reshape(1, TABLE_SIDE, TABLE_SIDE, channels)
+    spatial = resize_cubic(spatial, grid, TABLE_OFFSET)
     return jnp.concatenate([table[:, :1], spatial.reshape(1, -1, channels)], axis=1)
 
 
