@@ -97,7 +97,7 @@ def open_gl_ms(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, repea
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--batch", type=int, default=16)
     args = parser.parse_args()
