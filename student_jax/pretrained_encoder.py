@@ -28,24 +28,33 @@ _RESNET18 = {
 }
 
 
-def load_into(
-    encoder: Mapping[str, Any], config: StudentConfig
-) -> tuple[dict[str, Any], str | dict[str, str]]:
-    """The encoder's parameters with those of `config.encoder_weights` in place, and a line for reports.
+def source(config: StudentConfig) -> str | dict[str, str]:
+    """For reports: "built-in", or the weights that the encoder starts from.
 
-    Without weights: the parameters as they are, and "built-in".
-
-    Raises UserError for weights of another network, or a student whose encoder is no ResNet-18.
+    Raises UserError if `config.encoder_weights` holds none, or the student's encoder is no ResNet-18.
     """
     if not config.encoder_weights:
-        return dict(encoder), store.BUILT_IN
-    check_is_resnet18(config)
-    manifest, variables = store.load(Path(config.encoder_weights), (catalog.RESNET18,))
-    return from_resnet18(encoder, variables["params"], config), manifest.summary()
+        return store.BUILT_IN
+    _check(config)
+    return store.read_manifest(Path(config.encoder_weights)).summary()
 
 
-def check_is_resnet18(config: StudentConfig) -> None:
-    """UserError naming the first option that makes the encoder another network."""
+def load_into(encoder: Mapping[str, Any], config: StudentConfig) -> dict[str, Any]:
+    """The encoder's parameters with those of `config.encoder_weights` in place; unchanged without weights.
+
+    Raises UserError as `source`, and for weights of another network.
+    """
+    if not config.encoder_weights:
+        return dict(encoder)
+    _check(config)
+    _, variables = store.load(Path(config.encoder_weights), (catalog.RESNET18,))
+    return from_resnet18(encoder, variables["params"], config)
+
+
+def _check(config: StudentConfig) -> None:
+    """UserError naming the first option that makes the encoder another network, or another start."""
+    if config.init_from:
+        raise UserError("student.init_from and student.encoder_weights both say where to start: give one.")
     for name, wanted in _RESNET18.items():
         if (value := getattr(config, name)) != wanted:
             raise UserError(
@@ -80,9 +89,8 @@ def from_resnet18(
 def first_kernel(kernel: np.ndarray, config: StudentConfig) -> np.ndarray:
     """(7, 7, 3, 64) over RGB -> (7, 7, 3 * channels, 64) over frames and, faster, their channels."""
     depth = next(name for name in DEPTH_CHANNELS if name in config.channels)
-    made = np.zeros(
-        (*kernel.shape[:2], contract.DEPTH_FRAMES, len(config.channels), kernel.shape[3]), np.float32
-    )
+    rows, columns, _, outputs = kernel.shape
+    made = np.zeros((rows, columns, contract.DEPTH_FRAMES, len(config.channels), outputs), np.float32)
     made[:, :, :, config.channels.index(depth)] = kernel
     return made.reshape(rows, columns, -1, outputs)
 
@@ -90,7 +98,7 @@ def first_kernel(kernel: np.ndarray, config: StudentConfig) -> np.ndarray:
 def _conv_norm(
     here: Mapping[str, Any], conv: Mapping[str, Any], norm: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """The student's ConvNorm from a convolution and its batch norm; without a norm only the convolution fits."""
+    """The student's ConvNorm from a convolution and its batch norm, whose values go if there is no norm."""
     made = {"conv": {**here["conv"], "kernel": np.asarray(conv["kernel"])}}
     if "norm" in here:
         made["norm"] = {name: np.asarray(norm[name]) for name in ("scale", "bias")}

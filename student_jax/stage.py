@@ -1,8 +1,9 @@
 """Stage `student`: demos, generator and teacher -> depth-only diffusion policy.
 
-Fit on the demos with generated artefacts, then DAgger: the student acts, the teacher labels, and all
-frames so far are fitted again; last the action head alone on cached features. Each part leaves a
-checkpoint, so that an interrupted stage goes on from the last finished part.
+The action head learns from true poses with noise; perception from the demos with generated artefacts
+and from DAgger, where the student acts, the teacher labels, and all frames so far are fitted again; last
+the head on what perception reports. Each part leaves a checkpoint, so that an interrupted stage goes on
+from the last finished part.
 """
 
 import shutil
@@ -16,9 +17,10 @@ from ddgrasp.progress import Progress
 from demos.stage import STORE
 from demos.store import EpisodeStore
 from ppo import policy as teacher_policy
-from student_jax import evaluate, frames_io
+from student_jax import evaluate, frames_io, pretrained_encoder
 from student_jax.dagger import Trainer
 from student_jax.data import check_chunk
+from student_jax.head import POSES
 
 STAGE = "student"
 
@@ -26,6 +28,7 @@ STAGE = "student"
 def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
     """Trains the student and evaluates it closed-loop on clean and on generated depth."""
     check_chunk(config.student)
+    encoder_weights = pretrained_encoder.source(config.student)
     parents = {name: artifacts.require(run_dir, name, config) for name in ("teacher", "demos", "ddg")}
     directory = run_dir / STAGE
     generator = Generator.load(parents["ddg"].directory)
@@ -33,8 +36,9 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
     trainer = Trainer(config, teacher, generator, directory, progress)
     trainer.run(EpisodeStore(parents["demos"].directory / STORE))
     metrics = evaluate.closed_loop(config, teacher, generator, trainer.params, progress)
-    metrics |= {"tried": trainer.history, "frames": trainer.frame_count}
+    metrics |= {"tried": trainer.history, "frames": trainer.frame_count, "encoder_weights": encoder_weights}
     shutil.rmtree(directory / frames_io.CACHE, ignore_errors=True)
+    (directory / POSES).unlink(missing_ok=True)
     return artifacts.finish(
         directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=list(parents.values()),
         origin="loaded" if config.student.init_from and not _trains(config) else "trained",
@@ -43,6 +47,8 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
 
 def _trains(config: Config) -> bool:
     student = config.student
-    return (
-        student.train_steps > 0 or student.dagger_rounds * student.dagger_steps > 0 or student.head_steps > 0
-    )
+    steps = (
+        student.train_steps, student.dagger_rounds * student.dagger_steps, student.head_steps,
+        student.pose_rounds * student.pose_steps,
+    )  # fmt: skip
+    return any(steps)

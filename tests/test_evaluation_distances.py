@@ -1,15 +1,11 @@
 """FID and KID: recorded values of the originals, and small cases by hand."""
 
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
 import parity_support as parity
-
 from ddgrasp.errors import UserError
 from evaluation import distances
 

@@ -1,16 +1,12 @@
 """Feature extractors: with weights, without, and what they say about themselves."""
 
-import sys
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
 import checkpoint_support as files
 import parity_support as parity
-
 from ddgrasp.errors import UserError
 from foundation import convert, features, pictures, store
 from foundation.resnet import ResNet18

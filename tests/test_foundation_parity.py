@@ -4,19 +4,15 @@
 """
 
 import re
-import sys
 from collections.abc import Callable
 from functools import lru_cache, partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
 import parity_support as parity
-
 from foundation import convert, dpt, long_video, pictures, resample
 from foundation.inception import FidInception
 from foundation.resnet import ResNet18

@@ -3,7 +3,6 @@
 import json
 import pickle
 import struct
-import sys
 import zipfile
 from pathlib import Path
 
@@ -11,10 +10,8 @@ import jax
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
 import checkpoint_support as files
 import parity_support as parity
-
 from ddgrasp.cli import main
 from ddgrasp.errors import UserError
 from foundation import catalog, convert, store

@@ -1,17 +1,13 @@
 """ImageNet's ResNet-18 as the student's first encoder weights."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
 import checkpoint_support as files
 import parity_support as parity
-
 from ddgrasp.config import StudentConfig, WorldConfig
 from ddgrasp.errors import UserError
 from foundation import convert, store
@@ -42,7 +38,7 @@ def test_every_convolution_is_taken_over(weights, norm, stride):
     directory, theirs = weights
     config = replace(RESNET18, encoder_weights=str(directory), norm=norm, output_stride=stride)
     fresh = fresh_encoder(config)
-    made, source = pretrained_encoder.load_into(fresh, config)
+    made, source = pretrained_encoder.load_into(fresh, config), pretrained_encoder.source(config)
     shapes = jax.tree.map(np.shape, fresh)
     assert jax.tree.map(np.shape, made) == shapes
     assert isinstance(source, dict) and source["network"] == "resnet18"
@@ -67,7 +63,7 @@ def test_every_convolution_is_taken_over(weights, norm, stride):
 def test_colours_stand_for_frames(weights):
     directory, theirs = weights
     config = replace(RESNET18, encoder_weights=str(directory), channels=("valid", "relief"))
-    kernel = pretrained_encoder.load_into(fresh_encoder(config), config)[0]["stem"]["conv7"]["conv"]["kernel"]
+    kernel = pretrained_encoder.load_into(fresh_encoder(config), config)["stem"]["conv7"]["conv"]["kernel"]
     assert kernel.shape == (7, 7, 6, 64)
     for frame in range(3):
         np.testing.assert_array_equal(kernel[:, :, 2 * frame + 1], theirs["conv1"]["kernel"][:, :, frame])
@@ -82,4 +78,9 @@ def test_another_encoder_is_refused_and_none_is_said(weights):
     with pytest.raises(UserError, match="depth or relief"):
         pretrained_encoder.load_into({}, replace(RESNET18, encoder_weights="x", channels=("valid",)))
     encoder = {"stem": {}}
-    assert pretrained_encoder.load_into(encoder, StudentConfig()) == (encoder, "built-in")
+    assert pretrained_encoder.load_into(encoder, StudentConfig()) == encoder
+    assert pretrained_encoder.source(StudentConfig()) == "built-in"
+    with pytest.raises(UserError, match="both say where to start"):
+        pretrained_encoder.source(replace(RESNET18, encoder_weights="x", init_from="y"))
+    with pytest.raises(UserError, match="weights convert"):
+        pretrained_encoder.source(replace(RESNET18, encoder_weights="nowhere"))
