@@ -32,6 +32,7 @@ class DepthNetworkPrior:
         if config.prior_in_sim not in IN_SIMULATION:
             raise unknown_name("ddg.prior_in_sim", config.prior_in_sim, IN_SIMULATION)
         self.name, self._config = config.prior, config
+        self.needs_sim_rgb = config.prior_in_sim == "rgb"
         self._directory = Path(config.prior_weights or store.WEIGHTS_DIR / f"{config.prior}_small")
         manifest = store.read_manifest(self._directory)
         if not manifest.network.startswith(config.prior):
@@ -56,7 +57,7 @@ class DepthNetworkPrior:
     def _from_rgb(self, rgb: np.ndarray | None, size: tuple[int, ...]) -> np.ndarray:
         if rgb is None:
             raise UserError(
-                f"ddg.prior {self.name} was given no RGB: keep it (demos.rgb), or set ddg.prior_in_sim depth."
+                f"ddg.prior {self.name} was given no RGB: keep it, or set ddg.prior_in_sim depth."
             )
         return normalise(np.stack([at_size(frame, (size[0], size[1])) for frame in self._infer(rgb)]))
 

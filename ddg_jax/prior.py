@@ -29,6 +29,8 @@ class Prior(Protocol):
     name: str
     needs_rgb: bool
     """Whether recordings must bring `rgb`; otherwise it is ignored and may be None."""
+    needs_sim_rgb: bool
+    """The same in simulation."""
     source: str | dict[str, str]
     """For reports: "built-in", or which weights were used."""
 
@@ -51,7 +53,7 @@ class InverseDepthPrior:
     """
 
     name = "inverse_depth"
-    needs_rgb = False
+    needs_rgb = needs_sim_rgb = False
     source: str | dict[str, str] = "built-in"
 
     def __init__(self, blur_px: float, decoy_share: float = 0.0):

@@ -13,14 +13,13 @@ from ddgrasp.config import StudentConfig
 from demos.rollout import Scene
 from student_jax.policy import sample_actions
 
-Corrupt = Callable[[np.ndarray, int], np.ndarray]
-"""(B, H, W) uint16 clean depth of B environments and the control step -> depth as the student sees it."""
+Corrupt = Callable[[Scene], np.ndarray]
+"""The scene of B environments -> depth as the student sees it, (B, H, W) uint16."""
 
 
-def keep_clean(depth_mm: np.ndarray, step: int) -> np.ndarray:
+def keep_clean(scene: Scene) -> np.ndarray:
     """Ideal camera."""
-    del step
-    return depth_mm
+    return scene.depth_mm
 
 
 class DDGCamera:
@@ -32,12 +31,13 @@ class DDGCamera:
     def __init__(self, generator: Generator, key: jax.Array, first: int = 0):
         self._generator, self._key, self._first = generator, key, first
 
-    def __call__(self, depth_mm: np.ndarray, step: int) -> np.ndarray:
+    def __call__(self, scene: Scene) -> np.ndarray:
         """(B, H, W) uint16 with artefacts."""
-        episode = self._first + np.arange(len(depth_mm))
-        frame = np.full(len(depth_mm), step)
-        depth_m = depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
-        noisy = generate(self._key, self._generator, depth_m, episode=episode, frame=frame)
+        episode = self._first + np.arange(len(scene.depth_mm))
+        frame = np.full(len(scene.depth_mm), scene.step)
+        depth_m = scene.depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
+        rgb = scene.rgb if self._generator.prior.needs_sim_rgb else None
+        noisy = generate(self._key, self._generator, depth_m, rgb, episode=episode, frame=frame)
         return np.round(noisy.depth_m / contract.DEPTH_UNIT_M).astype(np.uint16)
 
 
@@ -67,7 +67,7 @@ class StudentActor:
 
     def __call__(self, scene: Scene) -> np.ndarray:
         """(B, 8) actions for the scene."""
-        self.seen_mm.append(self._corrupt(scene.depth_mm, scene.step))
+        self.seen_mm.append(self._corrupt(scene))
         position = scene.step % self._config.execute_steps
         if position == 0:
             frames = [self.seen_mm[max(0, scene.step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)]

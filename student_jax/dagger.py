@@ -126,7 +126,8 @@ class Trainer:
             actor = StudentActor(
                 self.params, student, self._profile, camera, rng, self._config.deploy.noise, share
             )
-            roller = Roller(self._config, self._teacher, wanted - first)
+            with_rgb = self._generator.prior.needs_sim_rgb
+            roller = Roller(self._config, self._teacher, wanted - first, with_rgb)
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
                 key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
                 episodes = roller.run(key, actor, lambda _: task.advance())

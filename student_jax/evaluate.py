@@ -21,7 +21,8 @@ def closed_loop(
     config: Config, teacher: TeacherPolicy, generator: Generator, params: Any, progress: Progress
 ) -> dict[str, Any]:
     """`student_clean` and `student_ddg`: counts in total and per object, on the same seeds."""
-    roller = Roller(config, teacher, config.evaluation.student_trials)
+    with_rgb = generator.prior.needs_sim_rgb
+    roller = Roller(config, teacher, config.evaluation.student_trials, with_rgb)
     cameras = {
         "student_clean": keep_clean,
         "student_ddg": DDGCamera(generator, jax.random.key(config.seed), first=_FIRST_EPISODE),

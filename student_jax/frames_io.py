@@ -34,7 +34,8 @@ def add_noisy_demos(
             end = ends[i] + useful_steps(held, config.student.demo_held_steps)
             steps = {name: demos.steps(name, ends[i], end) for name in _FIELDS}
             if not keep_clean[i]:
-                steps["depth_mm"] = corrupt_episode(generator, key, steps["depth_mm"], i)
+                rgb = demos.steps("rgb", ends[i], end) if generator.prior.needs_sim_rgb else None
+                steps["depth_mm"] = corrupt_episode(generator, key, steps["depth_mm"], i, rgb)
             frames.append(steps, {"from_demo": np.bool_(True)})
             task.advance()
 
@@ -45,10 +46,12 @@ def useful_steps(held: np.ndarray, held_steps: int) -> int:
     return int(enough[0]) + 1 if len(enough) else len(held)
 
 
-def corrupt_episode(generator: Generator, key: jax.Array, depth_mm: np.ndarray, episode: int) -> np.ndarray:
-    """(T, H, W) uint16 clean depth to depth with generated artefacts."""
+def corrupt_episode(
+    generator: Generator, key: jax.Array, depth_mm: np.ndarray, episode: int, rgb: np.ndarray | None = None
+) -> np.ndarray:
+    """(T, H, W) uint16 clean depth, and (T, H, W, 3) if the prior needs it, to depth with artefacts."""
     depth_m = depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
-    noisy = generate(key, generator, depth_m, episode=episode).depth_m
+    noisy = generate(key, generator, depth_m, rgb, episode=episode).depth_m
     return np.round(noisy / contract.DEPTH_UNIT_M).astype(np.uint16)
 
 
