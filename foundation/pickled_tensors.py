@@ -2,7 +2,7 @@
 
 A pickle is a program, and loading one with Python's `pickle` calls whatever it names. Here its instructions
 are read one by one (`pickletools.genops`) by a machine that knows the few a dictionary of tensors consists
-of. Names of classes and functions stay text; the four that occur in such files are understood, any other is
+of. Names of classes and functions stay text; the few that occur in such files are understood, any other is
 refused.
 
 Formats: the zip archive that PyTorch writes since 1.6, and the sequence of pickles it wrote before.
@@ -243,15 +243,13 @@ def _storage(reference: Any) -> _Storage:
 
 
 def _build(function: Any, arguments: Any) -> Any:
-    """What the four calls that occur in state dicts stand for."""
+    """What the calls that occur in state dicts stand for."""
     text = function.text if isinstance(function, _Name) else repr(function)
     if text == "collections OrderedDict":
         return dict(*arguments)
-    if text == "torch._utils _rebuild_tensor_v2":
+    if text in ("torch._utils _rebuild_tensor", "torch._utils _rebuild_tensor_v2"):
         storage, offset, shape, strides = arguments[:4]
         return _View(storage, offset, tuple(shape), tuple(strides))
-    if text == "torch._utils _rebuild_parameter":
-        return arguments[0]
-    if text == "torch._utils _rebuild_parameter_with_state":
+    if text in ("torch._utils _rebuild_parameter", "torch._utils _rebuild_parameter_with_state"):
         return arguments[0]
     raise UserError(f"The checkpoint wants to call {text!r} when loaded: it is not read.")

@@ -5,10 +5,9 @@ network they belong to. Reading it needs no JAX.
 """
 
 import hashlib
-import json
 import shutil
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +68,8 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float
     network = recognise({key: tuple(array.shape) for key, array in arrays.items()})
     _check_metric(file, network, max_depth_m)
     variables = convert(network, arrays)
-    directory, fresh = weights_dir / network, weights_dir / f".tmp-{network}"
+    name = f"{network}_metric" if max_depth_m else network
+    directory, fresh = weights_dir / name, weights_dir / f".tmp-{name}"
     shutil.rmtree(fresh, ignore_errors=True)
     _save(fresh / CHECKPOINT, variables)
     entry = catalog.get_entry(network)
@@ -98,8 +98,9 @@ def read_manifest(directory: Path) -> WeightsManifest:
             f"{directory} holds no converted weights: get a file that `ddgrasp weights list` names and run "
             "`ddgrasp weights convert FILE`."
         )
-    value = json.loads(path.read_text())
-    if not isinstance(value, dict) or value.get("format_version") != FORMAT_VERSION:
+    value = artifacts.read_json(path)
+    names = {field.name for field in fields(WeightsManifest)}
+    if not isinstance(value, dict) or value.keys() != names or value["format_version"] != FORMAT_VERSION:
         raise UserError(f"{path} was written by another version of this project: convert the weights again.")
     return WeightsManifest(**value)
 
@@ -121,9 +122,9 @@ def load(directory: Path, families: tuple[str, ...] = ()) -> tuple[WeightsManife
 
 
 def installed(weights_dir: Path = WEIGHTS_DIR) -> dict[str, WeightsManifest]:
-    """Network -> manifest of every conversion in `weights_dir`."""
-    found = (read_manifest(path.parent) for path in sorted(weights_dir.glob(f"[!.]*/{MANIFEST}")))
-    return {manifest.network: manifest for manifest in found}
+    """Folder name (the network's, of metric variants with `_metric` behind) -> manifest."""
+    folders = [path.parent for path in sorted(weights_dir.glob(f"[!.]*/{MANIFEST}"))]
+    return {folder.name: read_manifest(folder) for folder in folders}
 
 
 def _check_metric(file: Path, network: str, max_depth_m: float) -> None:
@@ -148,7 +149,7 @@ def _restore(path: Path, shapes: dict[str, Any]) -> dict[str, Any]:
     import numpy as np
     import orbax.checkpoint as ocp
 
-    target = jax.tree.map(lambda leaf: np.zeros((), np.float32), shapes)
+    target = jax.tree.map(lambda leaf: np.empty(leaf.shape, np.float32), shapes)
     try:
         with ocp.StandardCheckpointer() as checkpointer:
             variables = checkpointer.restore(path.absolute(), target)

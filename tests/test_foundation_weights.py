@@ -211,8 +211,27 @@ def test_conversion_is_stored_with_its_origin_and_loads_back(tmp_path, resnet18)
         store.load(directory, (catalog.VIDEO_DEPTH,))
     with pytest.raises(UserError, match="weights convert"):
         store.load(tmp_path)
+    (directory / store.MANIFEST).write_text('{"format_version": 1}')
+    with pytest.raises(UserError, match="another version"):
+        store.load(directory)
+    (directory / store.MANIFEST).write_text("{")
+    with pytest.raises(UserError, match="not valid JSON"):
+        store.load(directory)
     with pytest.raises(UserError, match="no metric variant"):
         store.convert_file(file, tmp_path / "weights", max_depth_m=20)
+
+
+def test_metric_weights_lie_beside_the_relative_ones_and_state_their_range(tmp_path):
+    shapes = {key: target.shape for key, target in convert.targets("depth_anything_v2_small").items()}
+    arrays = {key: np.zeros(shape, np.float32) for key, shape in shapes.items()}
+    file = tmp_path / "depth_anything_v2_metric_hypersim_vits.safetensors"
+    files.write_safetensors(file, arrays)
+    with pytest.raises(UserError, match="--max-depth-m"):
+        store.convert_file(file, tmp_path)
+    directory = store.convert_file(file, tmp_path, max_depth_m=20.0)
+    assert directory.name == "depth_anything_v2_small_metric"
+    assert store.installed(tmp_path)["depth_anything_v2_small_metric"].max_depth_m == 20.0
+    assert store.read_manifest(directory).licence == catalog.METRIC_NOTE
 
 
 def test_the_catalog_states_licences():
