@@ -14,6 +14,7 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from student_jax import diffusion
+from student_jax.augment import disparity_noise
 from student_jax.data import Frames, aux_targets, random_crops, sharpen_gripper
 from student_jax.encoder import POSITION_SCALE_M
 from student_jax.policy import (
@@ -138,7 +139,10 @@ def train_step(
     """One optimiser step on pictures. Pure: noise comes from fold_in(state.key, state.step)."""
     policy = StudentPolicy(config, profile)
     key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
+    key, k_noise = jax.random.split(key)
     depth_m = batch.depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
+    if config.disparity_noise_px:
+        depth_m = disparity_noise(k_noise, depth_m, profile, config)
 
     def loss_fn(params):
         params = params | frozen
@@ -168,10 +172,18 @@ def _update(config: StudentConfig, steps: int, state: TrainState, grads) -> Trai
 
 @partial(jax.jit, static_argnums=(0, 1))
 def encode(
-    config: StudentConfig, profile: CameraProfile, params, depth_mm: Array, state: Array, crop_rc: Array
+    config: StudentConfig,
+    profile: CameraProfile,
+    params,
+    depth_mm: Array,
+    state: Array,
+    crop_rc: Array,
+    key: Array | None = None,
 ) -> Any:
-    """`policy.Seen` of a batch."""
+    """`policy.Seen` of a batch; with `key`, under the disparity noise of training."""
     depth_m = depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
+    if key is not None:
+        depth_m = disparity_noise(key, depth_m, profile, config)
     return StudentPolicy(config, profile).apply({"params": params}, depth_m, state, crop_rc, method="encode")
 
 
