@@ -75,7 +75,7 @@ class Roller:
 
     def __init__(self, config: Config, teacher: TeacherPolicy, count: int, with_rgb: bool = False):
         self.env = GraspEnv(config.world)
-        self.viewer = Viewer(config.world.profile)
+        self.viewer = Viewer(config.world.profile, self.env.table.layout)
         self.count, self.steps = count, config.world.episode_steps
         self._teacher, self._random, self._with_rgb = teacher, config.world.random, with_rgb
         self._begin = jax.jit(self._begin_batch)

@@ -49,8 +49,8 @@ class GraspEnv(mjx_env.MjxEnv):
         super().__init__(config_dict.create(ctrl_dt=contract.CONTROL_DT_S, sim_dt=config.sim_dt_s))
         self.config = config
         self.table = randomize.ObjectTable(config.objects)
-        self.physics = physics.make_physics(config.backend, config.sim_dt_s)
-        self._mj_model = scene.build_model(config.sim_dt_s)
+        self.physics = physics.make_physics(config.backend, config.sim_dt_s, self.table.layout)
+        self._mj_model = scene.build_model(config.sim_dt_s, self.table.layout)
 
     def reset(self, rng: jax.Array) -> mjx_env.State:
         """A new episode: object, pose, dynamics and joints drawn from `rng`."""
@@ -61,7 +61,7 @@ class GraspEnv(mjx_env.MjxEnv):
         qpos = randomize.sample_qpos(k_qpos, self.config.random, rest)
         branch = grasp_math.yaw_branch(qpos[12:16], self._symmetry(index), jp)
         if self.config.random.pregrasp_share > 0:
-            grasp = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], self._symmetry(index), branch, jp)
+            grasp = self._grasp_pose(qpos, index, branch)
             qpos = randomize.maybe_pregrasp(k_start, self.config.random, qpos, *grasp)
         state = physics.initial_state(qpos)
         episode = Episode(
@@ -126,17 +126,24 @@ class GraspEnv(mjx_env.MjxEnv):
 
     def _get_obs(self, state: physics.PhysicsState, episode: Episode) -> jax.Array:
         log_category = jp.asarray(self.table.log_category, jp.float32)[episode.object_index]
-        symmetry = self._symmetry(episode.object_index)
-        return grasp_math.observation(state.qpos, state.qvel, symmetry, episode.branch, log_category, jp)
+        symmetry, offset = self._symmetry(episode.object_index), self._grasp_offset(episode.object_index)
+        return grasp_math.observation(
+            state.qpos, state.qvel, symmetry, episode.branch, log_category, jp, offset
+        )
 
     def _distances(self, qpos, index, branch) -> rewards.Distances:
-        grasp_pos, grasp_quat = grasp_math.grasp_pose(
-            qpos[9:12], qpos[12:16], self._symmetry(index), branch, jp
-        )
+        grasp_pos, grasp_quat = self._grasp_pose(qpos, index, branch)
         return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[:7], jp))
+
+    def _grasp_pose(self, qpos, index, branch) -> tuple[jax.Array, jax.Array]:
+        symmetry, offset = self._symmetry(index), self._grasp_offset(index)
+        return grasp_math.grasp_pose(qpos[9:12], qpos[12:16], symmetry, branch, jp, offset)
 
     def _symmetry(self, index) -> jax.Array:
         return jp.asarray(self.table.symmetry)[index]
+
+    def _grasp_offset(self, index) -> jax.Array:
+        return jp.asarray(self.table.grasp_offset, jp.float32)[index]
 
     @property
     def xml_path(self) -> str:
