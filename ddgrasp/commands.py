@@ -233,6 +233,36 @@ class Report:
         print_summary(report)
 
 
+@dataclass(frozen=True)
+class ObjectsList:
+    """Name the objects: category, size, mass, friction, where the numbers come from."""
+
+    def run(self) -> None:
+        from mjx_envs.objects import OBJECTS
+
+        for spec in OBJECTS.values():
+            size = " x ".join(f"{1000 * extent:.0f}" for extent in spec.extents_m())
+            numbers = f"{size:>14} mm {1000 * spec.mass_kg:>4.0f} g  friction {spec.friction}"
+            print(f"{spec.category_id:>2} {spec.name:<10} {numbers}  {spec.source}")
+
+
+@dataclass(frozen=True)
+class ObjectsSheet:
+    """Draw objects as a camera sees them, colour and depth, as one PNG."""
+
+    objects: tuple[str, ...] = ()
+    """Names; none draws all of them, those that the paper trains on first."""
+    out: Path = Path("objects.png")
+    """The picture's file."""
+
+    def run(self) -> None:
+        from evaluation.object_sheet import draw
+        from mjx_envs.objects import SEEN, UNSEEN
+
+        artifacts.atomic_write_bytes(self.out, draw(self.objects or (*SEEN, *UNSEEN)))
+        print(self.out)
+
+
 COMMANDS: dict[str, type] = {
     "run": Run,
     "teacher train": TeacherTrain,
@@ -246,6 +276,8 @@ COMMANDS: dict[str, type] = {
     "export": Export,
     "deploy": Deploy,
     "report": Report,
+    "objects list": ObjectsList,
+    "objects sheet": ObjectsSheet,
 }
 
 
