@@ -29,13 +29,14 @@ lock:  ## resolve requirements.lock anew (needs uv on PATH)
 	uv pip compile --universal --python-version 3.11 --fork-strategy requires-python --no-emit-index-url \
 		--no-annotate --no-header --upgrade --extra dev pyproject.toml --output-file requirements.lock
 
-test: setup  ## run the tests (trains the debug preset end to end)
+test: setup  ## run the tests (trains the debug preset end to end), then check; with ARGS those tests alone
 	$(BIN)/python -m pytest $(ARGS)
+	@$(if $(ARGS),,$(MAKE) --no-print-directory check)
 
 demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)
 
-check: setup  ## lint, format and types
+check: setup  ## lint, format and types (pyright runs on Node.js and fetches it if there is none)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright

@@ -13,12 +13,11 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from ddgrasp import contract
-from ddgrasp.config import ExportConfig, StudentConfig
+from ddgrasp.config import ExportConfig, StudentConfig, WorldConfig
 from export import graph, metadata, parity
 from student_jax import policy
 
-PROFILE = contract.D455.scaled(0.25)
+PROFILE = WorldConfig().profile
 DEFAULT = StudentConfig()
 STUDENTS = {
     "default": DEFAULT,

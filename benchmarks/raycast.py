@@ -14,7 +14,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from ddgrasp import contract
+from ddgrasp.config import WorldConfig
 from mjx_envs import raycast_numpy, scene
 from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.visible_geoms import visible_geoms
@@ -44,7 +44,7 @@ def home_scene() -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 def camera_of(height_px: int, width_px: int) -> Camera:
     """The nominal camera's view with this many pixels."""
-    camera = nominal_camera(contract.D455.scaled(0.25))
+    camera = nominal_camera(WorldConfig().profile)
     scale = width_px / camera.width_px
     return dataclasses.replace(
         camera, fx_px=camera.fx_px * scale, fy_px=camera.fy_px * scale,
@@ -97,7 +97,7 @@ def open_gl_ms(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, repea
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--batch", type=int, default=16)
     args = parser.parse_args()

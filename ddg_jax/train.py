@@ -11,6 +11,7 @@ import numpy as np
 import optax
 import orbax.checkpoint as ocp
 from jax import Array
+from jax.typing import DTypeLike
 
 from ddg_jax import schedule as diffusion
 from ddg_jax.data import Frames, make_batch
@@ -43,7 +44,7 @@ class TrainState:
     """Raw key data (uint32); the step's key is fold_in(key, step)."""
 
 
-def make_unet(config: DDGConfig, dtype: jnp.dtype = jnp.float32) -> UNet:
+def make_unet(config: DDGConfig, dtype: DTypeLike = jnp.float32) -> UNet:
     """The noise-prediction network of the configuration."""
     return UNet(config.widths, config.blocks, config.attention_heads, config.space_to_depth, dtype)
 

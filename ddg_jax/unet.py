@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import DTypeLike
 
 GROUPS = 8
 MAX_PERIOD = 10_000.0
@@ -41,7 +42,7 @@ class ResBlock(nn.Module):
     """Two 3x3 convolutions with group normalisation; the time embedding scales and shifts between them."""
 
     width: int
-    dtype: jnp.dtype = jnp.float32
+    dtype: DTypeLike = jnp.float32
 
     @nn.compact
     def __call__(self, x: Array, time: Array) -> Array:
@@ -60,7 +61,7 @@ class SelfAttention(nn.Module):
     """Attention between all positions of a feature map, as a residual. (B, H, W, C) -> same."""
 
     heads: int
-    dtype: jnp.dtype = jnp.float32
+    dtype: DTypeLike = jnp.float32
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -86,7 +87,7 @@ class UNet(nn.Module):
     blocks: Sequence[int]
     heads: int
     factor: int
-    dtype: jnp.dtype = jnp.float32
+    dtype: DTypeLike = jnp.float32
 
     @nn.compact
     def __call__(self, x_k: Array, c: Array, step: Array) -> Array:

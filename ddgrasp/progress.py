@@ -9,7 +9,7 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -95,9 +95,9 @@ class Progress:
             self._plain_last = time.monotonic() - _PLAIN_PERIOD_S
             yield Task(label, total, self._plain)
 
-    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        """Iterates over `items` under a bar; `total` if they have no length."""
-        with self.task(label, len(items) if total is None else total) as task:  # pyright: ignore[reportArgumentType]
+    def track(self, items: Collection[T], label: str, total: int | None = None) -> Iterator[T]:
+        """Iterates over `items` under a bar of `total` units, by default one per item."""
+        with self.task(label, len(items) if total is None else total) as task:
             for item in items:
                 yield item
                 task.advance()

@@ -2,6 +2,7 @@
 
 from collections import deque
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import onnxruntime as ort
@@ -10,11 +11,25 @@ from ddgrasp import contract
 from ddgrasp.errors import UserError
 from export import metadata
 
-DEPTH_DTYPES = {"uint16_mm": np.dtype(np.uint16), "float32_m": np.dtype(np.float32)}
-ONNX_DEPTH_TYPES = {"uint16_mm": "tensor(uint16)", "float32_m": "tensor(float)"}
 NOISES = ("zero", "normal")
 PLAUSIBLE_MEDIAN_M = (0.05, 20.0)
 """A scene's median depth outside this is another unit, not another scene."""
+
+
+class DepthInput(NamedTuple):
+    """What one `depth_dtype` of the metadata means for a frame."""
+
+    dtype: np.dtype
+    onnx_type: str
+    unit: str
+    unit_m: float
+
+
+DEPTH_INPUTS = {
+    "uint16_mm": DepthInput(np.dtype(np.uint16), "tensor(uint16)", "mm", contract.DEPTH_UNIT_M),
+    "float32_m": DepthInput(np.dtype(np.float32), "tensor(float)", "m", 1.0),
+}
+"""For every one of `metadata.DEPTH_DTYPES`."""
 
 
 class OnnxPolicy:
@@ -38,6 +53,7 @@ class OnnxPolicy:
         self.path = Path(path)
         self._session = _open(self.path)
         self.info = _metadata(self._session, self.path)
+        self.depth_input = DEPTH_INPUTS[self.info.depth_dtype]
         self.depth_shape = (self.info.depth_height, self.info.depth_width)
         steps = self.info.execute_steps if execute_steps is None else execute_steps
         if not 1 <= steps <= self.info.chunk:
@@ -66,7 +82,7 @@ class OnnxPolicy:
 
     def check_fit(self, depth: np.ndarray) -> str:
         """Why a camera that gives `depth` cannot be used with this file, empty if it can."""
-        wanted = DEPTH_DTYPES[self.info.depth_dtype]
+        wanted = self.depth_input.dtype
         if depth.dtype != wanted:
             return f"wrong depth: type {depth.dtype}, the policy takes {wanted} ({self.info.depth_dtype})"
         if depth.shape != self.depth_shape:
@@ -79,10 +95,9 @@ class OnnxPolicy:
         if not valid.size:
             return ""
         median = float(np.median(valid))
-        unit, per_metre = ("mm", 1000.0) if self.info.depth_dtype == "uint16_mm" else ("m", 1.0)
-        if PLAUSIBLE_MEDIAN_M[0] <= median / per_metre <= PLAUSIBLE_MEDIAN_M[1]:
+        if PLAUSIBLE_MEDIAN_M[0] <= median * self.depth_input.unit_m <= PLAUSIBLE_MEDIAN_M[1]:
             return ""
-        return f"wrong depth: median {median:g} cannot be {unit}"
+        return f"wrong depth: median {median:g} cannot be {self.depth_input.unit}"
 
     def check_frame(self, depth: np.ndarray) -> str:
         """Why this one frame cannot be used, empty if it can: type, size, finiteness, any valid pixel."""
@@ -115,7 +130,7 @@ class OnnxPolicy:
         return (1, self.info.chunk, contract.ACTION_SIZE)
 
     def _blank(self) -> np.ndarray:
-        return np.ones(self.depth_shape, DEPTH_DTYPES[self.info.depth_dtype])
+        return np.ones(self.depth_shape, self.depth_input.dtype)
 
     def _infer(self, state: np.ndarray) -> np.ndarray:
         """(chunk, 8) actions."""
@@ -156,7 +171,7 @@ def _metadata(session: ort.InferenceSession, path: Path) -> metadata.PolicyMetad
     shapes = {node.name: node.shape for node in (*session.get_inputs(), *session.get_outputs())}
     metadata.validate_shapes(info, shapes, str(path))
     depth_type = next(node.type for node in session.get_inputs() if node.name == contract.ONNX_INPUT_DEPTH)
-    expected = ONNX_DEPTH_TYPES[info.depth_dtype]
+    expected = DEPTH_INPUTS[info.depth_dtype].onnx_type
     if depth_type != expected:
         raise UserError(
             f"{path}: depth input is {depth_type}, its metadata says {info.depth_dtype} ({expected}): "

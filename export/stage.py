@@ -69,7 +69,7 @@ def measure(
     sizes = [BATCH] * config.export.parity_batches + [1] * BATCH_ONE_CHECKS
 
     def batches():
-        for index, size in enumerate(progress.track(sizes, "parity", len(sizes))):
+        for index, size in enumerate(progress.track(sizes, "parity")):
             frames = _pick(frames_m, size, rng) if index % 2 == 0 else None
             yield parity.random_inputs(rng, size, student, profile, dtype, frames)
 

@@ -18,8 +18,8 @@ class Camera:
     cy_px: float
     height_px: int
     width_px: int
-    T_world_cam: np.ndarray
-    """(4, 4) pose of the camera in the world frame, metres."""
+    T_world_cam: Any
+    """(4, 4) pose of the camera in the world frame, metres; NumPy or JAX."""
 
     def cropped(self, row0: int, col0: int, height_px: int, width_px: int) -> "Camera":
         """The camera that sees only the window whose first pixel is (row0, col0) of this one."""

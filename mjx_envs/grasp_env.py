@@ -4,6 +4,8 @@ Reads top to bottom: state, reset, step, reward. `reset` and `step` are for one 
 them, or use `AutoReset`, which also draws a new episode where one ended.
 """
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jp
 from flax import struct
@@ -108,14 +110,15 @@ class GraspEnv(mjx_env.MjxEnv):
         lost = jp.linalg.norm(object_pos[:2] - center) > OUT_OF_REACH_M
         lost = (lost & ~grasped) | ~finite
         over = steps >= self.config.episode_steps
-        episode = episode.replace(
-            distances=distances, action=action, steps=steps, hold_count=hold_count, grasped=grasped
+        episode = replace(
+            episode, distances=distances, action=action, steps=steps, hold_count=hold_count, grasped=grasped
         )
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jp.float32)
         metrics["saturated"] = jp.mean(jp.abs(action[:7]) > 0.95)
         info = state.info | {"episode": episode, "truncation": (over & ~lost).astype(jp.float32)}
-        return state.replace(
+        return replace(
+            state,
             data=new,
             obs=self._get_obs(new, episode),
             reward=jp.sum(jp.stack(list(terms.values()))),
@@ -182,20 +185,20 @@ class AutoReset:
         state = jax.vmap(self.env.reset)(rng)
         episode = state.info["episode"]
         stagger = jp.arange(rng.shape[0]) % self.env.config.episode_steps
-        info = state.info | {"episode": episode.replace(steps=stagger.astype(jp.int32))}
-        return self.refresh(state.replace(info=info))
+        info = state.info | {"episode": replace(episode, steps=stagger.astype(jp.int32))}
+        return self.refresh(replace(state, info=info))
 
     def refresh(self, state: mjx_env.State) -> mjx_env.State:
         """Draw the batch's next episodes."""
         fresh = jax.vmap(self.env.reset)(state.info["rng"])
         waiting = (fresh.data, fresh.obs, fresh.info["episode"])
-        return state.replace(info=state.info | {"next": waiting, "rng": fresh.info["rng"]})
+        return replace(state, info=state.info | {"next": waiting, "rng": fresh.info["rng"]})
 
     def step(self, state: mjx_env.State, action: jax.Array) -> mjx_env.State:
         """One control step of the batch with `action` (B, 8)."""
         waiting = state.info["next"]
         bare = {k: v for k, v in state.info.items() if k != "next"}
-        state = jax.vmap(self.env.step)(state.replace(info=bare), action)
+        state = jax.vmap(self.env.step)(replace(state, info=bare), action)
 
         def pick(new, old):
             return jp.where(state.done.reshape((-1,) + (1,) * (old.ndim - 1)) > 0, new, old)
@@ -203,4 +206,4 @@ class AutoReset:
         ended = (state.data, state.obs, state.info["episode"])
         data, obs, episode = jax.tree.map(pick, waiting, ended)
         info = state.info | {"episode": episode, "next": waiting}
-        return state.replace(data=data, obs=obs, info=info)
+        return replace(state, data=data, obs=obs, info=info)

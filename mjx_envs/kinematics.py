@@ -73,11 +73,10 @@ def body_poses(qpos, xp: ModuleType = np) -> dict:
     positions, quats = _arm_chain(zero, xp.moveaxis(qpos[..., : scene.N_ARM], -1, 0), xp)
     poses = {"link0": zero}
     poses |= {link.name: (positions[i], quats[i]) for i, link in enumerate(scene.ARM_LINKS)}
-    pos, quat = positions[-1], quats[-1]
-    hand = _child(pos, quat, scene.HAND_POS_M, scene.HAND_QUAT, xp)
-    poses["hand"] = hand
+    hand_pos, hand_quat = _child(positions[-1], quats[-1], scene.HAND_POS_M, scene.HAND_QUAT, xp)
+    poses["hand"] = hand_pos, hand_quat
     for name, turn, index in (("left_finger", (1.0, 0, 0, 0), 7), ("right_finger", (0.0, 0, 0, 1), 8)):
-        pos, quat = _child(*hand, scene.FINGER_POS_M, turn, xp)
+        pos, quat = _child(hand_pos, hand_quat, scene.FINGER_POS_M, turn, xp)
         slide = qpos[..., index, None] * xp.asarray([0.0, 1.0, 0.0])
         poses[name] = (pos + rotate(quat, slide, xp), quat)
     if qpos.shape[-1] > scene.N_ROBOT:
@@ -95,10 +94,11 @@ def _arm_chain(base, joints, xp):
     local_quat = np.array([link.quat for link in scene.ARM_LINKS])
 
     def step(pose, link):
+        parent_pos, parent_quat = pose
         child_pos, child_quat, angle = link
-        pos, quat = _child(*pose, child_pos, child_quat, xp)
-        pose = pos, quat_mul(quat, quat_about_z(angle, xp), xp)
-        return pose, pose
+        pos, quat = _child(parent_pos, parent_quat, child_pos, child_quat, xp)
+        turned = pos, quat_mul(quat, quat_about_z(angle, xp), xp)
+        return turned, turned
 
     if xp is not np:
         from jax import lax

@@ -10,7 +10,7 @@ back-face culling has it, so a camera inside a geom is not blinded. Shapes witho
 never hit, apart from planes, which are seen from above (+z).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import ModuleType
 from typing import Any
 
@@ -19,6 +19,12 @@ Vector = tuple[Array, Array, Array]
 
 MISS = float("inf")
 _TINY = 1e-12
+
+
+def vector(components: Iterable[Array]) -> Vector:
+    """The three components as a tuple; ValueError if there are not three."""
+    x, y, z = components
+    return x, y, z
 
 
 def _dot(a: Vector, b: Vector) -> Array:
@@ -47,7 +53,7 @@ def _sphere_entry(xp: ModuleType, origin: Vector, direction: Vector, radius: Arr
     """
     inverse = 1 / _dot(direction, direction)
     t_closest = -_dot(origin, direction) * inverse
-    closest = tuple(o + t_closest * d for o, d in zip(origin, direction, strict=True))
+    closest = vector(o + t_closest * d for o, d in zip(origin, direction, strict=True))
     chord = radius * radius - _dot(closest, closest)
     return t_closest - xp.sqrt(xp.maximum(chord, 0) * inverse), chord > 0
 
@@ -61,6 +67,13 @@ def _tube_span(
     x, y = origin[0] + t_closest * direction[0], origin[1] + t_closest * direction[1]
     chord = radius * radius - x * x - y * y
     return t_closest, xp.sqrt(xp.maximum(chord, 0) * inverse), chord > 0
+
+
+def _slab_span(xp: ModuleType, origin: Array, direction: Array, half: Array) -> tuple[Array, Array]:
+    """t of entry into and of exit from the slab |coordinate| <= half."""
+    inverse = 1 / _nonzero(xp, direction)
+    middle, reach = -origin * inverse, half * abs(inverse)
+    return middle - reach, middle + reach
 
 
 def hit_sphere(xp: ModuleType, origin: Vector, direction: Vector, size: Array) -> Array:
@@ -88,23 +101,18 @@ def hit_capsule(xp: ModuleType, origin: Vector, direction: Vector, size: Array) 
 
 def hit_box(xp: ModuleType, origin: Vector, direction: Vector, size: Array) -> Array:
     """t of entry; size (x, y, z half)."""
-    t_in, t_out = None, None
-    for axis in range(3):
-        inverse = 1 / _nonzero(xp, direction[axis])
-        middle = -origin[axis] * inverse
-        half = size[axis] * abs(inverse)
-        t_in = middle - half if t_in is None else xp.maximum(t_in, middle - half)
-        t_out = middle + half if t_out is None else xp.minimum(t_out, middle + half)
+    t_in, t_out = _slab_span(xp, origin[0], direction[0], size[0])
+    for axis in (1, 2):
+        entry, leave = _slab_span(xp, origin[axis], direction[axis], size[axis])
+        t_in, t_out = xp.maximum(t_in, entry), xp.minimum(t_out, leave)
     return xp.where((t_in < t_out) & (t_in > 0), t_in, MISS)
 
 
 def hit_cylinder(xp: ModuleType, origin: Vector, direction: Vector, size: Array) -> Array:
     """t of entry; size (radius, half height, -), axis z."""
     t_middle, t_half, hit = _tube_span(xp, origin, direction, size[0])
-    inverse = 1 / _nonzero(xp, direction[2])
-    middle, half = -origin[2] * inverse, size[1] * abs(inverse)
-    t_in = xp.maximum(t_middle - t_half, middle - half)
-    t_out = xp.minimum(t_middle + t_half, middle + half)
+    entry, leave = _slab_span(xp, origin[2], direction[2], size[1])
+    t_in, t_out = xp.maximum(t_middle - t_half, entry), xp.minimum(t_middle + t_half, leave)
     return xp.where(hit & (t_in < t_out) & (t_in > 0), t_in, MISS)
 
 

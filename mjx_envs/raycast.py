@@ -20,7 +20,7 @@ import mujoco
 
 from mjx_envs import ray_geometry
 from mjx_envs.camera import Buffers, Camera
-from mjx_envs.ray_geometry import Vector
+from mjx_envs.ray_geometry import Vector, vector
 from mjx_envs.visible_geoms import AMBIENT, BACKGROUND_RGB, LIGHT_DIRECTION_W, visible_geoms
 
 _CHUNK_PX = 8192
@@ -145,7 +145,7 @@ def _hits(geoms: Geoms, camera: Camera, rays: tuple[jax.Array, jax.Array]) -> It
     origin = jnp.einsum("gji,gj->gi", geoms.rot_w, T[:3, 3] - geoms.pos_w, precision=exact)
     axes = jnp.einsum("gji,jk->gik", geoms.rot_w, T[:3, :3], precision=exact)
     for g, kind in enumerate(geoms.types):
-        yield ray_geometry.HIT[kind](jnp, tuple(origin[g]), _direction(axes[g], *rays), geoms.size[g])
+        yield ray_geometry.HIT[kind](jnp, vector(origin[g]), _direction(axes[g], *rays), geoms.size[g])
 
 
 def _nearest(geoms: Geoms, camera: Camera, rays: tuple[jax.Array, jax.Array]) -> jax.Array:
@@ -179,7 +179,7 @@ def _decode(geoms: Geoms, key: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _direction(axes: Any, x: jax.Array, y: jax.Array) -> Vector:
-    return tuple(axes[i, 0] * x + axes[i, 1] * y + axes[i, 2] for i in range(3))
+    return vector(axes[i, 0] * x + axes[i, 1] * y + axes[i, 2] for i in range(3))
 
 
 def _shade(
@@ -222,28 +222,28 @@ def _local_point(camera: Camera, x: jax.Array, y: jax.Array, t: jax.Array, row: 
     T = jnp.asarray(camera.T_world_cam, jnp.float32)
     direction, pos, rot = _direction(T, x, y), row[_POS], row[_ROT]
     offset = [T[i, 3] - pos[i] + t * direction[i] for i in range(3)]
-    return tuple(sum(rot[3 * i + j] * offset[i] for i in range(3)) for j in range(3))
+    return vector(sum(rot[3 * i + j] * offset[i] for i in range(3)) for j in range(3))
 
 
 def _local_normal(geoms: Geoms, row: jax.Array, *point: jax.Array) -> Vector:
-    local = (0.0, 0.0, 0.0)
+    local: Vector = (0.0, 0.0, 0.0)
     for k, name in enumerate(_kinds(geoms)):
-        candidate = ray_geometry.NORMAL[name](jnp, point, row[_SIZE])
-        local = tuple(jnp.where(row[_KIND] == k, n, o) for n, o in zip(candidate, local, strict=True))
+        candidate = ray_geometry.NORMAL[name](jnp, vector(point), row[_SIZE])
+        local = vector(jnp.where(row[_KIND] == k, n, o) for n, o in zip(candidate, local, strict=True))
     return local
 
 
 def _world_normal(row: jax.Array, winner: jax.Array, *local: jax.Array) -> Vector:
     rot = row[_ROT]
     world = [sum(rot[3 * i + j] * local[j] for j in range(3)) for i in range(3)]
-    return tuple(jnp.where(winner >= 0, n, 0) for n in world)
+    return vector(jnp.where(winner >= 0, n, 0) for n in world)
 
 
 def _lambert(row: jax.Array, winner: jax.Array, *normal_w: jax.Array) -> Vector:
     """One directional light and an ambient share."""
     cosine = sum(n * light for n, light in zip(normal_w, LIGHT_DIRECTION_W, strict=True))
     shade = AMBIENT + (1 - AMBIENT) * jnp.maximum(cosine, 0)
-    return tuple(
+    return vector(
         jnp.where(winner >= 0, shade * albedo, background)
         for albedo, background in zip(row[_RGB], BACKGROUND_RGB, strict=True)
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from mjx_envs import ray_geometry
 from mjx_envs.camera import Buffers, Camera
-from mjx_envs.ray_geometry import Vector
+from mjx_envs.ray_geometry import Vector, vector
 from mjx_envs.visible_geoms import (
     AMBIENT,
     BACKGROUND_RGB,
@@ -115,7 +115,7 @@ def _windows(
     geoms: VisibleGeoms, pos_cam: np.ndarray, rot_cam_g: np.ndarray, camera: Camera
 ) -> list[Window | None]:
     half = _half_extents(geoms)
-    finite = np.isfinite(half).all(axis=1)
+    finite = np.all(np.isfinite(half), axis=1)
     corners = np.where(finite[:, None], half, 1.0)[:, None, :] * _CORNERS
     corners = corners @ rot_cam_g.transpose(0, 2, 1) + pos_cam[:, None, :]
     z = corners[..., 2]
@@ -140,7 +140,7 @@ def _pixel_span(position: np.ndarray, count: int, whole: np.ndarray) -> list[lis
 
 def _direction(rot_g_cam: np.ndarray, x: np.ndarray, y: np.ndarray) -> Vector:
     """Rays in the geom's frame; linear in column and row, so one addition per component and pixel."""
-    return tuple(row[0] * x + (row[1] * y + row[2]) for row in rot_g_cam)
+    return vector(row[0] * x + (row[1] * y + row[2]) for row in rot_g_cam)
 
 
 def _cast(view: _View) -> tuple[np.ndarray, np.ndarray]:
@@ -153,7 +153,7 @@ def _cast(view: _View) -> tuple[np.ndarray, np.ndarray]:
             continue
         direction = _direction(view.rot_g_cam[g], view.x[:, window[1]], view.y[window[0]])
         kind, size = view.geoms.types[g], view.geoms.size[g]
-        t = ray_geometry.HIT[kind](np, tuple(view.origin_g[g]), direction, size)
+        t = ray_geometry.HIT[kind](np, vector(view.origin_g[g]), direction, size)
         nearer = t < nearest[window]
         np.copyto(nearest[window], t, where=nearer)
         winner[window][nearer] = g
@@ -161,8 +161,10 @@ def _cast(view: _View) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _seen(view: _View, winner: np.ndarray) -> Iterator[tuple[int, Window]]:
-    for g in np.flatnonzero(np.bincount(winner.ravel() + 1, minlength=1)[1:]):
-        yield int(g), view.windows[g]
+    pixels = np.bincount(winner.ravel() + 1, minlength=len(view.windows) + 1)[1:]
+    for g, window in enumerate(view.windows):
+        if window is not None and pixels[g]:
+            yield g, window
 
 
 def _shade(
@@ -183,10 +185,10 @@ def _shade(
     else:
         direction = _direction(view.rot_g_cam[g], view.x[0, columns], view.y[rows, 0])
         depth = t[rows, columns]
-        point = tuple(o + depth * d for o, d in zip(view.origin_g[g], direction, strict=True))
+        point = vector(o + depth * d for o, d in zip(view.origin_g[g], direction, strict=True))
         local = ray_geometry.NORMAL[view.geoms.types[g]](np, point, view.geoms.size[g])
         normal = np.stack(local, axis=-1) @ view.rot_w[g].T
-    lambert = np.maximum(normal @ np.float32(LIGHT_DIRECTION_W), 0)
+    lambert = np.maximum(normal @ np.asarray(LIGHT_DIRECTION_W, np.float32), 0)
     shade = np.float32(AMBIENT) + np.float32(1 - AMBIENT) * lambert
     normal_w[rows, columns] = normal
     rgb[rows, columns] = shade[:, None] * view.geoms.rgb[g]

@@ -17,6 +17,9 @@ AMBIENT = 0.45
 LIGHT_DIRECTION_W = (0.3244428, -0.4866643, 0.8111071)
 """Unit vector towards the light, world frame."""
 
+_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
+"""MuJoCo's: a geom that has it takes its material's colour."""
+
 _TYPE_NAMES = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): "plane",
     int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
@@ -48,7 +51,7 @@ def visible_geoms(model: mujoco.MjModel) -> VisibleGeoms:
     ids = np.flatnonzero(np.isin(model.geom_group, VISIBLE_GROUPS) & (rgba[:, 3] > 0)).astype(np.int32)
     return VisibleGeoms(
         ids=ids,
-        types=tuple(_type_name(model, i) for i in ids),
+        types=tuple(_type_name(model, int(i)) for i in ids),
         size=model.geom_size[ids].astype(np.float32),
         rgb=rgba[ids, :3].astype(np.float32),
     )
@@ -57,7 +60,7 @@ def visible_geoms(model: mujoco.MjModel) -> VisibleGeoms:
 def _rgba(model: mujoco.MjModel) -> np.ndarray:
     """(ngeom, 4) colours as MuJoCo's visualiser picks them: the material's unless the geom has its own."""
     rgba = np.array(model.geom_rgba)
-    from_material = (model.geom_matid >= 0) & np.all(rgba == np.float32([0.5, 0.5, 0.5, 1.0]), axis=1)
+    from_material = (model.geom_matid >= 0) & np.all(rgba == _DEFAULT_RGBA, axis=1)
     rgba[from_material] = model.mat_rgba[model.geom_matid[from_material]]
     return rgba
 

@@ -1,5 +1,7 @@
 """What a depth camera sees of a batch of environments: physics state to pictures by the JAX ray caster."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jp
 import numpy as np
@@ -68,8 +70,7 @@ class Viewer:
         return jax.lax.map(draw, (geoms, T_world_cam))
 
     def _seen_from(self, T_world_cam: jax.Array) -> Camera:
-        c = self._camera
-        return Camera(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.height_px, c.width_px, T_world_cam)  # pyright: ignore
+        return dataclasses.replace(self._camera, T_world_cam=T_world_cam)
 
 
 def to_mm(depth_m: jax.Array) -> jax.Array:

@@ -5,8 +5,10 @@ environments included, is one pytree, so that a checkpoint of it resumes exactly
 """
 
 import math
+from collections.abc import Hashable
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jp
@@ -21,6 +23,9 @@ from ddgrasp import contract
 from ddgrasp.config import TeacherConfig
 from ddgrasp.errors import UserError
 from mjx_envs.grasp_env import AutoReset
+
+# The pyright ignores below are for annotations of Brax and optax: Brax's dataclasses get their decorator
+# through `import flax`, which types do not follow; optax has no type for "any pytree".
 
 OBSERVATION_STD_MIN = 0.01
 """Bounds the normalised size of components that hardly ever move, such as an upright object's tilt."""
@@ -48,14 +53,23 @@ def make_networks(config: TeacherConfig) -> ppo_networks.PPONetworks:
     networks = ppo_networks.make_ppo_networks(
         contract.OBSERVATION_SIZE,
         contract.ACTION_SIZE,
-        preprocess_observations_fn=running_statistics.normalize,
+        preprocess_observations_fn=running_statistics.normalize,  # pyright: ignore[reportArgumentType]
         policy_hidden_layer_sizes=config.hidden,
         value_hidden_layer_sizes=config.hidden,
         activation=linen.elu,
     )
     scale = config.action_std / math.log(2.0)  # softplus(0) = log 2
-    noise = distribution.NormalTanhDistribution(contract.ACTION_SIZE, min_std=0.01, var_scale=scale)
-    return networks.replace(parametric_action_distribution=noise)
+    noise = distribution.NormalTanhDistribution(
+        contract.ACTION_SIZE,
+        min_std=0.01,
+        var_scale=scale,  # pyright: ignore[reportArgumentType]  # declared int, used as a factor
+    )
+    return networks.replace(parametric_action_distribution=noise)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def network_params(policy: Any, value: Any) -> ppo_losses.PPONetworkParams:
+    """Brax's pair of policy and value parameters."""
+    return ppo_losses.PPONetworkParams(policy, value)  # pyright: ignore[reportCallIssue]
 
 
 def iterations(config: TeacherConfig) -> int:
@@ -71,22 +85,23 @@ def make_optimizer(config: TeacherConfig) -> optax.GradientTransformation:
         schedule = optax.linear_schedule(rate, 0.1 * rate, updates)
         return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
 
-    parts = {"policy": adam(config.learning_rate), "value": adam(config.critic_learning_rate)}
-    return optax.multi_transform(parts, ppo_losses.PPONetworkParams("policy", "value"))  # pyright: ignore
+    parts: dict[Hashable, optax.GradientTransformation] = {
+        "policy": adam(config.learning_rate),
+        "value": adam(config.critic_learning_rate),
+    }
+    return optax.multi_transform(parts, network_params("policy", "value"))
 
 
 def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
     """A fresh learner and its environments."""
     k_policy, k_value, k_env, k_next = jax.random.split(key, 4)
     networks = make_networks(config)
-    params = ppo_losses.PPONetworkParams(
-        networks.policy_network.init(k_policy), networks.value_network.init(k_value)
-    )
+    params = network_params(networks.policy_network.init(k_policy), networks.value_network.init(k_value))
     normalizer = running_statistics.init_state(specs.Array((contract.OBSERVATION_SIZE,), jp.dtype("float32")))
     return LearnerState(
         params=params,
         normalizer=normalizer,
-        opt_state=make_optimizer(config).init(params),
+        opt_state=make_optimizer(config).init(params),  # pyright: ignore[reportArgumentType]
         env_state=env.reset(jax.random.split(k_env, config.num_envs)),
         key=k_next,
         iteration=jp.zeros((), jp.int32),
@@ -100,8 +115,15 @@ def warm_start(state: LearnerState, saved: dict) -> LearnerState:
         raise UserError(
             "The teacher of teacher.init_from has other layers than teacher.hidden asks for: use the same."
         )
-    normalizer = state.normalizer.replace(mean=jp.asarray(saved["mean"]), std=jp.asarray(saved["std"]))
-    return state.replace(params=state.params.replace(policy=policy), normalizer=normalizer)
+    normalizer = replace(state.normalizer, mean=jp.asarray(saved["mean"]), std=jp.asarray(saved["std"]))
+    return with_policy(state, policy, normalizer)
+
+
+def with_policy(
+    state: LearnerState, policy: Any, normalizer: running_statistics.RunningStatisticsState
+) -> LearnerState:
+    """`state` with another policy and its normaliser; value network, optimiser and environments stay."""
+    return replace(state, params=network_params(policy, state.params.value), normalizer=normalizer)
 
 
 def iteration(
@@ -160,9 +182,11 @@ def _improve(config, networks, normalizer, data, key, state):
         batch, k_loss = batch_and_key
         (_, terms), grads = jax.value_and_grad(loss_fn, has_aux=True)(params, normalizer, batch, k_loss)
         learns = state.iteration >= config.critic_warmup
-        grads = grads.replace(policy=jax.tree.map(lambda g: jp.where(learns, g, 0.0), grads.policy))
+        policy_grads = jax.tree.map(lambda g: jp.where(learns, g, 0.0), grads.policy)
+        grads = network_params(policy_grads, grads.value)
         updates, opt_state = optimizer.update(grads, opt_state, params)
-        return (optax.apply_updates(params, updates), opt_state), terms
+        params = cast(ppo_losses.PPONetworkParams, optax.apply_updates(params, updates))
+        return (params, opt_state), terms
 
     def epoch(carry, k_epoch):
         k_permute, k_loss = jax.random.split(k_epoch)

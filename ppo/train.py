@@ -112,7 +112,9 @@ def _start(
             manager.save(0, args=ocp.args.StandardSave(state), force=True)
             manager.wait_until_finished()
         return state
-    return manager.restore(manager.latest_step(), args=ocp.args.StandardRestore(state))
+    restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore(state))
+    assert isinstance(restored, learner.LearnerState)
+    return restored
 
 
 def _log(i: int, metrics, progress: Progress, task) -> None:

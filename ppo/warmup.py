@@ -50,7 +50,7 @@ def clone_guide(
             policy, opt_state, loss = fit(normalizer, policy, opt_state, everything[index], wanted[index])
             progress.scalars(i, clone_loss=float(loss))
             task.advance(loss=float(loss))
-    return state.replace(params=state.params.replace(policy=policy), normalizer=normalizer)
+    return learner.with_policy(state, policy, normalizer)
 
 
 class _Collector:

@@ -11,11 +11,12 @@ from ddgrasp import contract
 from ddgrasp.config import ExportConfig, StudentConfig
 from deploy.interfaces import CameraError, Clock, Frame, RobotState
 from export import metadata
+from mjx_envs import scene
 
 PROFILE = contract.D455.scaled(1 / 80)
 """16 x 9 pixels."""
 SHAPE = (PROFILE.height_px, PROFILE.width_px)
-HOME_RAD = np.array([0.0, -0.2, 0.0, -2.485, 0.0, 2.2836, 0.7854])
+HOME_RAD = np.array(scene.HOME_RAD)
 
 
 def describe(depth_dtype: str = "uint16_mm", chunk: int = 4, execute_steps: int = 1, **changes):

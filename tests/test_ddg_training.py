@@ -32,7 +32,7 @@ TINY = DDGConfig(
 def pictures(count: int = 16) -> Frames:
     """A near square at a random place; the sensor loses the four columns left of it."""
     rng = np.random.default_rng(0)
-    clean = np.full((count, 16, 24), 2.0, np.float32)
+    clean = np.full((count, TINY.height_px, TINY.width_px), 2.0, np.float32)
     noisy = clean.copy()
     for i in range(count):
         row, column = rng.integers(2, 8), rng.integers(6, 16)
@@ -77,7 +77,7 @@ def fitted(tmp_path_factory):
 @pytest.fixture(scope="module")
 def scene():
     """Clean depth never seen in training."""
-    depth = np.full((6, 16, 24), 2.0, np.float32)
+    depth = np.full((6, TINY.height_px, TINY.width_px), 2.0, np.float32)
     depth[:, 5:11, 11:17] = 0.8
     return depth
 

@@ -6,9 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from deploy_support import HOME_RAD, KinematicRobot, constant_bias, describe, write_policy
-
 from ddgrasp import contract
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
@@ -20,6 +17,7 @@ from deploy.realsense_camera import RealSenseCamera
 from deploy.replay_camera import ReplayCamera
 from deploy.safety import SafetyFilter, SafetyLimits
 from deploy.session import SessionOptions, deploy
+from deploy_support import HOME_RAD, KinematicRobot, constant_bias, describe, write_policy
 from sensors.recordings import RecordingWriter
 
 SIZE = (45, 80)

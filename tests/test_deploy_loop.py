@@ -2,15 +2,17 @@
 
 import os
 import signal
-import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
+from ddgrasp.errors import UserError
+from deploy.clock import RealClock, SimClock
+from deploy.loop import ControlLoop, LoopSettings
+from deploy.policy import OnnxPolicy
+from deploy.safety import SafetyFilter, SafetyLimits
 from deploy_support import (
     HOME_RAD,
     SHAPE,
@@ -21,12 +23,6 @@ from deploy_support import (
     describe,
     write_policy,
 )
-
-from ddgrasp.errors import UserError
-from deploy.clock import RealClock, SimClock
-from deploy.loop import ControlLoop, LoopSettings
-from deploy.policy import OnnxPolicy
-from deploy.safety import SafetyFilter, SafetyLimits
 
 LIMITS = SafetyLimits(acceleration_rad_s2=(1e6,) * 7)
 

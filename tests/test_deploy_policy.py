@@ -1,16 +1,11 @@
 """An exported file on the robot side: checks at loading, frame buffer, chunks, noise."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from deploy_support import SHAPE, constant_bias, depth_mm, describe, write_policy
-
 from ddgrasp.errors import UserError
 from deploy.policy import OnnxPolicy
+from deploy_support import SHAPE, constant_bias, depth_mm, describe, write_policy
 
 STATE = np.zeros(8, np.float32)
 

@@ -2,14 +2,10 @@
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from deploy_support import write_policy
 
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Config, DeployConfig, EvalConfig, WorldConfig
@@ -20,6 +16,7 @@ from deploy.clock import SimClock
 from deploy.rig_eval import Trial, TrialResult, plan, run_trials
 from deploy.sim_robot import SimRobot
 from deploy.stage import TrialLog, metrics
+from deploy_support import write_policy
 from export import metadata
 from mjx_envs.camera import nominal_camera
 

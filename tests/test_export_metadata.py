@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from ddgrasp import contract
-from ddgrasp.config import ExportConfig, StudentConfig
+from ddgrasp.config import ExportConfig, StudentConfig, WorldConfig
 from ddgrasp.errors import UserError
 from export import metadata
 
-PROFILE = contract.D455.scaled(0.25)
+PROFILE = WorldConfig().profile
 GOOD = metadata.describe(StudentConfig(), ExportConfig(), PROFILE, student_manifest_hash="abc")
 
 

@@ -9,14 +9,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from ddgrasp import contract
-from ddgrasp.config import RecordConfig, StereoConfig
+from ddgrasp.config import RecordConfig, StereoConfig, WorldConfig
 from mjx_envs.camera import Buffers, Camera, nominal_camera
 from sensors import stats
 from sensors.active_stereo import ActiveStereo, Material
 from sensors.rig_camera import RigCamera, jittered_pose
 
-PROFILE = contract.D455.scaled(0.25)
+PROFILE = WorldConfig().profile
 FB_PX_M = PROFILE.fx_px * PROFILE.baseline_m
 GREY = {0: Material(0.5, texture=0.1), 1: Material(0.5, texture=0.1)}
 T_WORLD_CAM = np.eye(4)

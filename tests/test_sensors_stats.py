@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ddgrasp import contract
+from ddgrasp.config import WorldConfig
 from sensors import stats
 from sensors.procedural import ProceduralConfig, corrupt
 
@@ -37,7 +37,7 @@ def test_decimation_is_the_median_of_valid_pixels():
 
 
 def test_procedural_rates_and_disparity_noise():
-    profile = contract.D455.scaled(0.25)
+    profile = WorldConfig().profile
     clean = np.full((8, 180, 320), 0.8, np.float32)
     clean[:, :, :40] = 0
     config = ProceduralConfig(dropout=0.02, random_value=0.01, sticks=0)
@@ -53,7 +53,7 @@ def test_procedural_rates_and_disparity_noise():
 
 
 def test_procedural_without_noise_is_the_identity():
-    profile = contract.D455.scaled(0.25)
+    profile = WorldConfig().profile
     clean = np.random.default_rng(0).uniform(0.4, 1.5, (2, 90, 160)).astype(np.float32)
     off = ProceduralConfig(shift_px=0, disparity_px=0, dropout=0, random_value=0, sticks=0)
     np.testing.assert_allclose(corrupt(clean, np.random.default_rng(0), profile, off), clean, rtol=1e-5)
