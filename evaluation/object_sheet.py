@@ -32,7 +32,7 @@ def look(spec: ObjectSpec) -> Buffers:
     data.qpos[9:12] = (*contract.WORKSPACE_CENTER_M, spec.rest_height_m)
     data.qpos[12:16] = kinematics.quat_about_z(np.asarray(YAW_RAD))
     mujoco.mj_kinematics(model, data)
-    return raycast_numpy.render(model, data, _close_camera(spec.rest_height_m))
+    return raycast_numpy.render(model, data, close_camera(spec.rest_height_m))
 
 
 def draw(names: Sequence[str]) -> bytes:
@@ -60,8 +60,8 @@ def draw(names: Sequence[str]) -> bytes:
     return figures.to_png(figure)
 
 
-def _close_camera(height_m: float) -> Camera:
-    """From the nominal camera's place, turned to the object and zoomed in."""
+def close_camera(height_m: float) -> Camera:
+    """From the nominal camera's place, turned to the workspace's centre at `height_m` and zoomed in."""
     target = np.array([*contract.WORKSPACE_CENTER_M, height_m])
     distance = float(np.linalg.norm(target - contract.CAMERA_POSITION_M))
     focal_px = WIDTH_PX * distance / WIDTH_M
