@@ -257,9 +257,10 @@ class ObjectsSheet:
 
     def run(self) -> None:
         from evaluation.object_sheet import draw
-        from mjx_envs.objects import SEEN, UNSEEN
+        from mjx_envs.objects import OBJECTS, SEEN, UNSEEN
 
-        artifacts.atomic_write_bytes(self.out, draw(self.objects or (*SEEN, *UNSEEN)))
+        everything = tuple(dict.fromkeys((*SEEN, *UNSEEN, *OBJECTS)))
+        artifacts.atomic_write_bytes(self.out, draw(self.objects or everything))
         print(self.out)
 
 

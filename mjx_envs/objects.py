@@ -317,7 +317,7 @@ OBJECTS: dict[str, ObjectSpec] = {
         ObjectSpec(
             "wheel", 11, mass_kg=0.040, friction=0.9, rgb=(0.22, 0.22, 0.23), rest_height_m=0.0135,
             grasp_symmetry=8, capsules=_torus(ring_m=0.0195, radius_m=0.0135),
-            cylinders=(Cylinder(0.016, 0.0115, rgb=(0.90, 0.75, 0.10)), Cylinder(0.004, 0.0118)),
+            cylinders=(Cylinder(0.016, 0.0126, rgb=(0.90, 0.75, 0.10)), Cylinder(0.004, 0.0129)),
             source="the 65 mm rubber-tyred wheel of hobby gear motors; width, mass, friction: our estimates",
         ),
         ObjectSpec(
