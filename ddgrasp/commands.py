@@ -64,7 +64,7 @@ class TeacherTrain(_OneStage):
 
 @dataclass(frozen=True)
 class TeacherEval:
-    """Measure a trained teacher again: success per object, over as many trials as asked for."""
+    """Measure a trained teacher again: success and motion per object, over as many trials as asked for."""
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run."""
@@ -84,6 +84,12 @@ class TeacherEval:
         result = evaluate(GraspEnv(config.world), policy, self.trials, self.seed)
         for name, counts in {**result["objects"], "all": result["success"]}.items():
             print(f"{name:<12} {wilson.describe(wilson.success(counts['successes'], counts['n']))}")
+        columns = list(result["motion"][-1])
+        print("\n" + "  ".join([f"{columns[0]:<12}", *columns[1:]]))
+        for row in result["motion"]:
+            numbers = (f"{row[column]:>{len(column)}.3f}" for column in columns[1:])
+            print("  ".join([f"{row['object']:<12}", *numbers]))
+        print("acceleration and jerk relative to Franka's limits, over 100 ms; toggles per episode")
 
 
 @dataclass(frozen=True)
