@@ -25,6 +25,16 @@ OUT_OF_REACH_M = 0.35
 
 
 @struct.dataclass
+class Latency:
+    """Commands on their way to the robot."""
+
+    late: jax.Array
+    """() bool, whether they take a control step in this episode."""
+    controls: jax.Array
+    """(9,) the last step's."""
+
+
+@struct.dataclass
 class Episode:
     """What stays fixed during an episode, and its counters."""
 
@@ -42,6 +52,8 @@ class Episode:
     """() consecutive steps with the object at the target."""
     grasped: jax.Array
     """() bool."""
+    latency: Latency | None = None
+    """None unless configured."""
 
 
 class GraspEnv(mjx_env.MjxEnv):
@@ -76,6 +88,7 @@ class GraspEnv(mjx_env.MjxEnv):
             steps=jp.zeros((), jp.int32),
             hold_count=jp.zeros((), jp.int32),
             grasped=jp.zeros((), bool),
+            latency=self._latency(rng, qpos),
         )
         obs = self._get_obs(state, episode)
         metrics = {f"reward/{name}": jp.zeros(()) for name in rewards.TERMS}
@@ -87,7 +100,8 @@ class GraspEnv(mjx_env.MjxEnv):
         """One control step with `action` (8,)."""
         old: physics.PhysicsState = state.data
         episode: Episode = state.info["episode"]
-        new = self.physics.step(episode.params, old, grasp_math.controls(old.qpos[:7], action, jp))
+        controls, latency = self._delayed(episode.latency, grasp_math.controls(old.qpos[:7], action, jp))
+        new = self.physics.step(episode.params, old, controls)
         finite = jp.all(jp.isfinite(new.qpos)) & jp.all(jp.isfinite(new.qvel))
         new = jax.tree.map(lambda a, b: jp.where(finite, a, b), new, old)
 
@@ -111,8 +125,9 @@ class GraspEnv(mjx_env.MjxEnv):
         lost = (lost & ~grasped) | ~finite
         over = steps >= self.config.episode_steps
         episode = replace(
-            episode, distances=distances, action=action, steps=steps, hold_count=hold_count, grasped=grasped
-        )
+            episode, distances=distances, action=action, steps=steps, hold_count=hold_count, grasped=grasped,
+            latency=latency,
+        )  # fmt: skip
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jp.float32)
         metrics["saturated"] = jp.mean(jp.abs(action[:7]) > 0.95)
@@ -137,6 +152,21 @@ class GraspEnv(mjx_env.MjxEnv):
     def _distances(self, qpos, index, branch) -> rewards.Distances:
         grasp_pos, grasp_quat = self._grasp_pose(qpos, index, branch)
         return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[:7], jp))
+
+    def _latency(self, rng, qpos) -> Latency | None:
+        """At the start: the robot holds its pose, gripper open."""
+        share = self.config.random.latency_share
+        if share == 0:
+            return None
+        late = jax.random.uniform(jax.random.fold_in(rng, 1)) < share
+        return Latency(late, grasp_math.controls(qpos[:7], jp.zeros(contract.ACTION_SIZE), jp))
+
+    def _delayed(self, latency: Latency | None, controls) -> tuple[jax.Array, Latency | None]:
+        """The controls in force now, and what is on its way then."""
+        if latency is None:
+            return controls, None
+        now = jp.where(latency.late, latency.controls, controls)
+        return now, replace(latency, controls=controls)
 
     def _grasp_pose(self, qpos, index, branch) -> tuple[jax.Array, jax.Array]:
         symmetry, offset = self._symmetry(index), self._grasp_offset(index)

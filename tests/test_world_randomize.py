@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ddgrasp import contract
-from ddgrasp.config import RandomConfig
+from ddgrasp.config import RandomConfig, WorldConfig
 from mjx_envs import grasp_math, kinematics, physics, randomize, scene
 from mjx_envs.camera import nominal_camera
+from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.objects import OBJECTS
 from mjx_envs.rig import RigWorld
 
@@ -85,7 +86,7 @@ def sampler(table):
 
 
 def test_every_range_is_listed():
-    assert {field.name for field in fields(RandomConfig)} == {*MOVES, "crop_px"}
+    assert {field.name for field in fields(RandomConfig)} == {*MOVES, "crop_px", "latency_share"}
 
 
 @pytest.mark.parametrize("field", MOVES)
@@ -166,3 +167,21 @@ def test_a_range_reaches_the_model_of_both_worlds(field, table):
     plain.reset(5, "cube")
     moved = {name for name in one if not np.allclose(getattr(rig.model, name), getattr(plain.model, name))}
     assert moved == MODEL_FIELDS[field]
+
+
+def test_latency_delays_commands_by_one_step_in_its_share_of_the_episodes():
+    env = GraspEnv(WorldConfig(objects=("cube",), random=replace(NOTHING, latency_share=0.5)))
+    reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+    state = reset(jax.random.split(jax.random.PRNGKey(0), 64))
+    late = np.asarray(state.info["episode"].latency.late)
+    assert 16 < late.sum() < 48
+    bend = jp.zeros((64, 8)).at[:, 3].set(0.5).at[:, 7].set(1.0)  # elbow, and close
+    path = []
+    for action in (bend, -bend, -bend):
+        state = step(state, action)
+        path.append(np.asarray(state.data.qpos[:, :9]) - np.append(scene.HOME_RAD, (0.04, 0.04)))
+    path = np.stack(path)  # all start alike, far from the cube: only latency tells them apart
+    prompt, delayed = path[:, ~late], path[:, late]
+    assert np.abs(prompt[0, :, 3]).min() > 0.01 and prompt[0, :, 7].max() < -0.01
+    assert np.abs(delayed[0]).max() < 1e-3  # holds still
+    np.testing.assert_allclose(delayed[1], np.broadcast_to(prompt[0, :1], delayed[1].shape), atol=1e-3)
