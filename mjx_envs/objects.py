@@ -5,8 +5,8 @@ number of capsules whose sizes and poses differ per environment. Slots an object
 to a millimetre and hide inside it. How many slots there are follows from the objects chosen: with
 none that needs more, a run has the box and four capsules (`SlotLayout`).
 
-MJX collides no cylinder with a box, so cylinders are drawn only: what they enclose collides as box
-and capsules.
+The box and the capsules collide; cylinders (MJX collides none with a box) and plates are drawn only,
+around or between them.
 """
 
 import math
@@ -24,22 +24,28 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class SlotLayout:
-    """Geoms of the object's body, in this order: one box, then capsules, then drawn cylinders."""
+    """Geoms of the object's body, in this order: one box, capsules, then what is drawn only."""
 
     capsules: int = 4
     cylinders: int = 0
+    plates: int = 0
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """MuJoCo's geom type of each slot."""
-        return ("box",) + ("capsule",) * self.capsules + ("cylinder",) * self.cylinders
+        drawn = ("cylinder",) * self.cylinders + ("box",) * self.plates
+        return ("box",) + ("capsule",) * self.capsules + drawn
 
     @property
     def names(self) -> tuple[str, ...]:
         """Geom names: slot_box, slot_capsule0, ..."""
         numbered = [
             f"slot_{kind}{i}"
-            for kind, count in (("capsule", self.capsules), ("cylinder", self.cylinders))
+            for kind, count in (
+                ("capsule", self.capsules),
+                ("cylinder", self.cylinders),
+                ("plate", self.plates),
+            )  # fmt: skip
             for i in range(count)
         ]
         return ("slot_box", *numbered)
@@ -86,6 +92,18 @@ class Cylinder:
 
 
 @dataclass(frozen=True)
+class Plate:
+    """A box from the x axis outwards, turned about x; drawn only."""
+
+    half_length_m: float
+    height_m: float
+    """From the axis."""
+    half_thickness_m: float
+    roll_rad: float
+    """0 stands up, along z."""
+
+
+@dataclass(frozen=True)
 class ObjectSpec:
     """An object that lies on the table with its frame's z axis up.
 
@@ -108,6 +126,7 @@ class ObjectSpec:
     box: Box | None = None
     capsules: tuple[Capsule, ...] = ()
     cylinders: tuple[Cylinder, ...] = ()
+    plates: tuple[Plate, ...] = ()
     grasp_offset_m: Vector = (0.0, 0.0, 0.0)
     """From the origin to the grasp, object frame; not scaled with the object's randomised size."""
     source: str = ""
@@ -131,6 +150,10 @@ class ObjectSpec:
             quat[i] = _quat_z_to(end - start)
         for i, cylinder in enumerate(self.cylinders, start=1 + layout.capsules):
             size[i], pos[i] = (cylinder.radius_m, cylinder.half_height_m, 0.0), 0.0
+        for i, plate in enumerate(self.plates, start=1 + layout.capsules + layout.cylinders):
+            up = np.array([0.0, -math.sin(plate.roll_rad), math.cos(plate.roll_rad)])
+            size[i] = (plate.half_length_m, plate.half_thickness_m, plate.height_m / 2)
+            pos[i], quat[i] = plate.height_m / 2 * up, _quat_z_to(up)
         return size, pos, quat
 
     def slot_rgb(self, layout: SlotLayout) -> np.ndarray:
@@ -175,6 +198,7 @@ def slot_layout(specs: Iterable[ObjectSpec]) -> SlotLayout:
     return SlotLayout(
         capsules=max([DEFAULT_SLOTS.capsules, *(len(s.capsules) for s in specs)]),
         cylinders=max([DEFAULT_SLOTS.cylinders, *(len(s.cylinders) for s in specs)]),
+        plates=max([DEFAULT_SLOTS.plates, *(len(s.plates) for s in specs)]),
     )
 
 
@@ -235,9 +259,14 @@ def _disc(across_m: float, height_m: float) -> tuple[Capsule, ...]:
     return tuple(Capsule(ends[i], ends[i + 4], radius) for i in range(4))
 
 
-def _star(ring_m: float, radius_m: float, half_m: float) -> tuple[Capsule, ...]:
+def _star_edges(ring_m: float, radius_m: float, half_m: float) -> tuple[Capsule, ...]:
     """Five capsules along x around it, one of them straight up."""
     return tuple(_along_x(half_m, radius_m, y, z) for z, y in _around_z(5, ring_m))
+
+
+def _star_sides(ring_m: float, radius_m: float, half_m: float) -> tuple[Plate, ...]:
+    """Five plates from the axis to the edges."""
+    return tuple(Plate(half_m, ring_m, radius_m, 2 * math.pi * i / 5) for i in range(5))
 
 
 _FRUIT = "friction: golden apple on rubber 0.42 to 0.48 (Ooi Abdullah and Ch'ng 2022)"
@@ -296,7 +325,8 @@ OBJECTS: dict[str, ObjectSpec] = {
         ObjectSpec(
             "starfruit", 8, mass_kg=0.091, friction=0.5, rgb=(0.82, 0.80, 0.20), rest_height_m=0.0223,
             grasp_symmetry=2,
-            capsules=(*_star(ring_m=0.022, radius_m=0.0045, half_m=0.033), *_star(0.011, 0.0085, 0.0375)),
+            capsules=(_along_x(0.034, 0.012), *_star_edges(ring_m=0.022, radius_m=0.0045, half_m=0.036)),
+            plates=_star_sides(ring_m=0.022, radius_m=0.0045, half_m=0.038),
             source="92 mm long, 91 g: USDA FoodData Central 171715, medium; " + _FRUIT,
         ),
         ObjectSpec(

@@ -126,7 +126,7 @@ def _hand_xml() -> str:
 def _object_xml(layout: SlotLayout) -> str:
     cube = OBJECTS["cube"]
     slots = "".join(
-        f'<geom name="{n}" class="{"drawn_" if k == "cylinder" else ""}slot" type="{k}" '
+        f'<geom name="{n}" class="{"" if n in layout.colliding_names else "drawn_"}slot" type="{k}" '
         f'size="{_fmt(s)}" pos="{_fmt(p)}" quat="{_fmt(q)}"/>'
         for n, k, s, p, q in zip(layout.names, layout.kinds, *cube.slot_arrays(layout), strict=True)
     )

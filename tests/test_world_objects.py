@@ -79,6 +79,13 @@ def inside(spec: ObjectSpec, points: np.ndarray) -> np.ndarray:
     for cylinder in spec.cylinders:
         radial = np.hypot(points[:, 0], points[:, 1])
         within |= (radial <= cylinder.radius_m) & (np.abs(points[:, 2]) <= cylinder.half_height_m)
+    for plate in spec.plates:
+        cos, sin = np.cos(plate.roll_rad), np.sin(plate.roll_rad)
+        out, across = points @ [0.0, -sin, cos], points @ [0.0, cos, sin]
+        within |= (
+            (np.abs(points[:, 0]) <= plate.half_length_m) & (np.abs(across) <= plate.half_thickness_m)
+            & (out >= 0) & (out <= plate.height_m)
+        )  # fmt: skip
     return within
 
 
@@ -155,11 +162,11 @@ def test_the_grasp_offset_turns_with_the_object():
 
 def test_the_scene_has_as_many_slots_as_the_chosen_objects_need():
     assert ObjectTable(("cube", "apple", "banana")).layout == DEFAULT_SLOTS
-    assert ObjectTable(SEEN).layout == DEFAULT_SLOTS == SlotLayout(capsules=4, cylinders=0)
+    assert ObjectTable(SEEN).layout == DEFAULT_SLOTS == SlotLayout(capsules=4, cylinders=0, plates=0)
     assert ObjectTable(("cube", "wheel")).layout == SlotLayout(capsules=8, cylinders=2)
     twelve = ObjectTable(TWELVE)
-    assert twelve.layout == SlotLayout(capsules=10, cylinders=2)
-    assert twelve.slot_size.shape == (12, 13, 3) and twelve.rgb.shape == (12, 13, 3)
+    assert twelve.layout == SlotLayout(capsules=8, cylinders=2, plates=5)
+    assert twelve.slot_size.shape == (12, 16, 3) and twelve.rgb.shape == (12, 16, 3)
     model = scene.build_model(layout=twelve.layout)
     assert [model.geom(i).name for i in scene.slot_ids(model)] == list(twelve.layout.names)
 
@@ -173,12 +180,17 @@ def test_unused_slots_hide_inside_and_change_no_picture(name):
     np.testing.assert_array_equal(alone.rgb, crowded.rgb)
 
 
-def test_drawn_cylinders_touch_nothing():
-    model, data = place(get_object("can"))
-    cylinders = {i for i in scene.slot_ids(model) if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CYLINDER}
+@pytest.mark.parametrize("name", ["can", "starfruit"])
+def test_what_is_drawn_only_touches_nothing(name):
+    spec = get_object(name)
+    model, data = place(spec)
+    data.qpos[11] -= 0.01  # into the table
+    mujoco.mj_forward(model, data)
+    colliding = slot_layout([spec]).colliding_names
+    drawn = {int(i) for i in scene.slot_ids(model) if model.geom(i).name not in colliding}
     touching = {int(g) for contact in data.contact for g in contact.geom}
-    assert len(cylinders) == 2 and len(touching) > 1
-    assert not cylinders & touching
+    assert len(drawn) == len(spec.cylinders) + len(spec.plates) > 1 and len(touching) > 1
+    assert not drawn & touching
 
 
 def test_mjx_takes_the_scene_of_all_twelve():
