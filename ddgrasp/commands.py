@@ -12,6 +12,7 @@ import tyro
 
 from ddgrasp import artifacts, pipeline
 from ddgrasp.config import Config
+from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 
 DEFAULT_PRESET = "demo"
@@ -324,8 +325,10 @@ _PRESET_HELP = (
 
 def check_config_values(config: Config) -> Config:
     """`config` if the names in it exist; UserError that suggests the nearest right name otherwise."""
-    from mjx_envs.objects import get_object
+    from mjx_envs.objects import OBJECTS, get_object
 
+    if not config.world.objects:
+        raise UserError(f"world.objects is empty; expected at least one of {', '.join(OBJECTS)}.")
     for name in config.world.objects:
         get_object(name)
     return config
