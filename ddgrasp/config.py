@@ -330,11 +330,24 @@ class StudentConfig:
     """Keypoints of spatial_softmax, or channels per cell of tokens."""
     feature_size: int = 128
     """Length of the encoder's output vector."""
+    # --- hand view (student_jax/hand_view.py) ---
+    hand_view_px: int = 48
+    """Samples per side of the picture around the hand; 0 turns the hand view off."""
+    hand_view_pitch_m: float = 0.004
+    """Distance of its samples, metres at the hand's distance from the camera."""
+    hand_view_width: int = 32
+    """Channels of its convolutions."""
+    hand_view_blocks: int = 2
+    """Its basic blocks."""
+    hand_view_channels: int = 8
+    """Channels kept per 4x4 patch before they are flattened."""
+    hand_view_features: int = 96
+    """Length of its output vector."""
+    # --- action head (student_jax/policy.py, denoiser.py) ---
+    features_to_head: bool = False
+    """Give the encoder's vector to the action head."""
     aux_to_head: bool = True
     """Give the predicted object position, grasp yaw and held probability to the action head."""
-    aux_stop_gradient: bool = False
-    """Keep the action loss from changing the auxiliary predictions."""
-    # --- action head (student_jax/denoiser.py) ---
     chunk: int = 2
     """Actions predicted at once."""
     execute_steps: int = 1
@@ -367,7 +380,20 @@ class StudentConfig:
     ema_decay: float = 0.995
     """Decay of the averaged parameters, which are the ones used."""
     aux_weight: float = 1.0
-    """Weight of the privileged auxiliary losses against the diffusion loss."""
+    """Weight of the privileged losses (position, yaw, held) on pictures."""
+    action_weight: float = 0.0
+    """Weight of the diffusion loss on pictures; 0 trains the head on what perception reports instead."""
+    held_weight: float = 0.3
+    """How often a step with the object in the hand is drawn, relative to one before the grasp."""
+    demo_held_steps: int = 16
+    """Steps of a demo kept from the grasp on: the lift and a little of the hold."""
+    # --- head on true poses (student_jax/privileged.py) ---
+    pose_rounds: int = 8
+    """DAgger rounds without pictures, in which the head learns to act from noisy true poses; 0 for none."""
+    pose_episodes: int = 256
+    """Episodes per such round."""
+    pose_steps: int = 1000
+    """Optimiser steps per such round."""
     clean_share: float = 0.2
     """Share of the episodes that keep clean depth."""
     crop_shift_px: int = 6

@@ -57,8 +57,15 @@ DEBUG = Config(
     student=StudentConfig(
         width=8,
         keypoints=8,
+        hand_view_px=16,
+        hand_view_pitch_m=0.008,
+        hand_view_width=8,
+        hand_view_blocks=1,
         denoiser_width=32,
         denoiser_blocks=1,
+        pose_rounds=1,
+        pose_episodes=4,
+        pose_steps=10,
         train_steps=4,
         batch_size=4,
         dagger_rounds=1,
@@ -82,12 +89,14 @@ DEMO = Config(
     ddg=DDGConfig(train_steps=1000),
     student=StudentConfig(
         init_from="pretrained/student",
+        learning_rate=3e-4,
+        pose_rounds=2,
+        pose_steps=500,
         train_steps=200,
         dagger_rounds=1,
         dagger_episodes=48,
         dagger_steps=200,
         head_steps=1500,
-        learning_rate=3e-4,
     ),
 )
 """For two cores within 45 minutes (not yet timed as a whole); the student starts from the pretrained one."""
@@ -99,12 +108,12 @@ LAPTOP = Config(
     record=RecordConfig(trajectories=36),
     ddg=DDGConfig(train_steps=1200),
     student=StudentConfig(
-        train_steps=800,
-        dagger_rounds=1,
+        train_steps=1500,
+        dagger_rounds=3,
         dagger_episodes=48,
-        dagger_steps=300,
-        head_steps=2000,
-        clean_share=0.5,
+        dagger_steps=400,
+        head_steps=3000,
+        clean_share=0.3,
     ),
     evaluation=EvalConfig(student_trials=60, rig_trials=60),
 )
@@ -120,6 +129,7 @@ PAPER = Config(
     student=StudentConfig(
         input_height_px=225, input_width_px=290, stem="conv7", width=64, stage_blocks=(2, 2, 2, 2),
         output_stride=16,
+        features_to_head=True, action_weight=1.0, pose_rounds=12, pose_episodes=1024,
         train_steps=40_000, batch_size=256, dagger_rounds=6, dagger_episodes=512, dagger_steps=5000,
         head_steps=20_000, crop_shift_px=12,
     ),

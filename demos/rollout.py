@@ -71,13 +71,22 @@ class Roller:
       teacher: gives the labels.
       count: environments in lock-step.
       with_rgb: draw colour as well (slow).
+      with_depth: draw depth; without, pictures have no pixels.
     """
 
-    def __init__(self, config: Config, teacher: TeacherPolicy, count: int, with_rgb: bool = False):
+    def __init__(
+        self,
+        config: Config,
+        teacher: TeacherPolicy,
+        count: int,
+        with_rgb: bool = False,
+        with_depth: bool = True,
+    ):
         self.env = GraspEnv(config.world)
         self.viewer = Viewer(config.world.profile, self.env.table.layout)
         self.count, self.steps = count, config.world.episode_steps
         self._teacher, self._random, self._with_rgb = teacher, config.world.random, with_rgb
+        self._with_depth = with_depth
         self._begin = jax.jit(self._begin_batch)
         self._look = jax.jit(self._look_batch)
         self._pose = jax.jit(self._pose_batch)
@@ -113,10 +122,13 @@ class Roller:
         )  # fmt: skip
 
     def _scene(self, state, cameras, t: int) -> Scene:
+        seen = jax.tree.map(np.asarray, self._look(state))
+        if not self._with_depth:
+            return Scene(depth_mm=np.zeros((self.count, 0, 0), np.uint16), step=t, **seen)
         geoms = self._pose(state)
         depth_mm = np.asarray(self._draw_depth(geoms, cameras))
         rgb = np.asarray(self._draw_rgb(geoms, cameras)) if self._with_rgb else None
-        return Scene(depth_mm=depth_mm, step=t, rgb=rgb, **jax.tree.map(np.asarray, self._look(state)))
+        return Scene(depth_mm=depth_mm, step=t, rgb=rgb, **seen)
 
     def _begin_batch(self, key):
         k_env, k_cam = jax.random.split(key)
@@ -182,7 +194,7 @@ def successful(episodes: Episodes) -> Iterator[tuple[dict[str, np.ndarray], dict
         yield (
             steps,
             {
-                "object_index": np.int32(episodes.object_index[i]),
+                "object_index": np.asarray(episodes.object_index[i], np.int32),
                 "T_world_cam": episodes.T_world_cam[i].astype(np.float32),
             },
         )

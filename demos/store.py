@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import zarr
+from numpy.typing import ArrayLike
 from zarr.codecs import BloscCodec
 
 from ddgrasp.errors import UserError
@@ -28,8 +29,8 @@ class EpisodeStore:
             raise UserError(f"{path} is no episode store: collect one with `ddgrasp demos collect`.")
         try:
             self._root = zarr.open_group(str(path), mode="a" if create else "r")
-            self._data = self._root.require_group("data") if create else self._root["data"]
-            self._meta = self._root.require_group("meta") if create else self._root["meta"]
+            self._data = self._root.require_group("data") if create else _group(self._root, "data")
+            self._meta = self._root.require_group("meta") if create else _group(self._root, "meta")
         except (KeyError, ValueError, OSError) as error:
             raise UserError(
                 f"The episode store {path} is damaged ({error}): delete it and collect again."
@@ -42,7 +43,7 @@ class EpisodeStore:
         """(E,) index behind each episode's last step."""
         if "episode_ends" not in self._meta:
             return np.zeros(0, np.int64)
-        return np.asarray(self._meta["episode_ends"][:])
+        return np.asarray(_array(self._meta, "episode_ends")[:])
 
     def __len__(self) -> int:
         return len(self.ends)
@@ -57,15 +58,16 @@ class EpisodeStore:
         ends = self.ends
         count = int(ends[-1]) if len(ends) else 0
         try:
-            return np.asarray(self._data[field][first : count if last is None else min(last, count)])
+            rows = _array(self._data, field)
+            return np.asarray(rows[first : count if last is None else min(last, count)])
         except (KeyError, ValueError, OSError, RuntimeError) as error:
             raise UserError(f"{self.path}: steps of {field!r} cannot be read ({error}).") from None
 
     def episodes(self, field: str) -> np.ndarray:
         """Per-episode array."""
-        return np.asarray(self._meta[field][: len(self)])
+        return np.asarray(_array(self._meta, field)[: len(self)])
 
-    def append(self, steps: Mapping[str, np.ndarray], episode: Mapping[str, np.ndarray]) -> None:
+    def append(self, steps: Mapping[str, np.ndarray], episode: Mapping[str, ArrayLike]) -> None:
         """Adds one episode: arrays (T, ...) per step and (...) per episode."""
         ends = self.ends
         start, length = (int(ends[-1]) if len(ends) else 0), len(next(iter(steps.values())))
@@ -76,7 +78,21 @@ class EpisodeStore:
         _put(self._meta, "episode_ends", len(ends), np.array([start + length], np.int64))
 
 
-def _put(group, name: str, start: int, rows: np.ndarray) -> None:
+def _group(parent: zarr.Group, name: str) -> zarr.Group:
+    node = parent[name]
+    if not isinstance(node, zarr.Group):
+        raise ValueError(f"{name} is no group")
+    return node
+
+
+def _array(group: zarr.Group, name: str) -> zarr.Array:
+    node = group[name]
+    if not isinstance(node, zarr.Array):
+        raise ValueError(f"{name} is no array")
+    return node
+
+
+def _put(group: zarr.Group, name: str, start: int, rows: np.ndarray) -> None:
     """Writes rows at `start`, cutting off whatever an interrupted append left from there on."""
     if name not in group:
         image = rows.ndim >= 3
@@ -84,6 +100,6 @@ def _put(group, name: str, start: int, rows: np.ndarray) -> None:
         group.create_array(
             name, shape=(0, *rows.shape[1:]), chunks=chunks, dtype=rows.dtype, compressors=[_CODEC]
         )
-    array = group[name]
+    array = _array(group, name)
     array.resize((start + len(rows), *rows.shape[1:]))
     array[start:] = rows

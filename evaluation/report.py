@@ -94,7 +94,8 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         if entry is None:
             rows.append((stage.name, "", "", "not run"))
             continue
-        origin = "loaded" if entry["loaded"] else "this run"
+        start = report["config"].get(stage.name, {}).get("init_from", "")
+        origin = "loaded" if entry["loaded"] else "this run" + (f", from {start}" if start else "")
         results = _results(stage.name, report) or [stage.makes]
         rows.append((stage.name, origin, _duration(entry["seconds"]), results[0]))
         rows.extend(("", "", "", result) for result in results[1:])
@@ -134,6 +135,9 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
     if stage == "student":
         named = (("student_clean", "clean depth"), ("student_ddg", "generated depth"))
         return [f"{text}: success {rate}" for key, text in named if (rate := _success(report, key))]
+    if stage == "ddg" and {"recorded", "generated"} <= metrics.keys():
+        shares = [metrics[key]["invalid_fraction"] for key in ("recorded", "generated")]
+        return [f"invalid pixels: recorded {shares[0]:.1%}, generated {shares[1]:.1%} (held-out frames)"]
     if stage == "export" and "max_abs_diff" in metrics:
         return [f"largest difference between JAX and ONNX actions {metrics['max_abs_diff']:.1e}"]
     if stage == "deploy" and "latency_ms" in metrics:

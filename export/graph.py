@@ -17,7 +17,7 @@ from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
 from export.builder import GraphBuilder, tensor
 from export.metadata import PolicyMetadata, check_depth_dtype
-from student_jax import denoiser, diffusion, encoder, policy, preprocess
+from student_jax import denoiser, diffusion, encoder, hand_view, policy, preprocess
 
 Params = Mapping
 
@@ -44,7 +44,7 @@ def build_model(
     g = GraphBuilder()
     picture, planes = write_picture(g, contract.ONNX_INPUT_DEPTH, student, export, profile)
     features = write_encoder(g, picture, planes, params["encoder"], student, profile)
-    cond = write_condition(g, features, contract.ONNX_INPUT_STATE, params, student)
+    cond = write_condition(g, features, picture, contract.ONNX_INPUT_STATE, params, student, profile)
     write_sampler(g, cond, params["denoiser"], student, export.ddim_steps or student.ddim_steps)
     depth_type = TensorProto.UINT16 if export.depth_dtype == "uint16_mm" else TensorProto.FLOAT
     chunk = ["batch", student.chunk, contract.ACTION_SIZE]
@@ -67,6 +67,8 @@ def check_options(student: StudentConfig, export: ExportConfig) -> None:
     """UserError for an option that the graph cannot express."""
     preprocess.check_channels(student)
     encoder.check_encoder(student)
+    policy.check_head(student)
+    hand_view.check_hand_view(student)
     denoiser.check_denoiser(student)
     check_depth_dtype(export.depth_dtype)
     steps = export.ddim_steps or student.ddim_steps
@@ -157,7 +159,7 @@ def write_encoder(
     profile: CameraProfile,
 ) -> str:
     """Picture to features (B, feature_size)."""
-    x = _write_stem(g, picture, params["stem"], student)
+    x = _write_stem(g, picture, params["stem"], student.stem)
     for index, (_, stride) in enumerate(encoder.stage_plan(student)):
         for block in range(student.stage_blocks[index]):
             x = _write_block(g, x, params[f"stage{index}_block{block}"], stride if block == 0 else 1)
@@ -173,8 +175,8 @@ def write_encoder(
     return g.relu(g.dense(points, params["features"]))
 
 
-def _write_stem(g: GraphBuilder, x: str, params: Params, student: StudentConfig) -> str:
-    if student.stem == "conv7":
+def _write_stem(g: GraphBuilder, x: str, params: Params, kind: str) -> str:
+    if kind == "conv7":
         x = g.relu(_write_conv_norm(g, x, params["conv7"], 2))
         return g.op("MaxPool", x, kernel_shape=[3, 3], strides=[2, 2], pads=[1, 1, 1, 1])
     size = encoder.STEM_STRIDE
@@ -253,24 +255,125 @@ def _write_cell_relief(g: GraphBuilder, planes: tuple[str, str], student: Studen
     return g.reshape(mean, [0, 1, -1])
 
 
+# --- hand view (student_jax/hand_view.py) --------------------------------------------------------
+
+
+def write_grip(g: GraphBuilder, state: str) -> str:
+    """(B, 3) the point between the finger pads (m) from the raw state (B, 8): `policy.grip_position`."""
+    point = g.op("Expand", g.constant(hand_view.grip_tip()[None]), g.op("Shape", _columns(g, state, 0, 3)))
+    for joint, (rotation, offset) in reversed(list(enumerate(hand_view.grip_chain()))):
+        angle = _columns(g, state, joint, joint + 1)
+        cosine, sine = g.op("Cos", angle), g.op("Sin", angle)
+        x, y, z = (_columns(g, point, i, i + 1) for i in range(3))
+        turned_x = g.op("Sub", g.mul(cosine, x), g.mul(sine, y))
+        turned_y = g.add(g.mul(sine, x), g.mul(cosine, y))
+        point = g.affine(g.concat([turned_x, turned_y, z], axis=1), rotation.T, offset)
+    return point
+
+
+def write_hand_view(
+    g: GraphBuilder, picture: str, grip: str, params: Params, student: StudentConfig, profile: CameraProfile
+) -> str:
+    """Picture (B, C, h, w) and grip point (B, 3) to (B, hand_view_features)."""
+    view = _write_cut(g, picture, grip, student, profile)
+    x = _write_stem(g, view, params["stem"], hand_view.STEM)
+    for block in range(student.hand_view_blocks):
+        x = _write_block(g, x, params[f"block{block}"], 1)
+    kernel, bias = params["cells"]["kernel"], params["cells"]["bias"]
+    cells = g.relu(g.conv(x, np.asarray(kernel)[None, None], bias))
+    flat = g.op("Flatten", g.op("Transpose", cells, perm=[0, 2, 3, 1]))
+    return g.relu(g.dense(flat, params["features"]))
+
+
+def _write_cut(
+    g: GraphBuilder, picture: str, grip: str, student: StudentConfig, profile: CameraProfile
+) -> str:
+    """(B, C, n, n) part of the picture around the hand, as `hand_view.place` and `hand_view.cut`."""
+    view = hand_view.projection(profile, student)
+    point = g.affine(grip, view.rotation.T, view.offset_m)
+    depth = g.op("Max", _columns(g, point, 2, 3), g.constant(hand_view.MIN_CAMERA_DEPTH_M))
+    origin = np.array(profile.crop_origin_px) * view.shrink
+    samples = []
+    for axis, (column, length) in enumerate(((1, student.input_height_px), (0, student.input_width_px))):
+        per_metre = g.op("Div", g.constant(view.focal_px[axis]), depth)  # (B, 1)
+        centre = g.mul(_columns(g, point, column, column + 1), per_metre)
+        centre = g.add(centre, g.constant(view.centre_px[axis] - origin[axis]))
+        samples.append(_write_sampling(g, centre, per_metre, length, student))
+    rows, columns = samples
+    seen = g.op("MatMul", g.op("Unsqueeze", rows, g.integers([1])), picture)  # (B, C, n, w)
+    columns = g.op("Unsqueeze", g.op("Transpose", columns, perm=[0, 2, 1]), g.integers([1]))
+    seen = g.op("MatMul", seen, columns)  # (B, C, n, n)
+    count, kinds = student.hand_view_px, len(student.channels)
+    frames = g.reshape(seen, [0, contract.DEPTH_FRAMES, kinds, count, count])
+    valid = student.channels.index("valid")
+    coverage = g.slice(frames, [valid], [valid + 1], [2])
+    divisor = g.op("Max", coverage, g.constant(hand_view.MIN_COVERAGE))
+    parts = [
+        coverage if i == valid else g.op("Div", g.slice(frames, [i], [i + 1], [2]), divisor)
+        for i in range(kinds)
+    ]
+    return g.reshape(g.concat(parts, axis=2), [0, contract.DEPTH_FRAMES * kinds, count, count])
+
+
+def _write_sampling(g: GraphBuilder, centre: str, per_metre: str, length: int, student: StudentConfig) -> str:
+    """(B, n, length) weights from centre and scale (B, 1), as `hand_view.sampling_matrix`."""
+    count = student.hand_view_px
+    offsets = (np.arange(count) - (count - 1) / 2) * student.hand_view_pitch_m
+    place = g.add(centre, g.mul(per_metre, g.constant(offsets[None])))  # (B, n)
+    support = g.op("Max", g.mul(per_metre, g.constant(student.hand_view_pitch_m)), g.constant(1.0))
+    support = g.op("Unsqueeze", support, g.integers([2]))  # (B, 1, 1)
+    pixels = (np.arange(length) + 0.5)[None, None]
+    distance = g.op("Abs", g.op("Sub", g.op("Unsqueeze", place, g.integers([2])), g.constant(pixels)))
+    weight = g.op("Sub", g.constant(1.0), g.op("Div", distance, support))
+    return g.op("Div", g.relu(weight), support)
+
+
+def _columns(g: GraphBuilder, x: str, first: int, last: int) -> str:
+    return g.slice(x, [first], [last], [1])
+
+
 # --- condition and sampler (student_jax/policy.py, denoiser.py, diffusion.py) ---------------------
 
 
 def write_condition(
-    g: GraphBuilder, features: str, state: str, params: Params, student: StudentConfig
+    g: GraphBuilder,
+    features: str,
+    picture: str,
+    state: str,
+    params: Params,
+    student: StudentConfig,
+    profile: CameraProfile,
 ) -> str:
-    """Features (B, F) and raw state (B, 8) to the condition (B, D)."""
+    """Features (B, F), picture and raw state (B, 8) to the condition (B, D)."""
     span = denoiser.STATE_UPPER - denoiser.STATE_LOWER
     joints = g.op(
         "Div", g.mul(g.op("Sub", state, g.constant(denoiser.STATE_LOWER)), g.constant(2.0)), g.constant(span)
     )
     joints = g.op("Sub", joints, g.constant(1.0))
+    grip_m = write_grip(g, state)
+    centre = g.constant(encoder.POSITION_CENTER_M)
+    grip = g.op("Div", g.op("Sub", grip_m, centre), g.constant(encoder.POSITION_SCALE_M))
+    known = [joints]
+    if student.hand_view_px:
+        beside = write_hand_view(g, picture, grip_m, params["hand_view"], student, profile)
+        features = g.concat([features, beside], axis=1)
+        known.append(grip)
     stream = params["state_stream"]
-    joints = g.relu(g.dense(g.relu(g.dense(joints, stream["first"])), stream["second"]))
-    parts = [features, joints]
+    parts = [g.relu(g.dense(g.relu(g.dense(joints, stream["first"])), stream["second"]))]
+    if student.features_to_head:
+        parts.append(features)
     if student.aux_to_head:
-        hidden = g.relu(g.dense(g.concat(parts, axis=1), params["aux_hidden"]))
-        parts = [*parts, g.dense(hidden, params["aux_output"])]
+        hidden = g.relu(g.dense(g.concat([features, *known], axis=1), params["aux_hidden"]))
+        raw = g.dense(hidden, params["aux_output"])
+        position = _columns(g, raw, 0, 3)
+        if student.hand_view_px:
+            offset = g.mul(_columns(g, raw, 6, 9), g.constant(policy.BESIDE_SCALE))
+            near = g.op("Sigmoid", _columns(g, raw, 9, 10))
+            far = g.op("Sub", g.constant(1.0), near)
+            position = g.add(g.mul(near, g.add(grip, offset)), g.mul(far, position))
+        beside = g.op("Div", g.op("Sub", position, grip), g.constant(policy.BESIDE_SCALE))
+        held = g.op("Sigmoid", _columns(g, raw, 5, 6))
+        parts += [position, _columns(g, raw, 3, 5), held, beside]
     return g.concat(parts, axis=1)
 
 

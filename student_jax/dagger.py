@@ -1,12 +1,12 @@
-"""The student's training plan: demos, then rounds of DAgger (Ross et al. 2011), then the head alone.
+"""The student's training plan: the head on poses, perception on demos and DAgger, the head on perception.
 
-Phases in order: `demos`, `dagger-1` ... `dagger-n`, `head`. `plan.json` names the finished ones; within
-a fit the optimiser's state is saved now and then. All draws are keyed by seed, phase and step, so a
-resumed plan goes the way an uninterrupted one would.
+Phases in order: `poses`, `demos`, `dagger-1` ... `dagger-n` (Ross et al. 2011), `head`. `plan.json` names
+the finished ones; within a fit on pictures the optimiser's state is saved now and then. All draws are
+keyed by seed, phase and step, so a resumed plan goes the way an uninterrupted one would.
 """
 
-import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,8 @@ from ddgrasp.progress import Progress
 from demos.rollout import Roller
 from demos.store import EpisodeStore
 from ppo.policy import TeacherPolicy
-from student_jax import frames_io, train
+from student_jax import frames_io, head, train
 from student_jax.act import DDGCamera, StudentActor
-from student_jax.data import Frames, random_crops, sharpen_gripper
 from student_jax.policy import PARAMS_FILE, init_params
 
 PLAN = "plan.json"
@@ -32,7 +31,6 @@ PARTIAL = "partial.msgpack"
 SAVE_EVERY = 200
 LOG_EVERY = 20
 _DAGGER_SEED = 40_000
-_ENCODE_BATCH = 64
 
 
 class Trainer:
@@ -49,31 +47,32 @@ class Trainer:
         self._config, self._student, self._profile = config, config.student, config.world.profile
         self._teacher, self._generator = teacher, generator
         self._directory, self._progress = directory, progress
+        self._store = EpisodeStore(directory / frames_io.CACHE, create=True)
         self._done: list[str] = []
         self.history: list[dict[str, Any]] = []
-        self.params: Any = None
+        self.params: dict = {}
 
     def run(self, demos: EpisodeStore) -> None:
         """Every phase that is not finished; `params` is then the student."""
         self._restore()
-        self._store = EpisodeStore(self._directory / frames_io.CACHE, create=True)
+        self._phase("poses", self._fit_on_poses)
         frames_io.add_noisy_demos(demos, self._store, self._generator, self._config, self._progress)
         self._phase("demos", lambda: self._fit("demos", self._student.train_steps))
         for i in range(1, self._student.dagger_rounds + 1):
             self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))
-        self._phase("head", self._fit_head)
+        self._phase("head", self._fit_on_perception)
 
     @property
     def frame_count(self) -> int:
-        """Frames trained on."""
-        return int(self._store.ends[-1])
+        """Pictures trained on."""
+        return int(self._store.ends[-1]) if len(self._store) else 0
 
     # --- phases ---
 
-    def _phase(self, name: str, work) -> None:
+    def _phase(self, name: str, work: Callable[[], dict[str, float]]) -> None:
         if name in self._done:
             return
-        measured = work() or {}
+        measured = work()
         self._done.append(name)
         self.history.append({"phase": name, "frames": self.frame_count} | measured)
         artifacts.save_params(self._directory / PARAMS_FILE, self.params)
@@ -87,17 +86,35 @@ class Trainer:
             self._done, self.history = state["done"], state["history"]
             self.params = artifacts.load_params(self._directory / PARAMS_FILE)
             self._progress.note(f"going on after phase {self._done[-1]!r}")
-        elif self._student.init_from:
+            return
+        self.params = init_params(jax.random.key(self._config.seed), self._student, self._profile)
+        if self._student.init_from:
             source = Path(self._student.init_from)
             source = source if (source / PARAMS_FILE).exists() else source / "student"
-            fresh = init_params(jax.random.key(0), self._student, self._profile)
-            self.params = artifacts.load_params(source / PARAMS_FILE, fresh)
+            self.params = artifacts.load_params(source / PARAMS_FILE, self.params)
+
+    def _fit_on_poses(self) -> dict[str, float]:
+        if self._student.pose_rounds == 0:
+            return {}
+        self.params, measured = head.fit_on_poses(
+            self._config, self._teacher, self.params, self._directory, self._progress
+        )
+        return measured
+
+    def _fit_on_perception(self) -> dict[str, float]:
+        if self._student.head_steps == 0:
+            return {}
+        frames = frames_io.load(self._directory / frames_io.CACHE)
+        self.params, measured = head.fit_on_perception(
+            self._config, self.params, frames, self._directory, self._progress
+        )
+        return measured
 
     def _dagger(self, number: int, demo_count: int) -> dict[str, float]:
         """One round: roll out if that was not done yet, then fit on everything."""
         student = self._student
         wanted = demo_count + number * student.dagger_episodes
-        rate = float("nan")
+        measured = {}
         if len(self._store) < wanted:
             first = len(self._store)
             share = student.dagger_teacher_share * (1 - (number - 1) / max(1, student.dagger_rounds - 1))
@@ -112,82 +129,40 @@ class Trainer:
                 key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
                 episodes = roller.run(key, actor, lambda _: task.advance())
             frames_io.add_rollouts(self._store, episodes, actor.seen_mm)
-            rate = float(episodes.success.mean())
+            measured["rollout_success"] = rate = float(episodes.success.mean())
             self._progress.note(f"round {number}: {rate:.0%} success with the teacher taking {share:.0%}")
-        self._fit(f"dagger-{number}", student.dagger_steps)
-        return {"rollout_success": rate}
+        return measured | self._fit(f"dagger-{number}", student.dagger_steps)
 
     def _fit(self, phase: str, steps: int) -> dict[str, float]:
         """`steps` optimiser steps on all frames, from the current parameters."""
         if steps == 0:
-            self.params = self.params or init_params(
-                jax.random.key(self._config.seed), self._student, self._profile
-            )
             return {}
         student, profile = self._student, self._profile
         frames = frames_io.load(self._directory / frames_io.CACHE)
-        state = train.init_state(student, profile, steps, self._config.seed, self.params)
-        state = self._load_partial(phase, state)
+        trained, frozen = train.split(student, self.params)
+        state = self._load_partial(phase, train.init_state(student, steps, self._config.seed, trained))
         terms = {}
         with self._progress.task(f"student, {phase}", steps) as task:
             task.start_at(int(state.step))
             for i in range(int(state.step), steps):
                 rng = np.random.default_rng([self._config.seed, _phase_number(phase), i])
-                index = rng.integers(0, len(frames), student.batch_size)
+                index = frames.draw(rng, student.batch_size, student.held_weight)
                 batch = train.make_batch(frames, index, rng, student, profile)
-                state, terms = train.train_step(student, profile, steps, state, batch)
+                state, terms = train.train_step(student, profile, steps, state, frozen, batch)
                 if (i + 1) % LOG_EVERY == 0:
                     self._log(phase, i + 1, terms, task)
                 task.advance()
                 if (i + 1) % SAVE_EVERY == 0:
                     self._save_partial(phase, state)
-        self.params = jax.tree.map(np.asarray, state.ema)
+        self.params = frozen | jax.tree.map(np.asarray, state.ema)
         return {name: float(value) for name, value in terms.items()}
-
-    def _fit_head(self) -> dict[str, float]:
-        """The denoiser alone, on conditions computed once for every frame."""
-        # Conditions cost nothing here: more of them serve better than more noises for each.
-        student, profile = dataclasses.replace(self._student, noise_draws=1), self._profile
-        steps = student.head_steps
-        if steps == 0:
-            return {}
-        frames = frames_io.load(self._directory / frames_io.CACHE)
-        rng = np.random.default_rng([self._config.seed, 1])
-        conditions = self._encode_all(frames, rng)
-        chunks = sharpen_gripper(frames.action_chunks(np.arange(len(frames)), student.chunk))
-        head = self.params["denoiser"]
-        state = train.init_state(student, profile, steps, self._config.seed, head)
-        loss = 0.0
-        with self._progress.task("action head", steps) as task:
-            for i in range(steps):
-                index = rng.integers(0, len(frames), student.head_batch_size)
-                cond, action = jnp.asarray(conditions[index]), jnp.asarray(chunks[index])
-                state, loss = train.head_step(student, profile, steps, state, cond, action)
-                if (i + 1) % (5 * LOG_EVERY) == 0:
-                    self._progress.scalars(i + 1, head_loss=float(loss))
-                    task.advance(0, loss=float(loss))
-                task.advance()
-        self.params = self.params | {"denoiser": jax.tree.map(np.asarray, state.ema)}
-        return {"head_loss": float(loss)}
-
-    def _encode_all(self, frames: Frames, rng: np.random.Generator) -> np.ndarray:
-        """(N, D) conditions of all frames, each under one random crop."""
-        student, profile, parts = self._student, self._profile, []
-        batches = range(0, len(frames), _ENCODE_BATCH)
-        for start in self._progress.track(batches, "features", len(batches)):
-            index = np.minimum(np.arange(start, start + _ENCODE_BATCH), len(frames) - 1)
-            crops = random_crops(rng, _ENCODE_BATCH, profile, student.crop_shift_px)
-            depth = frames.depth_stack(index)
-            seen = train.encode(student, profile, self.params, depth, frames.state[index], crops)
-            parts.append(np.asarray(seen.cond))
-        return np.concatenate(parts)[: len(frames)]
 
     # --- within a fit ---
 
     def _log(self, phase: str, step: int, terms, task) -> None:
         values = {name: float(value) for name, value in terms.items()}
         self._progress.scalars(_phase_number(phase) * 100_000 + step, **values)
-        task.advance(0, action=values["action"], position_mm=values["position_error_mm"])
+        task.advance(0, position_mm=values["position_error_mm"], yaw=values["yaw"], held=values["held"])
 
     def _save_partial(self, phase: str, state: train.TrainState) -> None:
         saved = serialization.to_state_dict(state) | {"phase": np.int32(_phase_number(phase))}
@@ -200,7 +175,9 @@ class Trainer:
         saved = artifacts.load_params(path)
         if int(saved.pop("phase")) != _phase_number(phase):
             return fresh
-        return serialization.from_state_dict(fresh, jax.tree.map(jnp.asarray, saved))
+        restored = serialization.from_state_dict(fresh, jax.tree.map(jnp.asarray, saved))
+        assert isinstance(restored, train.TrainState)
+        return restored
 
 
 def _phase_number(phase: str) -> int:

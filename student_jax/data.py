@@ -8,6 +8,8 @@ import numpy as np
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
+from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M
+from student_jax.policy import Aux
 
 _OBJECT_POS = slice(25, 28)
 _GRASP_QUAT = slice(35, 39)
@@ -25,32 +27,32 @@ class Frames:
     """(N, 8)."""
     action: np.ndarray
     """(N, 8) the teacher's labels."""
-    position_m: np.ndarray
-    """(N, 3) object in the world."""
-    yaw: np.ndarray
-    """(N, 2) cosine and sine of YAW_MULTIPLE times the grasp yaw."""
+    observation: np.ndarray
+    """(N, 40) the teacher's."""
     held: np.ndarray
     """(N,) float, object in the hand."""
     episode: np.ndarray
     """(N,) index into `depth_mm`."""
     step: np.ndarray
     """(N,) index within the episode."""
+    _cumulative: tuple[float, np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.state)
 
-    def extend(self, other: "Frames") -> "Frames":
-        """These frames and then the other's."""
-        return Frames(
-            self.depth_mm + other.depth_mm,
-            *(np.concatenate([getattr(self, n), getattr(other, n)]) for n in _ROW_FIELDS[:-2]),
-            np.concatenate([self.episode, other.episode + len(self.depth_mm)]),
-            np.concatenate([self.step, other.step]),
-        )
+    def draw(self, rng: np.random.Generator, count: int, held_weight: float) -> np.ndarray:
+        """(count,) indices at random; a step with the object in the hand counts `held_weight`.
+
+        Most of an episode holds the lifted object, and there is little to learn from that.
+        """
+        if self._cumulative is None or self._cumulative[0] != held_weight:
+            self._cumulative = held_weight, np.cumsum(np.where(self.held > 0, held_weight, 1.0))
+        total = self._cumulative[1]
+        return np.searchsorted(total, rng.random(count) * total[-1], side="right")
 
     def depth_stack(self, index: np.ndarray) -> np.ndarray:
         """(B, 3, H, W) uint16: the last three frames at each index, the first repeated at the start."""
-        return np.stack([self._stack_one(self.episode[i], self.step[i]) for i in index])
+        return np.stack([self._stack_one(int(self.episode[i]), int(self.step[i])) for i in index])
 
     def _stack_one(self, episode: int, step: int) -> np.ndarray:
         frames = self.depth_mm[episode]
@@ -65,7 +67,16 @@ class Frames:
         return self.action[np.where(inside, ahead, last)]
 
 
-_ROW_FIELDS = ("state", "action", "position_m", "yaw", "held", "episode", "step")
+def aux_targets(observation: np.ndarray, held: np.ndarray) -> Aux:
+    """What perception is to report of the teacher's observations (N, 40); `held_logit` is 0 or 1."""
+    quat = observation[:, _GRASP_QUAT]
+    yaw = 2.0 * np.arctan2(quat[:, 2], quat[:, 1]) * YAW_MULTIPLE
+    position = (observation[:, _OBJECT_POS] - np.array(POSITION_CENTER_M)) / POSITION_SCALE_M
+    return Aux(
+        position.astype(np.float32),
+        np.stack([np.cos(yaw), np.sin(yaw)], axis=1).astype(np.float32),
+        held.astype(np.float32),
+    )
 
 
 def make_frames(
@@ -75,17 +86,16 @@ def make_frames(
     observations: Sequence[np.ndarray],
     held: Sequence[np.ndarray],
 ) -> Frames:
-    """Frames of whole episodes; each argument has one array (T, ...) per episode."""
+    """Frames of whole episodes; each argument has one array (T, ...) per episode.
+
+    `depth_mm` is empty for episodes without pictures.
+    """
     lengths = [len(s) for s in states]
-    observation = np.concatenate(observations)
-    quat = observation[:, _GRASP_QUAT]
-    yaw = 2.0 * np.arctan2(quat[:, 2], quat[:, 1]) * YAW_MULTIPLE
     return Frames(
         depth_mm=list(depth_mm),
         state=np.concatenate(states).astype(np.float32),
         action=np.clip(np.concatenate(actions), -1, 1).astype(np.float32),
-        position_m=observation[:, _OBJECT_POS].astype(np.float32),
-        yaw=np.stack([np.cos(yaw), np.sin(yaw)], axis=1).astype(np.float32),
+        observation=np.concatenate(observations).astype(np.float32),
         held=np.concatenate(held).astype(np.float32),
         episode=np.repeat(np.arange(len(lengths)), lengths),
         step=np.concatenate([np.arange(n) for n in lengths]),

@@ -25,7 +25,7 @@ def cosine_alpha_bar(steps: int) -> np.ndarray:
     return (f[1:] / f[0]).astype(np.float32)
 
 
-def q_sample(x0: jax.Array, noise: jax.Array, k: jax.Array, alpha_bar: jax.Array) -> jax.Array:
+def q_sample(x0: jax.Array, noise: jax.Array, k: jax.Array, alpha_bar: np.ndarray) -> jax.Array:
     """x_k = sqrt(alpha_bar_k) x_0 + sqrt(1 - alpha_bar_k) noise (Ho et al., 2020, eq. 4). k: (B,) int."""
     a = jnp.asarray(alpha_bar)[k].reshape((-1,) + (1,) * (x0.ndim - 1))
     return jnp.sqrt(a) * x0 + jnp.sqrt(1.0 - a) * noise

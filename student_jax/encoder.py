@@ -128,18 +128,19 @@ class BasicBlock(nn.Module):
 class Stem(nn.Module):
     """Input at a quarter of its resolution: conv7 + max pooling, or one matrix product per 4x4 patch."""
 
-    config: StudentConfig
+    kind: str
+    width: int
+    norm: str
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        config = self.config
-        if config.stem == "conv7":
-            x = nn.relu(ConvNorm(config.width, 7, 2, config.norm, name="conv7")(x))
+        if self.kind == "conv7":
+            x = nn.relu(ConvNorm(self.width, 7, 2, self.norm, name="conv7")(x))
             x = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))  # after relu zeros pad as well as -inf
             return nn.max_pool(x, window_shape=(3, 3), strides=(2, 2), padding="VALID")
         patches = space_to_depth(x, STEM_STRIDE)
-        x = nn.Dense(config.width, use_bias=config.norm == "none", name="patch")(patches)
-        return nn.relu(GroupNorm(name="norm")(x) if config.norm == "group" else x)
+        x = nn.Dense(self.width, use_bias=self.norm == "none", name="patch")(patches)
+        return nn.relu(GroupNorm(name="norm")(x) if self.norm == "group" else x)
 
 
 def space_to_depth(x: jax.Array, size: int) -> jax.Array:
@@ -229,7 +230,8 @@ def newest_channel_index(config: StudentConfig, name: str) -> int:
     """Index of that channel among the picture's 3 * channels."""
     if name not in config.channels:
         raise UserError(
-            f"student.channels is {config.channels}; pooling {config.pooling!r} needs {name!r} among them."
+            f"student.channels is {config.channels}; student.pooling {config.pooling!r} or the hand view "
+            f"needs {name!r} among them."
         )
     return (contract.DEPTH_FRAMES - 1) * len(config.channels) + config.channels.index(name)
 
@@ -262,7 +264,7 @@ class DepthEncoder(nn.Module):
     def __call__(self, picture: jax.Array, origin_rc: jax.Array) -> jax.Array:
         config = self.config
         check_encoder(config)
-        x = Stem(config, name="stem")(picture)
+        x = Stem(config.stem, config.width, config.norm, name="stem")(picture)
         for index, (channels, stride) in enumerate(stage_plan(config)):
             for block in range(config.stage_blocks[index]):
                 stride_here = stride if block == 0 else 1

@@ -42,12 +42,6 @@ def closed_loop(
 
 def _counts(episodes: Episodes, names: tuple[str, ...]) -> dict[str, Any]:
     success = {"successes": int(episodes.success.sum()), "n": len(episodes.success)}
-    objects = [
-        {
-            "object": name,
-            "successes": int(episodes.success[episodes.object_index == i].sum()),
-            "n": int((episodes.object_index == i).sum()),
-        }
-        for i, name in enumerate(names)
-    ]
+    of = {name: episodes.success[episodes.object_index == i] for i, name in enumerate(names)}
+    objects = {name: {"successes": int(won.sum()), "n": len(won)} for name, won in of.items()}
     return {"success": success, "per_object": objects}

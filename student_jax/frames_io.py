@@ -22,7 +22,7 @@ def add_noisy_demos(
 ) -> None:
     """Copies the demos into `frames` with generated artefacts on their depth, going on from what is there.
 
-    A share of `config.student.clean_share` keeps clean depth.
+    A share of `config.student.clean_share` keeps clean depth. Steps long after the grasp are left out.
     """
     key = jax.random.key(config.seed)
     ends = np.concatenate([[0], demos.ends])
@@ -30,11 +30,19 @@ def add_noisy_demos(
     with progress.task("artefacts on the demos", len(demos)) as task:
         task.start_at(len(frames))
         for i in range(len(frames), len(demos)):
-            steps = {name: demos.steps(name, ends[i], ends[i + 1]) for name in _FIELDS}
+            held = demos.steps("held", ends[i], ends[i + 1])
+            end = ends[i] + useful_steps(held, config.student.demo_held_steps)
+            steps = {name: demos.steps(name, ends[i], end) for name in _FIELDS}
             if not keep_clean[i]:
                 steps["depth_mm"] = corrupt_episode(generator, key, steps["depth_mm"], i)
             frames.append(steps, {"from_demo": np.bool_(True)})
             task.advance()
+
+
+def useful_steps(held: np.ndarray, held_steps: int) -> int:
+    """Number of an episode's first steps up to `held_steps` with the object in the hand; held: (T,) bool."""
+    enough = np.flatnonzero(np.cumsum(held) >= held_steps)
+    return int(enough[0]) + 1 if len(enough) else len(held)
 
 
 def corrupt_episode(generator: Generator, key: jax.Array, depth_mm: np.ndarray, episode: int) -> np.ndarray:

@@ -4,7 +4,8 @@
 
     params = init_params(key, config, profile)
     seen = policy.apply({"params": params}, depth_m, state, crop_rc, method="encode")
-    eps = policy.apply({"params": params}, noisy_action, k, seen.cond, method="denoise")
+    cond = policy.apply({"params": params}, seen, state, method="condition")
+    eps = policy.apply({"params": params}, noisy_action, k, cond, method="denoise")
 """
 
 from typing import NamedTuple, cast
@@ -17,43 +18,53 @@ from flax import linen as nn
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
+from ddgrasp.errors import UserError
+from mjx_envs import kinematics
 from student_jax import diffusion
-from student_jax.denoiser import Denoiser, StateStream
+from student_jax.denoiser import Denoiser, StateStream, normalise_state
 from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M, DepthEncoder
+from student_jax.hand_view import HandView
 from student_jax.preprocess import crop_origin, prepare_depth
 
 AUX_SIZE = 6
+BESIDE_SIZE = 4
+"""What the hand view adds to the auxiliary output: the object's offset from the hand, and a gate."""
+BESIDE_SCALE = 0.25
+"""Network units per unit of that offset: 5 cm."""
+HEAD_PARAMS = ("state_stream", "denoiser")
+"""The parameters that act; all others see."""
 PARAMS_FILE = "params.msgpack"
 """Name of the parameter file in the student's artefact (`artifacts.save_params`)."""
+Numbers = jax.Array | np.ndarray
 
 
 class Aux(NamedTuple):
     """Privileged predictions, supervised in simulation only."""
 
-    position: jax.Array
+    position: Numbers
     """(B, 3) object position in network units; see `position_from_world` and `position_to_world`."""
-    yaw: jax.Array
+    yaw: Numbers
     """(B, 2) cosine and sine of k times the grasp yaw, k being the object's symmetry."""
-    held_logit: jax.Array
+    held_logit: Numbers
     """(B,) logit of the object being in the hand."""
 
 
 class Seen(NamedTuple):
-    """What the policy makes of one observation."""
+    """What the policy makes of one observation; worth caching while only the head trains."""
 
-    cond: jax.Array
-    """(B, D) condition of the denoiser; worth caching while only the denoiser trains."""
+    features: Numbers
+    """(B, F) the encoder's vector."""
     aux: Aux
 
 
-def position_from_world(position_m: jax.Array) -> jax.Array:
+def position_from_world(position_m: Numbers) -> jax.Array:
     """(..., 3) metres in the world to network units."""
-    return (position_m - jnp.array(POSITION_CENTER_M)) / POSITION_SCALE_M
+    return (jnp.asarray(position_m) - jnp.array(POSITION_CENTER_M)) / POSITION_SCALE_M
 
 
-def position_to_world(position: jax.Array) -> jax.Array:
+def position_to_world(position: Numbers) -> jax.Array:
     """(..., 3) network units to metres in the world."""
-    return position * POSITION_SCALE_M + jnp.array(POSITION_CENTER_M)
+    return jnp.asarray(position) * POSITION_SCALE_M + jnp.array(POSITION_CENTER_M)
 
 
 class StudentPolicy(nn.Module):
@@ -63,11 +74,14 @@ class StudentPolicy(nn.Module):
     profile: CameraProfile
 
     def setup(self) -> None:
+        check_head(self.config)
         self.encoder = DepthEncoder(self.config, self.profile)
-        self.state_stream = StateStream(self.config)
         self.aux_hidden = nn.Dense(self.config.feature_size)
-        self.aux_output = nn.Dense(AUX_SIZE)
+        self.aux_output = nn.Dense(AUX_SIZE + (BESIDE_SIZE if self.config.hand_view_px else 0))
+        self.state_stream = StateStream(self.config)
         self.denoiser = Denoiser(self.config)
+        if self.config.hand_view_px:
+            self.hand_view = HandView(self.config, self.profile)
 
     def encode(self, depth_m: jax.Array, state: jax.Array, crop_rc: jax.Array | None = None) -> Seen:
         """(B, 3, H, W) metres, (B, 8), (B, 2) or None for the centred crop."""
@@ -76,13 +90,32 @@ class StudentPolicy(nn.Module):
 
     def encode_picture(self, picture: jax.Array, state: jax.Array, crop_rc: jax.Array | None = None) -> Seen:
         """As `encode`, from the output of `prepare_depth`."""
-        features = self.encoder(picture, crop_origin(crop_rc, picture.shape[0], self.profile))
-        joints = self.state_stream(state)
-        hidden = nn.relu(self.aux_hidden(jnp.concatenate([features, joints], axis=-1)))
-        raw = self.aux_output(hidden)
-        shown = jax.lax.stop_gradient(raw) if self.config.aux_stop_gradient else raw
-        parts = [features, joints] + ([shown] if self.config.aux_to_head else [])
-        return Seen(jnp.concatenate(parts, axis=-1), Aux(raw[:, :3], raw[:, 3:5], raw[:, 5]))
+        origin = crop_origin(crop_rc, picture.shape[0], self.profile)
+        features = self.encoder(picture, origin)
+        if not self.config.hand_view_px:
+            raw = self._aux(features, normalise_state(state))
+            return Seen(features, Aux(raw[:, :3], raw[:, 3:5], raw[:, 5]))
+        grip_m = grip_position(state)
+        grip = position_from_world(grip_m)
+        features = jnp.concatenate([features, self.hand_view(picture, grip_m, origin)], axis=-1)
+        raw = self._aux(features, normalise_state(state), grip)
+        near = nn.sigmoid(raw[:, 9:])
+        position = near * (grip + BESIDE_SCALE * raw[:, 6:9]) + (1.0 - near) * raw[:, :3]
+        return Seen(features, Aux(position, raw[:, 3:5], raw[:, 5]))
+
+    def _aux(self, *parts: jax.Array) -> jax.Array:
+        return self.aux_output(nn.relu(self.aux_hidden(jnp.concatenate(parts, axis=-1))))
+
+    def condition(self, seen: Seen, state: jax.Array) -> jax.Array:
+        """(B, D) what the denoiser is told."""
+        parts: list[Numbers] = [self.state_stream(state)]
+        if self.config.features_to_head:
+            parts.append(seen.features)
+        if self.config.aux_to_head:
+            aux = seen.aux
+            beside = (aux.position - position_from_world(grip_position(state))) / BESIDE_SCALE
+            parts += [aux.position, aux.yaw, nn.sigmoid(aux.held_logit)[:, None], beside]
+        return jnp.concatenate(parts, axis=-1)
 
     def denoise(self, noisy_action: jax.Array, k: jax.Array, cond: jax.Array) -> jax.Array:
         """(B, chunk, 8), (B,) int steps, (B, D) -> predicted noise (B, chunk, 8)."""
@@ -98,7 +131,23 @@ class StudentPolicy(nn.Module):
     ) -> tuple[jax.Array, Aux]:
         """Predicted noise and auxiliary predictions: everything a training step needs."""
         seen = self.encode(depth_m, state, crop_rc)
-        return self.denoise(noisy_action, k, seen.cond), seen.aux
+        return self.denoise(noisy_action, k, self.condition(seen, state)), seen.aux
+
+
+def check_head(config: StudentConfig) -> None:
+    """UserError if the head would see nothing."""
+    if not (config.features_to_head or config.aux_to_head):
+        raise UserError("student.features_to_head and student.aux_to_head are both off: turn one on.")
+
+
+def grip_position(state: jax.Array) -> jax.Array:
+    """(B, 3) the point between the finger pads (m, robot base) from the joint state (B, 8)."""
+    return kinematics.grip_pose(state[:, :7], jnp)[0]
+
+
+def feature_count(config: StudentConfig) -> int:
+    """Length of `Seen.features`."""
+    return config.feature_size + (config.hand_view_features if config.hand_view_px else 0)
 
 
 def alpha_bar(config: StudentConfig) -> np.ndarray:
@@ -125,16 +174,21 @@ def count_params(params: dict) -> int:
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(params))
 
 
-def sample_from_cond(
+def sample_from_seen(
     params: dict,
-    cond: jax.Array,
+    seen: Seen,
+    state: jax.Array,
     noise: jax.Array,
     config: StudentConfig,
     profile: CameraProfile,
     steps: int = 0,
 ) -> jax.Array:
-    """DDIM from (B, chunk, 8) standard normal noise to actions in [-1, 1]; steps 0 means the config's."""
+    """DDIM from (B, chunk, 8) standard normal noise to actions in [-1, 1]; steps 0 means the config's.
+
+    Needs the parameters of HEAD_PARAMS alone.
+    """
     policy = StudentPolicy(config, profile)
+    cond = cast(jax.Array, policy.apply({"params": params}, seen, state, method="condition"))
 
     def predict(x: jax.Array, k: jax.Array) -> jax.Array:
         return cast(jax.Array, policy.apply({"params": params}, x, k, cond, method="denoise"))
@@ -154,5 +208,5 @@ def sample_actions(
 ) -> jax.Array:
     """The whole policy: (B, 3, H, W) metres, (B, 8), (B, chunk, 8) noise -> (B, chunk, 8) in [-1, 1]."""
     policy = StudentPolicy(config, profile)
-    seen = cast(Seen, policy.apply({"params": params}, depth_m, state, crop_rc, method="encode"))
-    return sample_from_cond(params, seen.cond, noise, config, profile, steps)
+    seen = policy.apply({"params": params}, depth_m, state, crop_rc, method="encode")
+    return sample_from_seen(params, cast(Seen, seen), state, noise, config, profile, steps)

@@ -1,8 +1,9 @@
 """Stage `student`: demos, generator and teacher -> depth-only diffusion policy.
 
-Fit on the demos with generated artefacts, then DAgger: the student acts, the teacher labels, and all
-frames so far are fitted again; last the action head alone on cached features. Each part leaves a
-checkpoint, so that an interrupted stage goes on from the last finished part.
+The action head learns from true poses with noise; perception from the demos with generated artefacts
+and from DAgger, where the student acts, the teacher labels, and all frames so far are fitted again; last
+the head on what perception reports. Each part leaves a checkpoint, so that an interrupted stage goes on
+from the last finished part.
 """
 
 import shutil
@@ -19,6 +20,7 @@ from ppo import policy as teacher_policy
 from student_jax import evaluate, frames_io
 from student_jax.dagger import Trainer
 from student_jax.data import check_chunk
+from student_jax.head import POSES
 
 STAGE = "student"
 
@@ -35,6 +37,7 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
     metrics = evaluate.closed_loop(config, teacher, generator, trainer.params, progress)
     metrics |= {"tried": trainer.history, "frames": trainer.frame_count}
     shutil.rmtree(directory / frames_io.CACHE, ignore_errors=True)
+    (directory / POSES).unlink(missing_ok=True)
     return artifacts.finish(
         directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=list(parents.values()),
         origin="loaded" if config.student.init_from and not _trains(config) else "trained",
@@ -43,6 +46,8 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
 
 def _trains(config: Config) -> bool:
     student = config.student
-    return (
-        student.train_steps > 0 or student.dagger_rounds * student.dagger_steps > 0 or student.head_steps > 0
-    )
+    steps = (
+        student.train_steps, student.dagger_rounds * student.dagger_steps, student.head_steps,
+        student.pose_rounds * student.pose_steps,
+    )  # fmt: skip
+    return any(steps)

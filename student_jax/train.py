@@ -1,7 +1,7 @@
 """Training the student: diffusion loss on the teacher's labels, privileged auxiliary losses (III-C3)."""
 
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import flax.struct
 import jax
@@ -14,11 +14,21 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from student_jax import diffusion
-from student_jax.data import Frames, random_crops, sharpen_gripper
-from student_jax.policy import Aux, StudentPolicy, alpha_bar, init_params, position_from_world
+from student_jax.data import Frames, aux_targets, random_crops, sharpen_gripper
+from student_jax.encoder import POSITION_SCALE_M
+from student_jax.policy import (
+    HEAD_PARAMS,
+    Aux,
+    Seen,
+    StudentPolicy,
+    alpha_bar,
+    sample_from_seen,
+)
 
 MAX_GRAD_NORM = 1.0
 WARMUP_STEPS = 100
+POSITION_DELTA, POSITION_WEIGHT = 0.05, 40.0
+"""Huber's bound in network units (one centimetre); with the weight, centimetres count as much as yaw."""
 
 
 @flax.struct.dataclass
@@ -58,11 +68,7 @@ def make_batch(
         crop_rc=jnp.asarray(random_crops(rng, len(index), profile, config.crop_shift_px)),
         state=jnp.asarray(frames.state[index]),
         action=jnp.asarray(sharpen_gripper(frames.action_chunks(index, config.chunk))),
-        aux=Aux(
-            position_from_world(jnp.asarray(frames.position_m[index])),
-            jnp.asarray(frames.yaw[index]),
-            jnp.asarray(frames.held[index]),
-        ),
+        aux=aux_targets(frames.observation[index], frames.held[index]),
     )
 
 
@@ -77,21 +83,34 @@ def make_optimizer(config: StudentConfig, steps: int) -> optax.GradientTransform
     )
 
 
-def init_state(
-    config: StudentConfig, profile: CameraProfile, steps: int, seed: int, params=None
-) -> TrainState:
-    """State before the first of `steps` steps, from fresh or given parameters."""
-    key = jax.random.key(seed)
-    params = init_params(key, config, profile) if params is None else jax.tree.map(jnp.asarray, params)
-    optimizer = make_optimizer(config, steps)
-    copy = jax.tree.map(jnp.copy, params)
+def split(config: StudentConfig, params: dict) -> tuple[dict, dict]:
+    """(trained, frozen) on pictures: without an action loss the head keeps what it learnt from poses."""
+    names = set(params) if config.action_weight else set(params) - set(HEAD_PARAMS)
+    return {k: v for k, v in params.items() if k in names}, {
+        k: v for k, v in params.items() if k not in names
+    }
+
+
+def head_of(params: dict) -> dict:
+    """The parameters that act."""
+    return {name: params[name] for name in HEAD_PARAMS}
+
+
+def init_state(config: StudentConfig, steps: int, seed: int, params: dict) -> TrainState:
+    """State before the first of `steps` steps on `params`."""
+    params = jax.tree.map(jnp.array, params)  # copies: a step gives its state away
     return TrainState(
-        jnp.zeros((), jnp.int32), params, copy, optimizer.init(params), jax.random.key_data(key)
+        jnp.zeros((), jnp.int32),
+        params,
+        jax.tree.map(jnp.copy, params),
+        make_optimizer(config, steps).init(params),
+        jax.random.key_data(jax.random.key(seed)),
     )
 
 
-def diffusion_loss(config, policy, params, cond, action, key) -> Array:
-    """mean |eps - eps_theta(a_k, k, s)|^2 (paper Eq. 6) over `noise_draws` noises for each condition."""
+def diffusion_loss(config, policy, params, seen, state, action, key) -> Array:
+    """mean |eps - eps_theta(a_k, k, s)|^2 (paper Eq. 6) over `noise_draws` noises for each sample."""
+    cond = policy.apply({"params": params}, seen, state, method="condition")
     draws = config.noise_draws
     cond, action = (jnp.repeat(x, draws, axis=0) for x in (cond, action))
     k_step, k_noise = jax.random.split(key)
@@ -105,7 +124,8 @@ def diffusion_loss(config, policy, params, cond, action, key) -> Array:
 def aux_losses(seen: Aux, target: Aux) -> dict[str, Array]:
     """Position (Huber, network units), yaw (squared), held (cross-entropy)."""
     return {
-        "position": jnp.mean(optax.huber_loss(seen.position, target.position, delta=0.1)) * 10.0,
+        "position": jnp.mean(optax.huber_loss(seen.position, target.position, delta=POSITION_DELTA))
+        * POSITION_WEIGHT,
         "yaw": jnp.mean((seen.yaw - target.yaw) ** 2),
         "held": jnp.mean(optax.sigmoid_binary_cross_entropy(seen.held_logit, target.held_logit)),
     }
@@ -113,55 +133,67 @@ def aux_losses(seen: Aux, target: Aux) -> dict[str, Array]:
 
 @partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
 def train_step(
-    config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, batch: Batch
+    config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, frozen: dict, batch: Batch
 ) -> tuple[TrainState, dict[str, Array]]:
-    """One optimiser step. Pure: noise comes from fold_in(state.key, state.step)."""
+    """One optimiser step on pictures. Pure: noise comes from fold_in(state.key, state.step)."""
     policy = StudentPolicy(config, profile)
     key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
     depth_m = batch.depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
 
     def loss_fn(params):
-        seen = policy.apply({"params": params}, depth_m, batch.state, batch.crop_rc, method="encode")
-        terms = aux_losses(seen.aux, batch.aux)  # pyright: ignore[reportAttributeAccessIssue]
-        terms["action"] = diffusion_loss(config, policy, params, seen.cond, batch.action, key)  # pyright: ignore
-        total = terms["action"] + config.aux_weight * (terms["position"] + terms["yaw"] + 0.3 * terms["held"])
-        error_m = 0.2 * jnp.linalg.norm(seen.aux.position - batch.aux.position, axis=-1)  # pyright: ignore
-        return total, terms | {"position_error_mm": 1000 * jnp.median(error_m)}
+        params = params | frozen
+        seen = cast(
+            Seen, policy.apply({"params": params}, depth_m, batch.state, batch.crop_rc, method="encode")
+        )
+        terms = aux_losses(seen.aux, batch.aux)
+        total = config.aux_weight * (terms["position"] + terms["yaw"] + 0.3 * terms["held"])
+        if config.action_weight:
+            terms["action"] = diffusion_loss(config, policy, params, seen, batch.state, batch.action, key)
+            total += config.action_weight * terms["action"]
+        error = jnp.linalg.norm(seen.aux.position - batch.aux.position, axis=-1)
+        terms["position_error_mm"] = 1000.0 * POSITION_SCALE_M * jnp.median(error)
+        return total, terms
 
-    (total, terms), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.params)
+    (_, terms), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.params)
+    return _update(config, steps, state, grads), terms
+
+
+def _update(config: StudentConfig, steps: int, state: TrainState, grads) -> TrainState:
     updates, opt_state = make_optimizer(config, steps).update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
     decay = jnp.minimum(config.ema_decay, (1 + state.step) / (10 + state.step))
     ema = jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, state.ema, params)
-    return TrainState(state.step + 1, params, ema, opt_state, state.key), terms | {"total": total}
-
-
-# --- the action head alone, on cached conditions ---------------------------------------------------
+    return TrainState(state.step + 1, params, ema, opt_state, state.key)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def encode(
     config: StudentConfig, profile: CameraProfile, params, depth_mm: Array, state: Array, crop_rc: Array
 ) -> Any:
-    """(B, D) conditions and auxiliary predictions of a batch."""
+    """`policy.Seen` of a batch."""
     depth_m = depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
     return StudentPolicy(config, profile).apply({"params": params}, depth_m, state, crop_rc, method="encode")
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
 def head_step(
-    config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, cond: Array, action: Array
-) -> tuple[TrainState, Array]:
-    """One optimiser step on the denoiser's parameters alone; `state.params` is that subtree."""
+    config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, seen: Seen, joints: Array,
+    action: Array,
+) -> tuple[TrainState, Array]:  # fmt: skip
+    """One optimiser step on the head's parameters alone; `state.params` is `head_of` all."""
     key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
     policy = StudentPolicy(config, profile)
 
     def loss_fn(head):
-        return diffusion_loss(config, policy, {"denoiser": head}, cond, action, key)
+        return diffusion_loss(config, policy, head, seen, joints, action, key)
 
     loss, grads = jax.value_and_grad(loss_fn)(state.params)
-    updates, opt_state = make_optimizer(config, steps).update(grads, state.opt_state, state.params)
-    params = optax.apply_updates(state.params, updates)
-    decay = jnp.minimum(config.ema_decay, (1 + state.step) / (10 + state.step))
-    ema = jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, state.ema, params)
-    return TrainState(state.step + 1, params, ema, opt_state, state.key), loss
+    return _update(config, steps, state, grads), loss
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def act_on_seen(
+    config: StudentConfig, profile: CameraProfile, params, seen: Seen, joints: Array, noise: Array
+) -> Array:
+    """(B, chunk, 8) actions from what perception reports; needs `head_of` the parameters alone."""
+    return sample_from_seen(params, seen, joints, noise, config, profile)

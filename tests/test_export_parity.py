@@ -18,6 +18,8 @@ PROFILE = contract.D455.scaled(0.125)
 SMALL = StudentConfig(
     input_height_px=56, input_width_px=72, width=8, stage_blocks=(1, 1), keypoints=8, feature_size=32,
     state_features=16, denoiser_width=48, denoiser_blocks=2, time_features=16, chunk=3,
+    hand_view_px=16, hand_view_pitch_m=0.008, hand_view_width=8, hand_view_blocks=1, hand_view_channels=2,
+    hand_view_features=16,
 )  # fmt: skip
 OPTIONS = {
     "keypoints, trimmed crop": (SMALL, ExportConfig(depth_dtype="uint16_mm")),
@@ -29,11 +31,14 @@ OPTIONS = {
         replace(
             SMALL, pooling="tokens", stem="conv7", conditioning="concat", keypoints=2,
             channels=("depth", "relief", "valid"), input_height_px=48, input_width_px=64,
+            features_to_head=True, hand_view_pitch_m=0.002,
         ),
         ExportConfig(depth_dtype="float32_m"),
     ),
     "mean, no norm, no auxiliary": (
-        replace(SMALL, pooling="mean", norm="none", aux_to_head=False),
+        replace(
+            SMALL, pooling="mean", norm="none", hand_view_px=0, features_to_head=True, aux_to_head=False
+        ),
         ExportConfig(depth_dtype="uint16_mm"),
     ),
 }  # fmt: skip
@@ -48,10 +53,13 @@ def jittered(params: dict, seed: int = 0) -> dict:
 def trained_head(params: dict, config: StudentConfig) -> dict:
     """Denoiser trained on moderate actions: an untrained one saturates at +-1, where all policies agree."""
     net = policy.StudentPolicy(config, PROFILE)
-    shapes = jax.eval_shape(
-        lambda: net.apply({"params": params}, jnp.zeros((1, 3, 90, 160)), jnp.zeros((1, 8)), method="encode")
-    )
-    size, schedule = shapes.cond.shape[-1], policy.alpha_bar(config)
+    frames, state = jnp.zeros((1, 3, 90, 160)), jnp.zeros((1, 8))
+
+    def condition():
+        seen = net.apply({"params": params}, frames, state, method="encode")
+        return net.apply({"params": params}, seen, state, method="condition")
+
+    size, schedule = jax.eval_shape(condition).shape[-1], policy.alpha_bar(config)
     optimiser = optax.adam(3e-3)
 
     def loss(head, key):

@@ -11,8 +11,9 @@ import pytest
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
+from mjx_envs import kinematics, scene
 from mjx_envs.camera import nominal_camera
-from student_jax import denoiser, diffusion, encoder, policy, preprocess
+from student_jax import denoiser, diffusion, encoder, hand_view, policy, preprocess
 
 PROFILE = contract.D455.scaled(0.25)
 CONFIG = StudentConfig()
@@ -93,6 +94,7 @@ def test_resnet18_has_the_published_number_of_parameters():
         output_stride=32,
         pooling="mean",
         channels=("relief",),
+        hand_view_px=0,
     )
     shapes = policy.param_shapes(config, PROFILE)["encoder"]
     del shapes["features"]
@@ -137,20 +139,95 @@ def test_ddim_step_clips_and_keeps_explaining_x():
     np.testing.assert_allclose(diffusion.ddim_step(x, eps, row), [0.8 + 0.6 / np.sqrt(3.0)], rtol=1e-6)
 
 
-def test_auxiliary_predictions_reach_the_head_and_stop_gradient_stops():
-    def head_gradient(config):
-        params = policy.init_params(jax.random.key(0), config, PROFILE)
-        net = policy.StudentPolicy(config, PROFILE)
-        picture = jax.random.normal(jax.random.key(1), (2, 112, 144, 6))
+def test_the_condition_is_joints_then_pose_then_offset_from_the_hand():
+    params = policy.init_params(jax.random.key(0), SMALL, PROFILE)
+    net = policy.StudentPolicy(SMALL, PROFILE)
+    state = jnp.asarray([[*scene.HOME_RAD, 0.05]])
+    hand, _ = kinematics.grip_pose(np.array(scene.HOME_RAD))
+    place = policy.position_from_world(jnp.asarray(hand + [0.0, 0.1, -0.05]))
+    aux = policy.Aux(place[None], jnp.array([[0.6, 0.8]]), jnp.array([2.0]))
+    seen = policy.Seen(jnp.ones((1, policy.feature_count(SMALL))), aux)
 
-        def loss(p):
-            seen = net.apply({"params": p}, picture, jnp.zeros((2, 8)), method="encode_picture")
-            return seen.cond[:, -policy.AUX_SIZE :].sum()
+    def condition(config):
+        cond = policy.StudentPolicy(config, PROFILE).apply(
+            {"params": params}, seen, state, method="condition"
+        )
+        return np.asarray(cond)[0]
 
-        return float(jnp.abs(jax.jit(jax.grad(loss))(params)["aux_output"]["bias"]).sum())
+    joints = np.asarray(net.apply({"params": params}, state, method=lambda m, s: m.state_stream(s)))[0]
+    held = 1 / (1 + np.exp(-2.0))
+    expected = np.concatenate([joints, place, [0.6, 0.8, held], [0.0, 2.0, -1.0]])  # units of 5 cm
+    np.testing.assert_allclose(condition(SMALL), expected, atol=1e-5)
+    both = condition(replace(SMALL, features_to_head=True))
+    assert both.shape[0] == len(expected) + policy.feature_count(SMALL)
+    with pytest.raises(UserError, match="features_to_head and student.aux_to_head are both off"):
+        condition(replace(SMALL, aux_to_head=False))
 
-    assert head_gradient(SMALL) == pytest.approx(2 * policy.AUX_SIZE)
-    assert head_gradient(replace(SMALL, aux_stop_gradient=True)) == 0.0
+
+def test_the_hand_view_decides_how_much_the_hand_counts():
+    """With the gate open the position is hand + 5 cm * offset, with it closed the raw output."""
+    params = policy.init_params(jax.random.key(0), SMALL, PROFILE)
+    output = {"kernel": jnp.zeros_like(params["aux_output"]["kernel"])}
+    state = jnp.asarray([[*scene.HOME_RAD, 0.05]])
+    hand, _ = kinematics.grip_pose(np.array(scene.HOME_RAD))
+    picture = jnp.zeros((1, SMALL.input_height_px, SMALL.input_width_px, 6))
+    net = policy.StudentPolicy(SMALL, PROFILE)
+
+    def position(gate):
+        bias = jnp.array([0.1, 0.2, 0.3, 0, 0, 0, 1.0, 0.0, -2.0, gate])
+        seen = net.apply(
+            {"params": {**params, "aux_output": {**output, "bias": bias}}}, picture, state,
+            method="encode_picture",
+        )  # fmt: skip
+        return np.asarray(policy.position_to_world(seen.aux.position))[0]
+
+    np.testing.assert_allclose(position(50.0), hand + [0.05, 0.0, -0.1], atol=1e-5)
+    np.testing.assert_allclose(
+        position(-50.0), policy.position_to_world(jnp.array([0.1, 0.2, 0.3])), atol=1e-5
+    )
+
+
+def test_the_hand_view_shows_what_lies_beside_the_hand():
+    """A point 3 cm beside the hand, across the camera's axis, is 3 cm / pitch samples from the middle."""
+    config = replace(CONFIG, hand_view_pitch_m=0.005)
+    origin = np.array(PROFILE.crop_origin_px) + [3, -4]
+    camera = nominal_camera(PROFILE)
+    right, down = camera.T_world_cam[:3, 0], camera.T_world_cam[:3, 1]
+    hand = np.array([0.5, 0.02, 0.1])
+    point = hand + 0.03 * right - 0.02 * down
+    seen = np.linalg.inv(camera.T_world_cam)[:3] @ [*point, 1.0]
+    u = PROFILE.fx_px * seen[0] / seen[2] + PROFILE.cx_px - origin[1]
+    v = PROFILE.fy_px * seen[1] / seen[2] + PROFILE.cy_px - origin[0]
+    picture = np.zeros((1, config.input_height_px, config.input_width_px, 6), np.float32)
+    rows, columns = np.mgrid[: picture.shape[1], : picture.shape[2]] + 0.5
+    picture[0, :, :, 1::2] = 1.0  # valid everywhere
+    picture[0, :, :, 4] = np.exp(-((rows - v) ** 2 + (columns - u) ** 2) / 8)  # relief of the newest frame
+    placed = hand_view.place(jnp.asarray(hand)[None], jnp.asarray(origin)[None], PROFILE, config)
+    view = np.asarray(hand_view.cut(jnp.asarray(picture), *placed, config))[0, :, :, 4]
+    middle = (config.hand_view_px - 1) / 2
+    sample = (np.indices(view.shape) * view).sum((1, 2)) / view.sum() - middle
+    np.testing.assert_allclose(sample, [-0.02 / 0.005, 0.03 / 0.005], atol=0.1)
+
+
+def test_the_hand_view_ignores_invalid_pixels_and_what_is_outside():
+    picture = np.full((1, CONFIG.input_height_px, CONFIG.input_width_px, 6), 0.7, np.float32)
+    picture[..., 1::2] = 1.0
+    picture[:, :, ::2] = 0.0  # every second column has no reading
+    centre, per_metre = jnp.array([[56.0, 144.0]]), jnp.array([[300.0, 300.0]])  # at the right edge
+    view = np.asarray(hand_view.cut(jnp.asarray(picture), centre, per_metre, CONFIG))[0]
+    relief, share = view[10:-10, :20, ::2], view[10:-10, :20, 1::2]
+    assert np.all(view[:, 30:] == 0)
+    assert share.mean() == pytest.approx(0.5, abs=0.05)
+    np.testing.assert_allclose(relief[share > 0.25], 0.7, rtol=1e-4)
+
+
+def test_the_chain_of_the_exported_graph_ends_between_the_finger_pads():
+    q = np.random.default_rng(0).uniform(-1, 1, 7)
+    point = hand_view.grip_tip()
+    for angle, (rotation, offset) in zip(q[::-1], hand_view.grip_chain()[::-1], strict=True):
+        c, s = np.cos(angle), np.sin(angle)
+        point = rotation @ (np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ point) + offset
+    np.testing.assert_allclose(point, kinematics.grip_pose(q)[0], atol=1e-9)
 
 
 def test_unknown_options_name_the_nearest():
@@ -162,7 +239,7 @@ def test_unknown_options_name_the_nearest():
         denoiser.check_denoiser(replace(CONFIG, ddim_steps=60))
 
 
-def scene(rng: np.random.Generator, batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def disc_scene(rng: np.random.Generator, batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Discs of 5 cm above the table at random places, 10 % dropped pixels, random crops."""
     camera, table = nominal_camera(PROFILE), preprocess.table_depth(PROFILE, CONFIG.max_depth_m)
     rows, columns = np.mgrid[: PROFILE.height_px, : PROFILE.width_px] + 0.5
@@ -181,7 +258,7 @@ def scene(rng: np.random.Generator, batch: int) -> tuple[np.ndarray, np.ndarray,
 def test_the_encoder_learns_where_an_object_is_within_seconds():
     """Chance is 10 cm; 80 steps of 32 pictures must bring unseen ones under 4 cm."""
     rng = np.random.default_rng(0)
-    config = replace(SMALL, width=16, keypoints=16, feature_size=64)
+    config = replace(SMALL, width=16, keypoints=16, feature_size=64, hand_view_px=0)
     net = policy.StudentPolicy(config, PROFILE)
     params = policy.init_params(jax.random.key(0), config, PROFILE)
     optimiser = optax.adam(3e-3)
@@ -197,9 +274,9 @@ def test_the_encoder_learns_where_an_object_is_within_seconds():
         update, moments = optimiser.update(gradient, moments, params)
         return optax.apply_updates(params, update), moments, error_m
 
-    batches = [scene(rng, 32) for _ in range(20)]
+    batches = [disc_scene(rng, 32) for _ in range(20)]
     moments = optimiser.init(params)
     for index in range(80):
         params, moments, _ = step(params, moments, *batches[index % len(batches)])
-    unseen = scene(rng, 32)
+    unseen = disc_scene(rng, 32)
     assert float(step(params, moments, *unseen)[2]) < 0.04

@@ -11,13 +11,16 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
 from student_jax import train
-from student_jax.data import check_chunk, make_frames, random_crops, sharpen_gripper
-from student_jax.policy import Aux
+from student_jax.data import aux_targets, check_chunk, make_frames, random_crops, sharpen_gripper
+from student_jax.frames_io import useful_steps
+from student_jax.policy import Aux, init_params, position_to_world
+from student_jax.privileged import noisy_seen
 
 PROFILE = contract.D455.scaled(0.25)
 CONFIG = StudentConfig(
     width=8, keypoints=4, stage_blocks=(1, 1), feature_size=16, denoiser_width=16, denoiser_blocks=1,
     state_features=8, chunk=2, execute_steps=1, batch_size=2, noise_draws=2,
+    hand_view_px=8, hand_view_width=8, hand_view_blocks=1, hand_view_channels=2, hand_view_features=8,
 )  # fmt: skip
 
 
@@ -27,7 +30,7 @@ def frames_of(lengths=(3, 2)):
     for n in lengths:
         numbers = np.array([next(count) for _ in range(n)], np.float32)
         observation = np.zeros((n, 40), np.float32)
-        observation[:, 25] = numbers
+        observation[:, 25] = 0.4 + numbers / 50
         observation[:, 36] = np.cos(0.1)  # quaternion of a hand turned by 0.2 rad, fingers down
         observation[:, 37] = np.sin(0.1)
         columns.append(
@@ -59,15 +62,21 @@ def test_chunks_repeat_an_episodes_last_label():
 
 def test_privileged_targets_come_from_the_observation():
     frames = frames_of()
-    np.testing.assert_allclose(frames.position_m[:, 0], np.arange(5.0))
-    np.testing.assert_allclose(frames.yaw[0], [np.cos(0.4), np.sin(0.4)], atol=1e-6)
-    np.testing.assert_array_equal(frames.held, [0, 0, 1, 1, 1])
+    aux = aux_targets(frames.observation, frames.held)
+    np.testing.assert_allclose(position_to_world(aux.position)[:, 0], 0.4 + np.arange(5) / 50, atol=1e-5)
+    np.testing.assert_allclose(aux.yaw[0], [np.cos(0.4), np.sin(0.4)], atol=1e-6)
+    np.testing.assert_array_equal(aux.held_logit, [0, 0, 1, 1, 1])
 
 
-def test_frames_extend_with_shifted_episodes():
-    both = frames_of().extend(frames_of((1,)))
-    assert len(both) == 6 and both.episode.tolist() == [0, 0, 0, 1, 1, 2]
-    np.testing.assert_array_equal(both.depth_stack(np.array([5]))[0, :, 0, 0], [700, 700, 700])
+def test_steps_with_the_object_in_the_hand_are_drawn_less():
+    index = frames_of().draw(np.random.default_rng(0), 6000, 0.25)  # 2 before the grasp, 3 after
+    share = np.bincount(index, minlength=5) / 6000
+    np.testing.assert_allclose(share, np.array([1, 1, 0.25, 0.25, 0.25]) / 2.75, atol=0.02)
+
+
+def test_a_demo_ends_after_so_many_steps_with_the_object():
+    held = np.array([0, 1, 0, 1, 1, 1], bool)
+    assert [useful_steps(held, n) for n in (1, 2, 3, 9)] == [2, 4, 5, 6]
 
 
 def test_gripper_labels_are_sharp():
@@ -85,28 +94,65 @@ def test_auxiliary_losses_by_hand():
     seen = Aux(jnp.array([[0.3, 0.0, 0.0]]), jnp.array([[1.0, 0.0]]), jnp.array([0.0]))
     target = Aux(jnp.array([[0.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0]]), jnp.array([1.0]))
     losses = train.aux_losses(seen, target)
-    assert float(losses["position"]) == pytest.approx(
-        10 * 0.1 * (0.3 - 0.05) / 3, rel=1e-5
-    )  # Huber, delta 0.1
+    huber = 0.05 * (0.3 - 0.025) / 3  # bound 0.05
+    assert float(losses["position"]) == pytest.approx(40 * huber, rel=1e-5)
     assert float(losses["yaw"]) == pytest.approx(1.0)
     assert float(losses["held"]) == pytest.approx(np.log(2), rel=1e-5)
 
 
-def test_a_training_step_is_pure_and_learns():
+@pytest.mark.parametrize("action_weight", [0.0, 1.0])
+def test_a_training_step_is_pure_and_learns(action_weight):
+    config = dataclasses.replace(CONFIG, action_weight=action_weight, learning_rate=5e-3)
     frames = frames_of((6, 6))
     rng = np.random.default_rng(0)
-    batch = train.make_batch(frames, np.arange(8), rng, CONFIG, PROFILE)
+    batch = train.make_batch(frames, np.arange(8), rng, config, PROFILE)
     steps = 60
-    fresh = lambda: train.init_state(CONFIG, PROFILE, steps, 0)  # noqa: E731
-    one, first = train.train_step(CONFIG, PROFILE, steps, fresh(), batch)
-    two, _ = train.train_step(CONFIG, PROFILE, steps, fresh(), batch)
+    params = init_params(jax.random.key(0), config, PROFILE)
+    trained, frozen = train.split(config, params)
+    assert ("denoiser" in trained) == bool(action_weight)
+    fresh = lambda: train.init_state(config, steps, 0, trained)  # noqa: E731
+    one, first = train.train_step(config, PROFILE, steps, fresh(), frozen, batch)
+    two, _ = train.train_step(config, PROFILE, steps, fresh(), frozen, batch)
     for a, b in zip(jax.tree.leaves(one.params), jax.tree.leaves(two.params), strict=True):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
     state = fresh()
     for _ in range(steps):
-        state, last = train.train_step(CONFIG, PROFILE, steps, state, batch)
+        state, last = train.train_step(config, PROFILE, steps, state, frozen, batch)
     assert float(last["held"]) < 0.7 * float(first["held"])
-    assert float(last["total"]) < 0.8 * float(first["total"])
+    assert float(last["yaw"]) < 0.8 * float(first["yaw"])
+    assert ("action" in last) == bool(action_weight)
+
+
+def test_the_head_learns_actions_from_poses():
+    """Labels that say where the object is: after 300 steps the head's actions follow a new position."""
+    rng = np.random.default_rng(0)
+    params = init_params(jax.random.key(0), CONFIG, PROFILE)
+    state = train.init_state(CONFIG, 300, 0, train.head_of(params))
+
+    def samples(count):
+        observation = np.zeros((count, 40), np.float32)
+        observation[:, 25:27] = [0.5, 0.0] + rng.uniform(-0.15, 0.15, (count, 2))
+        observation[:, 18:21] = observation[:, 25:28]  # hand at the object: errors are small
+        observation[:, 36] = 1.0
+        seen = noisy_seen(observation, np.zeros(count, bool), np.zeros((count, 5)), rng, CONFIG)
+        label = np.zeros((count, CONFIG.chunk, 8), np.float32)
+        label[:, :, 0] = observation[:, 26:27] * 5
+        return seen, np.zeros((count, 8), np.float32), label
+
+    for _ in range(300):
+        state, _ = train.head_step(CONFIG, PROFILE, 300, state, *samples(64))
+    seen, joints, label = samples(100)
+    chosen = train.act_on_seen(CONFIG, PROFILE, state.params, seen, joints, np.zeros_like(label))
+    assert np.corrcoef(np.asarray(chosen)[:, 0, 0], label[:, 0, 0])[0, 1] > 0.9
+
+
+def test_pose_errors_shrink_near_the_object():
+    observation = np.zeros((2, 40), np.float32)
+    observation[1, 18] = 0.5  # half a metre away
+    seen = noisy_seen(observation, np.ones(2, bool), np.ones((2, 5)), np.random.default_rng(0), CONFIG)
+    error = np.asarray(position_to_world(seen.aux.position))
+    np.testing.assert_allclose(error, [[0.002] * 3, [0.010] * 3], atol=1e-6)
+    assert np.abs(seen.aux.held_logit).tolist() == [6.0, 6.0]
 
 
 def test_executing_more_than_a_chunk_is_refused():

@@ -1,0 +1,153 @@
+"""A second look: the picture around the hand, where joints say it should be, at a constant metric scale.
+
+The camera's pose is known to a centimetre only, so a place read off the picture is known no better. The
+hand is in the same picture and its place is known from the joints: what lies beside it can be placed
+relative to it, whatever the camera's error. Like a spatial transformer (Jaderberg et al., 2015) whose
+place is computed, not learned.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+
+from ddgrasp.config import StudentConfig
+from ddgrasp.contract import CameraProfile
+from ddgrasp.errors import UserError
+from mjx_envs import kinematics, scene
+from mjx_envs.camera import nominal_camera
+from student_jax import preprocess
+from student_jax.encoder import STEM_STRIDE, BasicBlock, Stem, newest_channel_index
+
+MIN_CAMERA_DEPTH_M = 0.1
+"""A hand nearer to the camera than this is drawn as if it were there."""
+MIN_COVERAGE = 0.25
+"""Bounds the division by the share of valid pixels under a sample."""
+
+
+class Projection(NamedTuple):
+    """Nominal camera and crop window as plain numbers: picture pixel = focal * xy / z + centre - origin."""
+
+    rotation: np.ndarray
+    """(3, 3) world to camera."""
+    offset_m: np.ndarray
+    """(3,) world to camera."""
+    focal_px: np.ndarray
+    """(2,) row, column, in pixels of the network's picture."""
+    centre_px: np.ndarray
+    """(2,) principal point in those pixels, had the crop window its origin at (0, 0)."""
+    shrink: np.ndarray
+    """(2,) picture pixels per camera pixel."""
+
+
+def check_hand_view(config: StudentConfig) -> None:
+    """UserError for sizes that do not work."""
+    if config.hand_view_px % STEM_STRIDE or config.hand_view_px < 0:
+        raise UserError(
+            f"student.hand_view_px is {config.hand_view_px}; "
+            f"expected a multiple of {STEM_STRIDE}, or 0 for none."
+        )
+    if config.hand_view_px:
+        newest_channel_index(config, "valid")
+
+
+def projection(profile: CameraProfile, config: StudentConfig) -> Projection:
+    """How the nominal camera draws a point of the world into the network's picture."""
+    window = preprocess.plan_window(profile, config)
+    shrink = np.array([1.0 if a.matrix is None else len(a.matrix) / a.length for a in window])
+    start = np.array([a.start for a in window])
+    pose = nominal_camera(profile).T_world_cam
+    rotation = pose[:3, :3].T
+    centre = (np.array([profile.cy_px, profile.cx_px]) - start) * shrink
+    focal = np.array([profile.fy_px, profile.fx_px]) * shrink
+    numbers = (rotation, -rotation @ pose[:3, 3], focal, centre, shrink)
+    return Projection(*(np.asarray(x, np.float32) for x in numbers))
+
+
+def grip_chain() -> list[tuple[np.ndarray, np.ndarray]]:
+    """[(R (3, 3), t (3,)), ...] of base to tip: point = R_1 Rz(q_1) (R_2 Rz(q_2) (... p) + t_2) + t_1.
+
+    One entry for each arm joint; `grip_tip` is p.
+    """
+    return [(kinematics.quat_to_mat(np.array(link.quat)), np.array(link.pos_m)) for link in scene.ARM_LINKS]
+
+
+def grip_tip() -> np.ndarray:
+    """(3,) the point between the finger pads in the last link's frame, metres."""
+    return np.array(scene.HAND_POS_M) + kinematics.rotate(
+        np.array(scene.HAND_QUAT), np.array(scene.GRIP_POS_M)
+    )
+
+
+def place(
+    grip_m: jax.Array, origin_rc: jax.Array, profile: CameraProfile, config: StudentConfig
+) -> tuple[jax.Array, jax.Array]:
+    """Where the nominal camera draws the hand.
+
+    Args:
+        grip_m: (B, 3) the point between the finger pads, world frame.
+        origin_rc: (B, 2) crop origins in the full frame.
+
+    Returns:
+        (B, 2) its (row, column) in the network's picture, and (B, 2) pixels per metre there.
+    """
+    view = projection(profile, config)
+    point = grip_m @ view.rotation.T + view.offset_m
+    depth = jnp.maximum(point[:, 2:], MIN_CAMERA_DEPTH_M)
+    per_metre = jnp.asarray(view.focal_px) / depth
+    centre = point[:, 1::-1] * per_metre + view.centre_px - origin_rc * view.shrink
+    return centre, per_metre
+
+
+def sampling_matrix(centre: jax.Array, step: jax.Array, count: int, length: int) -> jax.Array:
+    """(B, count, length) weights of `count` samples, `step` pixels apart around `centre`, both (B,).
+
+    Linear interpolation, widened to the step where that is more than a pixel; nothing beyond the edge.
+    """
+    offsets = np.arange(count, dtype=np.float32) - (count - 1) / 2
+    pixels = np.arange(length, dtype=np.float32) + 0.5
+    place_px = centre[:, None] + step[:, None] * offsets
+    support = jnp.maximum(step, 1.0)[:, None, None]
+    return jnp.maximum(0.0, 1.0 - jnp.abs(place_px[:, :, None] - pixels) / support) / support
+
+
+def cut(picture: jax.Array, centre: jax.Array, per_metre: jax.Array, config: StudentConfig) -> jax.Array:
+    """(B, n, n, C) part of the picture (B, h, w, C) around `centre`, samples hand_view_pitch_m apart.
+
+    Measures are averaged over valid pixels alone; the valid channel becomes the share of them.
+    """
+    count, pitch = config.hand_view_px, config.hand_view_pitch_m
+    rows = sampling_matrix(centre[:, 0], pitch * per_metre[:, 0], count, config.input_height_px)
+    columns = sampling_matrix(centre[:, 1], pitch * per_metre[:, 1], count, config.input_width_px)
+    seen = jnp.einsum("bij,bjkc,blk->bilc", rows, picture, columns)
+    frames = seen.reshape(*seen.shape[:3], -1, len(config.channels))
+    valid = config.channels.index("valid")
+    coverage = frames[..., valid : valid + 1]
+    scale = jnp.where(
+        jnp.arange(len(config.channels)) == valid, 1.0, 1.0 / jnp.maximum(coverage, MIN_COVERAGE)
+    )
+    return (frames * scale).reshape(seen.shape)
+
+
+class HandView(nn.Module):
+    """(B, h, w, C) picture, (B, 3) grip point and (B, 2) crop origins to (B, hand_view_features)."""
+
+    config: StudentConfig
+    profile: CameraProfile
+
+    @nn.compact
+    def __call__(self, picture: jax.Array, grip_m: jax.Array, origin_rc: jax.Array) -> jax.Array:
+        config = self.config
+        check_hand_view(config)
+        view = cut(picture, *place(grip_m, origin_rc, self.profile, config), config)
+        x = Stem(STEM, config.hand_view_width, config.norm, name="stem")(view)
+        for block in range(config.hand_view_blocks):
+            x = BasicBlock(config.hand_view_width, 1, config.norm, name=f"block{block}")(x)
+        cells = nn.relu(nn.Dense(config.hand_view_channels, name="cells")(x))
+        return nn.relu(nn.Dense(config.hand_view_features, name="features")(cells.reshape(len(cells), -1)))
+
+
+STEM = "space_to_depth"
+"""Patches keep every pixel; at this size they are as cheap as convolutions are dear."""

@@ -1,0 +1,137 @@
+"""Training the action head: on true poses with noise first, on what perception reports last."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from ddgrasp import artifacts
+from ddgrasp.config import Config
+from ddgrasp.progress import Progress
+from demos.rollout import Roller
+from ppo.policy import TeacherPolicy
+from student_jax import train
+from student_jax.data import Frames, make_frames, random_crops, sharpen_gripper
+from student_jax.policy import Seen
+from student_jax.privileged import PoseActor, noisy_seen
+
+POSES = "poses.msgpack"
+"""The pictureless episodes in the stage's directory; `fit_on_perception` goes on using them."""
+LOG_EVERY = 100
+_SEED = 45_000
+_ENCODE_BATCH = 64
+_COLUMNS = ("state", "action", "observation", "held")
+
+Samples = tuple[Seen, np.ndarray, np.ndarray]
+"""What perception reports, joint state (B, 8), action chunk (B, chunk, 8)."""
+
+
+def fit_on_poses(
+    config: Config, teacher: TeacherPolicy, params: dict, directory: Path, progress: Progress
+) -> tuple[dict, dict[str, float]]:
+    """DAgger without pictures (`student_jax.privileged`), which is cheap.
+
+    Returns:
+        `params` with the head trained, and {"rollout_success", "head_loss"} of the last round.
+    """
+    student, rounds = config.student, config.student.pose_rounds
+    steps = rounds * student.pose_steps
+    state = train.init_state(student, steps, config.seed, train.head_of(params))
+    roller = Roller(config, teacher, student.pose_episodes, with_depth=False)
+    rng = np.random.default_rng([config.seed, _SEED])
+    columns: dict[str, list[np.ndarray]] = {name: [] for name in _COLUMNS}
+    rate, loss = 0.0, np.float32(0.0)
+    with progress.task("head, on poses", steps) as task:
+        for i in range(rounds):
+            head = jax.tree.map(np.asarray, state.ema) if i else None
+            share = 0.5**i if i < rounds - 1 else 0.0
+            actor = PoseActor(head, student, config.world.profile, rng, student.pose_episodes, share)
+            episodes = roller.run(jax.random.PRNGKey(_SEED + 100 * config.seed + i), actor)
+            for name in _COLUMNS:
+                whole = getattr(episodes, name)
+                columns[name] += [whole[j, :n].astype(np.float32) for j, n in enumerate(episodes.length)]
+            rate = float(episodes.success.mean())
+            poses = _poses(columns)
+            for _ in range(student.pose_steps):
+                samples = _from_poses(config, poses, rng, student.head_batch_size)
+                state, loss = _step(config, steps, state, samples)
+                task.advance()
+            task.advance(0, loss=float(loss), success=rate)
+            progress.scalars(i, pose_loss=float(loss), pose_success=rate)
+    lengths = np.array([len(x) for x in columns["held"]])
+    saved = {name: np.concatenate(parts) for name, parts in columns.items()} | {"lengths": lengths}
+    artifacts.save_params(directory / POSES, saved)
+    trained = jax.tree.map(np.asarray, state.ema)
+    return params | trained, {"rollout_success": rate, "head_loss": float(loss)}
+
+
+def fit_on_perception(
+    config: Config, params: dict, frames: Frames, directory: Path, progress: Progress
+) -> tuple[dict, dict[str, float]]:
+    """The head on what `params` see in every frame, and on as many noisy poses if there are any."""
+    student, steps = config.student, config.student.head_steps
+    rng = np.random.default_rng([config.seed, _SEED, 1])
+    seen = _encode_all(config, params, frames, rng, progress)
+    chunks = sharpen_gripper(frames.action_chunks(np.arange(len(frames)), student.chunk))
+    poses = _load_poses(directory / POSES)
+    state = train.init_state(student, steps, config.seed, train.head_of(params))
+    count = student.head_batch_size if poses is None else student.head_batch_size // 2
+    loss = np.float32(0.0)
+    with progress.task("head, on perception", steps) as task:
+        for i in range(steps):
+            index = frames.draw(rng, count, student.held_weight)
+            samples = jax.tree.map(lambda x, index=index: x[index], (seen, frames.state, chunks))
+            if poses is not None:
+                samples = _join(samples, _from_poses(config, poses, rng, student.head_batch_size - count))
+            state, loss = _step(config, steps, state, samples)
+            if (i + 1) % LOG_EVERY == 0:
+                progress.scalars(i + 1, head_loss=float(loss))
+                task.advance(0, loss=float(loss))
+            task.advance()
+    return params | jax.tree.map(np.asarray, state.ema), {"head_loss": float(loss)}
+
+
+def _step(config: Config, steps: int, state: train.TrainState, samples: Samples):
+    # Samples cost nothing here: more of them serve better than more noises for each.
+    student = replace(config.student, noise_draws=1)
+    return train.head_step(student, config.world.profile, steps, state, *samples)
+
+
+def _from_poses(config: Config, poses: Frames, rng: np.random.Generator, count: int) -> Samples:
+    index = poses.draw(rng, count, config.student.held_weight)
+    bias = rng.standard_normal((count, 5))
+    seen = noisy_seen(poses.observation[index], poses.held[index], bias, rng, config.student)
+    return seen, poses.state[index], sharpen_gripper(poses.action_chunks(index, config.student.chunk))
+
+
+def _join(a: Samples, b: Samples) -> Samples:
+    return jax.tree.map(lambda x, y: np.concatenate([x, y]), a, b)
+
+
+def _encode_all(config: Config, params: dict, frames: Frames, rng, progress: Progress) -> Seen:
+    """What perception reports of all frames, each under one random crop."""
+    student, profile, parts = config.student, config.world.profile, []
+    batches = range(0, len(frames), _ENCODE_BATCH)
+    for start in progress.track(batches, "features", len(batches)):
+        index = np.minimum(np.arange(start, start + _ENCODE_BATCH), len(frames) - 1)
+        crops = random_crops(rng, _ENCODE_BATCH, profile, student.crop_shift_px)
+        depth = frames.depth_stack(index)
+        parts.append(
+            jax.tree.map(
+                np.asarray, train.encode(student, profile, params, depth, frames.state[index], crops)
+            )
+        )
+    return jax.tree.map(lambda *x: np.concatenate(x)[: len(frames)], *parts)
+
+
+def _poses(columns: dict[str, list[np.ndarray]]) -> Frames:
+    return make_frames([], *(columns[name] for name in _COLUMNS))
+
+
+def _load_poses(path: Path) -> Frames | None:
+    if not path.exists():
+        return None
+    saved = artifacts.load_params(path)
+    bounds = np.cumsum(saved["lengths"])[:-1]
+    return _poses({name: np.split(saved[name], bounds) for name in _COLUMNS})

@@ -1,0 +1,86 @@
+"""True poses with the errors that perception will make: what the action head learns from first.
+
+A simulation without pictures gives a hundred thousand labelled steps a minute, so that the head can
+act before the encoder sees anything. The error grows with the object's distance from the hand, as the
+hand view's does, and an episode keeps its own.
+"""
+
+import numpy as np
+
+from ddgrasp.config import StudentConfig
+from demos.rollout import Scene
+from student_jax import train
+from student_jax.data import aux_targets
+from student_jax.encoder import POSITION_SCALE_M
+from student_jax.policy import Aux, Seen, feature_count
+
+_GRIP_POS = slice(18, 21)
+NEAR_ERROR_M = 0.002
+ERROR_PER_DISTANCE = 0.08
+FAR_ERROR_M = 0.010
+"""Standard deviation of a position per axis: near + slope * distance, at most far."""
+YAW_ERROR = 0.15
+"""Of cosine and sine of the doubled angle: four degrees."""
+HELD_LOGIT = 6.0
+HELD_WRONG = 0.01
+"""Share of steps whose held probability is the wrong way round."""
+ACTION_NOISE, NOISE_SHARE = 0.3, 0.15
+"""Perturbation of the executed joint actions, and the share of steps that have one."""
+
+
+def noisy_seen(
+    observation: np.ndarray,
+    held: np.ndarray,
+    bias: np.ndarray,
+    rng: np.random.Generator,
+    config: StudentConfig,
+) -> Seen:
+    """What perception might report of true poses.
+
+    Args:
+        observation: (B, 40).
+        held: (B,) object in the hand.
+        bias: (B, 5) standard normal: position and yaw errors in units of their size.
+    """
+    truth = aux_targets(observation, held)
+    position = observation[:, 25:28]
+    distance = np.linalg.norm(observation[:, _GRIP_POS] - position, axis=1, keepdims=True)
+    size_m = np.minimum(NEAR_ERROR_M + ERROR_PER_DISTANCE * distance, FAR_ERROR_M)
+    wrong = rng.random(len(held)) < HELD_WRONG
+    logit = HELD_LOGIT * (2 * (truth.held_logit > 0.5) - 1.0) * np.where(wrong, -1.0, 1.0)
+    aux = Aux(
+        (truth.position + size_m / POSITION_SCALE_M * bias[:, :3]).astype(np.float32),
+        (truth.yaw + YAW_ERROR * bias[:, 3:]).astype(np.float32),
+        logit.astype(np.float32),
+    )
+    return Seen(np.zeros((len(held), feature_count(config)), np.float32), aux)
+
+
+class PoseActor:
+    """Acts in `demos.rollout.Roller` from noisy true poses, mixed with the teacher and perturbed.
+
+    Args:
+      head: parameters of HEAD_PARAMS; None lets the teacher act.
+      teacher_share: probability that an action is the teacher's instead.
+    """
+
+    def __init__(
+        self, head, config: StudentConfig, profile, rng: np.random.Generator, count: int, teacher_share: float
+    ):
+        self._head, self._config, self._profile = head, config, profile
+        self._rng, self._share = rng, 1.0 if head is None else teacher_share
+        self._bias = rng.standard_normal((count, 5))
+
+    def __call__(self, scene: Scene) -> np.ndarray:
+        """(B, 8) actions for the scene."""
+        rng, action = self._rng, np.array(scene.expert)
+        if self._head is not None:
+            seen = noisy_seen(scene.observation, scene.held, self._bias, rng, self._config)
+            noise = np.zeros((len(action), self._config.chunk, action.shape[1]), np.float32)
+            chosen = train.act_on_seen(self._config, self._profile, self._head, seen, scene.state, noise)
+            taught = rng.random((len(action), 1)) < self._share
+            action = np.where(taught, action, np.asarray(chosen)[:, 0])
+        pushed = rng.random((len(action), 1)) < NOISE_SHARE
+        push = ACTION_NOISE * rng.standard_normal(action.shape) * pushed
+        push[:, 7] = 0.0
+        return np.clip(action + push, -1.0, 1.0)
