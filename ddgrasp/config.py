@@ -62,6 +62,8 @@ class RandomConfig:
     """Each axis."""
     crop_px: int = 24
     """Shift of the crop window at scale 1, each axis."""
+    latency_share: float = 0.0
+    """Share of episodes in which every command takes effect one control step late."""
 
 
 @dataclass(frozen=True)
