@@ -10,10 +10,10 @@ import numpy as np
 import optax
 from jax import Array
 
+from ddg_jax.schedule import q_sample
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
-from student_jax import diffusion
 from student_jax.augment import disparity_noise
 from student_jax.data import Frames, aux_targets, random_crops, sharpen_gripper
 from student_jax.encoder import POSITION_SCALE_M
@@ -22,7 +22,7 @@ from student_jax.policy import (
     Aux,
     Seen,
     StudentPolicy,
-    alpha_bar,
+    noise_schedule,
     sample_from_seen,
 )
 
@@ -117,7 +117,7 @@ def diffusion_loss(config, policy, params, seen, state, action, key) -> Array:
     k_step, k_noise = jax.random.split(key)
     k = jax.random.randint(k_step, (len(cond),), 0, config.diffusion_steps)
     eps = jax.random.normal(k_noise, action.shape)
-    noisy = diffusion.q_sample(action, eps, k, alpha_bar(config))
+    noisy = q_sample(noise_schedule(config), action, k, eps)
     predicted = policy.apply({"params": params}, noisy, k, cond, method="denoise")
     return jnp.mean((eps - predicted) ** 2)
 
