@@ -12,6 +12,7 @@ import tyro
 
 from ddgrasp import artifacts, pipeline
 from ddgrasp.config import Config
+from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 
 DEFAULT_PRESET = "demo"
@@ -64,7 +65,7 @@ class TeacherTrain(_OneStage):
 
 @dataclass(frozen=True)
 class TeacherEval:
-    """Measure a trained teacher again: success per object, over as many trials as asked for."""
+    """Measure a trained teacher again: success and motion per object, over as many trials as asked for."""
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run."""
@@ -84,6 +85,12 @@ class TeacherEval:
         result = evaluate(GraspEnv(config.world), policy, self.trials, self.seed)
         for name, counts in {**result["objects"], "all": result["success"]}.items():
             print(f"{name:<12} {wilson.describe(wilson.success(counts['successes'], counts['n']))}")
+        columns = list(result["motion"][-1])
+        print("\n" + "  ".join([f"{columns[0]:<12}", *columns[1:]]))
+        for row in result["motion"]:
+            numbers = (f"{row[column]:>{len(column)}.3f}" for column in columns[1:])
+            print("  ".join([f"{row['object']:<12}", *numbers]))
+        print("acceleration and jerk relative to Franka's limits, over 100 ms; toggles per episode")
 
 
 @dataclass(frozen=True)
@@ -277,6 +284,37 @@ class Report:
         print_summary(report)
 
 
+@dataclass(frozen=True)
+class ObjectsList:
+    """Name the objects: category, size, mass, friction, where the numbers come from."""
+
+    def run(self) -> None:
+        from mjx_envs.objects import OBJECTS
+
+        for spec in OBJECTS.values():
+            size = " x ".join(f"{1000 * extent:.0f}" for extent in spec.extents_m())
+            numbers = f"{size:>14} mm {1000 * spec.mass_kg:>4.0f} g  friction {spec.friction}"
+            print(f"{spec.category_id:>2} {spec.name:<10} {numbers}  {spec.source}")
+
+
+@dataclass(frozen=True)
+class ObjectsSheet:
+    """Draw objects as a camera sees them, colour and depth, as one PNG."""
+
+    objects: tuple[str, ...] = ()
+    """Names; none draws all of them, those that the paper trains on first."""
+    out: Path = Path("objects.png")
+    """The picture's file."""
+
+    def run(self) -> None:
+        from evaluation.object_sheet import draw
+        from mjx_envs.objects import OBJECTS, SEEN, UNSEEN
+
+        everything = tuple(dict.fromkeys((*SEEN, *UNSEEN, *OBJECTS)))
+        artifacts.atomic_write_bytes(self.out, draw(self.objects or everything))
+        print(self.out)
+
+
 COMMANDS: dict[str, type] = {
     "run": Run,
     "teacher train": TeacherTrain,
@@ -292,6 +330,8 @@ COMMANDS: dict[str, type] = {
     "weights convert": WeightsConvert,
     "weights list": WeightsList,
     "report": Report,
+    "objects list": ObjectsList,
+    "objects sheet": ObjectsSheet,
 }
 
 
@@ -331,8 +371,10 @@ _PRESET_HELP = (
 
 def check_config_values(config: Config) -> Config:
     """`config` if the names in it exist; UserError that suggests the nearest right name otherwise."""
-    from mjx_envs.objects import get_object
+    from mjx_envs.objects import OBJECTS, get_object
 
+    if not config.world.objects:
+        raise UserError(f"world.objects is empty; expected at least one of {', '.join(OBJECTS)}.")
     for name in config.world.objects:
         get_object(name)
     return config

@@ -109,7 +109,7 @@ LAPTOP = Config(
     ddg=DDGConfig(train_steps=1200),
     student=StudentConfig(
         train_steps=1500,
-        dagger_rounds=3,
+        dagger_rounds=2,
         dagger_episodes=48,
         dagger_steps=400,
         head_steps=3000,

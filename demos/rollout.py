@@ -83,7 +83,7 @@ class Roller:
         with_depth: bool = True,
     ):
         self.env = GraspEnv(config.world)
-        self.viewer = Viewer(config.world.profile)
+        self.viewer = Viewer(config.world.profile, self.env.table.layout)
         self.count, self.steps = count, config.world.episode_steps
         self._teacher, self._random, self._with_rgb = teacher, config.world.random, with_rgb
         self._with_depth = with_depth

@@ -60,7 +60,7 @@ def draw_panels(panels: Mapping[str, np.ndarray]) -> bytes:
         figure = _grid([list(strip) for strip in strips.values()], [""] * longest, list(strips))
     if depths:
         _depth_legend(figure, near, far)
-    return _png(figure)
+    return to_png(figure)
 
 
 def draw_curves(curves: Mapping[str, Sequence[tuple[int, float]]], columns: int = 4) -> bytes:
@@ -74,7 +74,7 @@ def draw_curves(curves: Mapping[str, Sequence[tuple[int, float]]], columns: int 
         axes.set_title(name, fontsize=9)
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.3)
-    return _png(figure)
+    return to_png(figure)
 
 
 def _as_frames(panel: np.ndarray) -> np.ndarray:
@@ -126,7 +126,8 @@ def _depth_legend(figure: Figure, near_m: float, far_m: float) -> None:
     figure.legend(handles=[patch], loc="outside lower right", fontsize=8, frameon=False)
 
 
-def _png(figure: Figure) -> bytes:
+def to_png(figure: Figure) -> bytes:
+    """The figure as a PNG file's content."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
     return buffer.getvalue()

@@ -381,12 +381,12 @@ def write_sampler(
     g: GraphBuilder, cond: str, params: Params, student: StudentConfig, iterations: int
 ) -> None:
     """DDIM from the noise input to the action output."""
-    schedule = policy.alpha_bar(student)
+    schedule = policy.noise_schedule(student)
     network = _Denoiser(g, cond, params, student)
     size = student.chunk * contract.ACTION_SIZE
     x = g.reshape(contract.ONNX_INPUT_NOISE, [0, size])
     for k, row in zip(
-        diffusion.ddim_timesteps(len(schedule), iterations),
+        diffusion.ddim_timesteps(schedule.steps, iterations),
         diffusion.ddim_coefficients(schedule, iterations),
         strict=True,
     ):

@@ -25,6 +25,16 @@ OUT_OF_REACH_M = 0.35
 
 
 @struct.dataclass
+class Latency:
+    """Commands on their way to the robot."""
+
+    late: jax.Array
+    """() bool, whether they take a control step in this episode."""
+    controls: jax.Array
+    """(9,) the last step's."""
+
+
+@struct.dataclass
 class Episode:
     """What stays fixed during an episode, and its counters."""
 
@@ -42,6 +52,8 @@ class Episode:
     """() consecutive steps with the object at the target."""
     grasped: jax.Array
     """() bool."""
+    latency: Latency | None = None
+    """None unless configured."""
 
 
 class GraspEnv(mjx_env.MjxEnv):
@@ -51,8 +63,8 @@ class GraspEnv(mjx_env.MjxEnv):
         super().__init__(config_dict.create(ctrl_dt=contract.CONTROL_DT_S, sim_dt=config.sim_dt_s))
         self.config = config
         self.table = randomize.ObjectTable(config.objects)
-        self.physics = physics.make_physics(config.backend, config.sim_dt_s)
-        self._mj_model = scene.build_model(config.sim_dt_s)
+        self.physics = physics.make_physics(config.backend, config.sim_dt_s, self.table.layout)
+        self._mj_model = scene.build_model(config.sim_dt_s, self.table.layout)
 
     def reset(self, rng: jax.Array) -> mjx_env.State:
         """A new episode: object, pose, dynamics and joints drawn from `rng`."""
@@ -63,7 +75,7 @@ class GraspEnv(mjx_env.MjxEnv):
         qpos = randomize.sample_qpos(k_qpos, self.config.random, rest)
         branch = grasp_math.yaw_branch(qpos[12:16], self._symmetry(index), jp)
         if self.config.random.pregrasp_share > 0:
-            grasp = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], self._symmetry(index), branch, jp)
+            grasp = self._grasp_pose(qpos, index, branch)
             qpos = randomize.maybe_pregrasp(k_start, self.config.random, qpos, *grasp)
         state = physics.initial_state(qpos)
         episode = Episode(
@@ -76,6 +88,7 @@ class GraspEnv(mjx_env.MjxEnv):
             steps=jp.zeros((), jp.int32),
             hold_count=jp.zeros((), jp.int32),
             grasped=jp.zeros((), bool),
+            latency=self._latency(rng, qpos),
         )
         obs = self._get_obs(state, episode)
         metrics = {f"reward/{name}": jp.zeros(()) for name in rewards.TERMS}
@@ -87,7 +100,8 @@ class GraspEnv(mjx_env.MjxEnv):
         """One control step with `action` (8,)."""
         old: physics.PhysicsState = state.data
         episode: Episode = state.info["episode"]
-        new = self.physics.step(episode.params, old, grasp_math.controls(old.qpos[:7], action, jp))
+        controls, latency = self._delayed(episode.latency, grasp_math.controls(old.qpos[:7], action, jp))
+        new = self.physics.step(episode.params, old, controls)
         finite = jp.all(jp.isfinite(new.qpos)) & jp.all(jp.isfinite(new.qvel))
         new = jax.tree.map(lambda a, b: jp.where(finite, a, b), new, old)
 
@@ -111,8 +125,9 @@ class GraspEnv(mjx_env.MjxEnv):
         lost = (lost & ~grasped) | ~finite
         over = steps >= self.config.episode_steps
         episode = replace(
-            episode, distances=distances, action=action, steps=steps, hold_count=hold_count, grasped=grasped
-        )
+            episode, distances=distances, action=action, steps=steps, hold_count=hold_count, grasped=grasped,
+            latency=latency,
+        )  # fmt: skip
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jp.float32)
         metrics["saturated"] = jp.mean(jp.abs(action[:7]) > 0.95)
@@ -129,17 +144,39 @@ class GraspEnv(mjx_env.MjxEnv):
 
     def _get_obs(self, state: physics.PhysicsState, episode: Episode) -> jax.Array:
         log_category = jp.asarray(self.table.log_category, jp.float32)[episode.object_index]
-        symmetry = self._symmetry(episode.object_index)
-        return grasp_math.observation(state.qpos, state.qvel, symmetry, episode.branch, log_category, jp)
+        symmetry, offset = self._symmetry(episode.object_index), self._grasp_offset(episode.object_index)
+        return grasp_math.observation(
+            state.qpos, state.qvel, symmetry, episode.branch, log_category, jp, offset
+        )
 
     def _distances(self, qpos, index, branch) -> rewards.Distances:
-        grasp_pos, grasp_quat = grasp_math.grasp_pose(
-            qpos[9:12], qpos[12:16], self._symmetry(index), branch, jp
-        )
+        grasp_pos, grasp_quat = self._grasp_pose(qpos, index, branch)
         return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[:7], jp))
+
+    def _latency(self, rng, qpos) -> Latency | None:
+        """At the start: the robot holds its pose, gripper open."""
+        share = self.config.random.latency_share
+        if share == 0:
+            return None
+        late = jax.random.uniform(jax.random.fold_in(rng, 1)) < share
+        return Latency(late, grasp_math.controls(qpos[:7], jp.zeros(contract.ACTION_SIZE), jp))
+
+    def _delayed(self, latency: Latency | None, controls) -> tuple[jax.Array, Latency | None]:
+        """The controls in force now, and what is on its way then."""
+        if latency is None:
+            return controls, None
+        now = jp.where(latency.late, latency.controls, controls)
+        return now, replace(latency, controls=controls)
+
+    def _grasp_pose(self, qpos, index, branch) -> tuple[jax.Array, jax.Array]:
+        symmetry, offset = self._symmetry(index), self._grasp_offset(index)
+        return grasp_math.grasp_pose(qpos[9:12], qpos[12:16], symmetry, branch, jp, offset)
 
     def _symmetry(self, index) -> jax.Array:
         return jp.asarray(self.table.symmetry)[index]
+
+    def _grasp_offset(self, index) -> jax.Array:
+        return jp.asarray(self.table.grasp_offset, jp.float32)[index]
 
     @property
     def xml_path(self) -> str:

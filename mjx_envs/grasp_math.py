@@ -12,6 +12,8 @@ HAND_DOWN = (0.0, 1.0, 0.0, 0.0)
 MIN_GRIP_HEIGHT_M = 0.02
 """The pads reach 12 mm beyond the grip site: keep them off the table."""
 
+NO_OFFSET_M = (0.0, 0.0, 0.0)
+
 
 def yaw_branch(object_quat, symmetry, xp: ModuleType = np):
     """() multiple of 2 pi / symmetry to add to the object's yaw so that the hand turns least.
@@ -22,20 +24,22 @@ def yaw_branch(object_quat, symmetry, xp: ModuleType = np):
     return -xp.round(kin.yaw_of(object_quat, xp) / turn)
 
 
-def grasp_pose(object_pos, object_quat, symmetry, branch, xp: ModuleType = np):
-    """((3,), (4,)) top-down grasp: pads close along the object's local y axis at its origin.
+def grasp_pose(object_pos, object_quat, symmetry, branch, xp: ModuleType = np, offset_m=NO_OFFSET_M):
+    """((3,), (4,)) top-down grasp: pads close along the object's local y axis.
 
     Args:
       object_pos, object_quat: object pose in the world.
       symmetry: equivalent yaws per turn; 0 = any, then the hand keeps yaw 0.
       branch: from `yaw_branch`.
+      offset_m: (3,) from the object's origin to the grasp, object frame.
     """
     turn = 2 * np.pi / xp.maximum(symmetry, 1)
     yaw = xp.where(symmetry == 0, 0.0, kin.yaw_of(object_quat, xp) + branch * turn)
     down = xp.broadcast_to(xp.asarray(HAND_DOWN, dtype=object_quat.dtype), object_quat.shape)
     quat = kin.quat_mul(kin.quat_about_z(yaw, xp), down, xp)
-    height = xp.maximum(object_pos[..., 2], MIN_GRIP_HEIGHT_M)
-    return xp.concatenate([object_pos[..., :2], height[..., None]], axis=-1), canonical(quat, 1, xp)
+    pos = object_pos + kin.rotate(object_quat, xp.asarray(offset_m, dtype=object_pos.dtype), xp)
+    height = xp.maximum(pos[..., 2], MIN_GRIP_HEIGHT_M)
+    return xp.concatenate([pos[..., :2], height[..., None]], axis=-1), canonical(quat, 1, xp)
 
 
 def canonical(quat, axis: int, xp: ModuleType = np):
@@ -43,11 +47,11 @@ def canonical(quat, axis: int, xp: ModuleType = np):
     return xp.where(quat[..., axis : axis + 1] < 0, -quat, quat)
 
 
-def observation(qpos, qvel, symmetry, branch, log_category, xp: ModuleType = np):
+def observation(qpos, qvel, symmetry, branch, log_category, xp: ModuleType = np, offset_m=NO_OFFSET_M):
     """(40,) teacher observation (ddgrasp.contract.OBSERVATION_SIZE lists its parts)."""
     grip_pos, grip_quat = kin.grip_pose(qpos[..., :7], xp)
     object_pos, object_quat = qpos[..., 9:12], qpos[..., 12:16]
-    grasp_pos, grasp_quat = grasp_pose(object_pos, object_quat, symmetry, branch, xp)
+    grasp_pos, grasp_quat = grasp_pose(object_pos, object_quat, symmetry, branch, xp, offset_m)
     return xp.concatenate(
         [
             qpos[..., :9], qvel[..., :9],

@@ -16,6 +16,7 @@ from flax import struct
 from ddgrasp import contract
 from ddgrasp.errors import unknown_name
 from mjx_envs import scene
+from mjx_envs.objects import DEFAULT_SLOTS, SlotLayout
 
 
 @struct.dataclass
@@ -23,11 +24,11 @@ class ModelParams:
     """What differs between environments of a batch."""
 
     slot_size: jax.Array
-    """(5, 3) MuJoCo sizes of the object's geoms, m."""
+    """(S, 3) MuJoCo sizes of the object's geoms (S slots), m."""
     slot_pos: jax.Array
-    """(5, 3) in the object frame, m."""
+    """(S, 3) in the object frame, m."""
     slot_quat: jax.Array
-    """(5, 4)."""
+    """(S, 4)."""
     object_mass: jax.Array
     """() kg."""
     object_inertia: jax.Array
@@ -72,8 +73,8 @@ def initial_state(qpos: jax.Array) -> PhysicsState:
 
 
 def touch_from_sensors(sensordata, xp):
-    """(..., 2) contact force (N) on the left and right pad from the scene's contact sensors (..., 30)."""
-    forces = sensordata.reshape(sensordata.shape[:-1] + (2, len(scene.SLOT_NAMES), 3))
+    """(..., 2) contact force (N) on the left and right pad from the scene's contact sensors (..., 6 S)."""
+    forces = sensordata.reshape(sensordata.shape[:-1] + (2, -1, 3))
     return xp.sqrt(xp.sum(forces**2, axis=-1)).sum(axis=-1)
 
 
@@ -81,7 +82,8 @@ class ModelIndex:
     """Where the fields of `ModelParams` live in the compiled model."""
 
     def __init__(self, model: mujoco.MjModel):
-        self.slots = np.array([model.geom(n).id for n in scene.SLOT_NAMES])
+        self.slots = scene.slot_ids(model)
+        self.slot_is_capsule = model.geom_type[self.slots] == mujoco.mjtGeom.mjGEOM_CAPSULE
         self.object_body = model.body("object").id
         self.links = np.array([model.body(link.name).id for link in scene.ARM_LINKS])
         self.arm_dofs = np.array([model.joint(n).dofadr[0] for n in contract.ARM_JOINTS])
@@ -96,9 +98,9 @@ class ModelIndex:
 
         gain = params.gain_scale
         size = params.slot_size
-        rbound = xp.sqrt(xp.sum(size**2, axis=-1)) + size[..., 1] * (xp.arange(5) > 0)
+        rbound = scene.slot_bounding_radii(size, self.slot_is_capsule, xp)
         mass_scale, obj = params.link_mass_scale, self.object_body
-        friction = xp.broadcast_to(params.object_friction[..., None], batch + (5,))
+        friction = xp.broadcast_to(params.object_friction[..., None], batch + self.slots.shape)
         put = _put_numpy if xp is np else _put_jax
         body_mass = put(base("body_mass"), (self.links,), base("body_mass")[..., self.links] * mass_scale)
         inertia = base("body_inertia")
@@ -132,15 +134,15 @@ def _put_jax(array, index, value):
     return array.at[(..., *index)].set(value)
 
 
-def make_physics(backend: str, sim_dt_s: float) -> Physics:
+def make_physics(backend: str, sim_dt_s: float, layout: SlotLayout = DEFAULT_SLOTS) -> Physics:
     """The named backend at `sim_dt_s` seconds a substep; UserError for an unknown name."""
     substeps = round(contract.CONTROL_DT_S / sim_dt_s)
     if backend == "cpu":
         from mjx_envs.physics_cpu import CpuPhysics
 
-        return CpuPhysics(sim_dt_s, substeps)
+        return CpuPhysics(sim_dt_s, substeps, layout)
     if backend == "jax":
         from mjx_envs.physics_jax import JaxPhysics
 
-        return JaxPhysics(sim_dt_s, substeps)
+        return JaxPhysics(sim_dt_s, substeps, layout)
     raise unknown_name("physics backend", backend, ("cpu", "jax"))

@@ -5,14 +5,15 @@ import numpy as np
 from mujoco.batch import Batch
 
 from mjx_envs import scene
+from mjx_envs.objects import SlotLayout
 from mjx_envs.physics import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
 
 
 class CpuPhysics:
     """`mujoco.batch` behind `jax.pure_callback`: one host call steps the whole vmapped batch."""
 
-    def __init__(self, sim_dt_s: float, substeps: int):
-        self._model = scene.build_model(sim_dt_s)
+    def __init__(self, sim_dt_s: float, substeps: int, layout: SlotLayout):
+        self._model = scene.build_model(sim_dt_s, layout)
         self._substeps = substeps
         self._index = ModelIndex(self._model)
         self._batches: dict[int, _HostBatch] = {}

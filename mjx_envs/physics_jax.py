@@ -5,14 +5,15 @@ import jax.numpy as jp
 from mujoco import mjx
 
 from mjx_envs import scene
+from mjx_envs.objects import SlotLayout
 from mjx_envs.physics import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
 
 
 class JaxPhysics:
     """MJX-JAX; carries no `mjx.Data` between control steps, so the state stays small."""
 
-    def __init__(self, sim_dt_s: float, substeps: int):
-        self._model = scene.build_model(sim_dt_s)
+    def __init__(self, sim_dt_s: float, substeps: int, layout: SlotLayout):
+        self._model = scene.build_model(sim_dt_s, layout)
         self._mx = mjx.put_model(self._model)
         self._substeps = substeps
         self._index = ModelIndex(self._model)

@@ -7,7 +7,7 @@ import numpy as np
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
 from mjx_envs import inverse_kinematics, kinematics, scene
-from mjx_envs.objects import get_object
+from mjx_envs.objects import get_object, slot_layout
 from mjx_envs.physics import ModelParams
 
 PREGRASP_HEIGHT_M = 0.15
@@ -18,7 +18,8 @@ class ObjectTable:
 
     def __init__(self, names: tuple[str, ...]):
         specs = [get_object(name) for name in names]
-        slots = [spec.slot_arrays() for spec in specs]
+        self.layout = slot_layout(specs)
+        slots = [spec.slot_arrays(self.layout) for spec in specs]
         self.names = tuple(names)
         self.slot_size = np.stack([s[0] for s in slots])
         self.slot_pos = np.stack([s[1] for s in slots])
@@ -29,7 +30,8 @@ class ObjectTable:
         self.rest_height = np.array([s.rest_height_m for s in specs])
         self.symmetry = np.array([s.grasp_symmetry for s in specs])
         self.log_category = np.log([s.category_id for s in specs])
-        self.rgb = np.array([s.rgb for s in specs])
+        self.grasp_offset = np.array([s.grasp_offset_m for s in specs])
+        self.rgb = np.stack([s.slot_rgb(self.layout) for s in specs])
 
 
 def _around(key, half_range, shape=()):

@@ -12,7 +12,7 @@ from ddgrasp import contract
 from ddgrasp.config import RandomConfig
 from ddgrasp.errors import unknown_name
 from mjx_envs import grasp_math, kinematics, scene
-from mjx_envs.objects import ObjectSpec, get_object
+from mjx_envs.objects import ObjectSpec, get_object, slot_layout
 
 SIM_DT_S = 0.0025
 
@@ -30,10 +30,10 @@ class RigWorld:
         self.objects = {name: get_object(name) for name in objects}
         self._random = random or RandomConfig()
         self._randomise = randomise
-        self._base = scene.build_model(SIM_DT_S)
-        self.model = scene.build_model(SIM_DT_S)
+        self._layout = slot_layout(self.objects.values())
+        self._base = scene.build_model(SIM_DT_S, self._layout)
+        self.model = scene.build_model(SIM_DT_S, self._layout)
         self.data = mujoco.MjData(self.model)
-        self._slots = [self.model.geom(name).id for name in scene.SLOT_NAMES]
         self._spec: ObjectSpec = next(iter(self.objects.values()))
         self._branch = 0.0
         self._hold_steps = 0
@@ -73,7 +73,7 @@ class RigWorld:
         """(40,) what the teacher sees; for the teacher alone."""
         return grasp_math.observation(
             self.data.qpos, self.data.qvel, np.asarray(self._spec.grasp_symmetry), self._branch,
-            np.log(self._spec.category_id),
+            np.log(self._spec.category_id), offset_m=np.asarray(self._spec.grasp_offset_m),
         )  # fmt: skip
 
     def success(self) -> bool:
@@ -89,20 +89,10 @@ class RigWorld:
         return 1.0 + scale * rng.uniform(-1.0, 1.0, shape)
 
     def _set_object(self, rng: np.random.Generator) -> float:
-        spec, model = self._spec, self.model
-        size = float(self._around(rng, self._random.size))
-        mass = float(self._around(rng, self._random.object_mass))
-        slot_size, slot_pos, slot_quat = spec.slot_arrays()
-        model.geom_size[self._slots] = slot_size * size
-        model.geom_pos[self._slots] = slot_pos * size
-        model.geom_quat[self._slots] = slot_quat
-        half_length = slot_size[:, 1] * (np.arange(len(self._slots)) > 0)
-        model.geom_rbound[self._slots] = (np.linalg.norm(slot_size, axis=1) + half_length) * size
-        model.geom_friction[self._slots, 0] = spec.friction * self._around(rng, self._random.object_friction)
-        model.geom_rgba[self._slots, :3] = spec.rgb
-        body = model.body("object").id
-        model.body_mass[body] = spec.mass_kg * mass
-        model.body_inertia[body] = spec.inertia_kg_m2() * mass * size**2
+        random = self._random
+        ranges = (random.size, random.object_mass, random.object_friction)
+        size, mass, friction = (float(self._around(rng, half_range)) for half_range in ranges)
+        scene.fill_slots(self.model, self._spec, self._layout, size, mass, friction)
         return size
 
     def _set_dynamics(self, rng: np.random.Generator) -> None:

@@ -8,9 +8,10 @@ Identification of the Franka Emika Panda Robot", RA-L 2019. Geometry is our own:
 from dataclasses import dataclass
 
 import mujoco
+import numpy as np
 
 from ddgrasp import contract
-from mjx_envs.objects import OBJECTS, SLOT_NAMES
+from mjx_envs.objects import DEFAULT_SLOTS, OBJECTS, ObjectSpec, SlotLayout
 
 _S = 0.7071067811865476  # cos 45 degrees
 
@@ -122,14 +123,13 @@ def _hand_xml() -> str:
     </body>"""
 
 
-def _object_xml() -> str:
-    size, pos, quat = OBJECTS["cube"].slot_arrays()
-    kinds = ("box",) + ("capsule",) * (len(SLOT_NAMES) - 1)
-    slots = "".join(
-        f'<geom name="{n}" class="slot" type="{k}" size="{_fmt(s)}" pos="{_fmt(p)}" quat="{_fmt(q)}"/>'
-        for n, k, s, p, q in zip(SLOT_NAMES, kinds, size, pos, quat, strict=True)
-    )
+def _object_xml(layout: SlotLayout) -> str:
     cube = OBJECTS["cube"]
+    slots = "".join(
+        f'<geom name="{n}" class="{"" if n in layout.colliding_names else "drawn_"}slot" type="{k}" '
+        f'size="{_fmt(s)}" pos="{_fmt(p)}" quat="{_fmt(q)}"/>'
+        for n, k, s, p, q in zip(layout.names, layout.kinds, *cube.slot_arrays(layout), strict=True)
+    )
     return f"""
     <body name="object" pos="{contract.WORKSPACE_CENTER_M[0]} 0 {cube.rest_height_m}">
       <joint name="object" type="free" damping="0.0005"/>
@@ -154,17 +154,17 @@ def _actuators_xml() -> str:
     return arm + fingers
 
 
-def _touch_xml() -> str:
+def _touch_xml(layout: SlotLayout) -> str:
     """Force of the strongest contact of each finger pad with each slot: MJX matches geoms only."""
     return "".join(
         f'<contact geom1="{side}_finger_pad" geom2="{slot}" data="force" reduce="maxforce" num="1"/>'
         for side in ("left", "right")
-        for slot in SLOT_NAMES
+        for slot in layout.colliding_names
     )
 
 
-def scene_xml(sim_dt_s: float = 0.005) -> str:
-    """MJCF of the whole scene.
+def scene_xml(sim_dt_s: float = 0.005, layout: SlotLayout = DEFAULT_SLOTS) -> str:
+    """MJCF of the whole scene, the cube in the object's slots.
 
     The solver rarely needs more than two iterations; capped at ten, a lying banana was thrown about.
     """
@@ -184,6 +184,7 @@ def scene_xml(sim_dt_s: float = 0.005) -> str:
       <geom contype="1" conaffinity="1" group="1" condim="4" friction="0.9 0.005 0.0001"
             solref="{2 * sim_dt_s} 1"/>
     </default>
+    <default class="drawn_slot"><geom contype="0" conaffinity="0" group="1"/></default>
   </default>
   <visual><global offwidth="1280" offheight="720"/><map znear="0.02" zfar="20"/></visual>
   <worldbody>
@@ -194,7 +195,7 @@ def scene_xml(sim_dt_s: float = 0.005) -> str:
       <geom class="arm" type="capsule" fromto="-0.05 0 0.05 0.0 0 0.07" size="0.07"/>
       {_arm_xml()}
     </body>
-    {_object_xml()}
+    {_object_xml(layout)}
   </worldbody>
   <equality>
     <joint joint1="{contract.FINGER_JOINTS[0]}" joint2="{contract.FINGER_JOINTS[1]}" solref="{2 * sim_dt_s} 1"
@@ -202,16 +203,51 @@ def scene_xml(sim_dt_s: float = 0.005) -> str:
   </equality>
   <actuator>{_actuators_xml()}</actuator>
   <sensor>
-    {_touch_xml()}
+    {_touch_xml(layout)}
   </sensor>
 </mujoco>"""
 
 
-def build_model(sim_dt_s: float = 0.005) -> mujoco.MjModel:
+def build_model(sim_dt_s: float = 0.005, layout: SlotLayout = DEFAULT_SLOTS) -> mujoco.MjModel:
     """A new compiled model; change it freely."""
-    model = mujoco.MjModel.from_xml_string(scene_xml(sim_dt_s))
+    model = mujoco.MjModel.from_xml_string(scene_xml(sim_dt_s, layout))
     _widen_object_bounds(model)
     return model
+
+
+def slot_ids(model: mujoco.MjModel) -> np.ndarray:
+    """(S,) geom ids of the object's slots, in the layout's order."""
+    body = model.body("object").id
+    return model.body_geomadr[body] + np.arange(model.body_geomnum[body])
+
+
+def fill_slots(
+    model: mujoco.MjModel,
+    spec: ObjectSpec,
+    layout: SlotLayout,
+    size: float = 1.0,
+    mass: float = 1.0,
+    friction: float = 1.0,
+) -> None:
+    """Makes the object of `model` (built with `layout`) that of `spec`; the rest are relative factors.
+
+    `mujoco.mj_setConst` must follow: MuJoCo precomputes inertia for free bodies.
+    """
+    slots, body = slot_ids(model), model.body("object").id
+    slot_size, slot_pos, slot_quat = spec.slot_arrays(layout)
+    model.geom_size[slots], model.geom_pos[slots], model.geom_quat[slots] = (
+        slot_size * size, slot_pos * size, slot_quat,
+    )  # fmt: skip
+    model.geom_rbound[slots] = slot_bounding_radii(slot_size * size, np.array(layout.kinds) == "capsule")
+    model.geom_friction[slots, 0] = spec.friction * friction
+    model.geom_rgba[slots, :3] = spec.slot_rgb(layout)
+    model.body_mass[body] = spec.mass_kg * mass
+    model.body_inertia[body] = spec.inertia_kg_m2() * mass * size**2
+
+
+def slot_bounding_radii(size, is_capsule, xp=np):
+    """(..., S) radii of spheres that hold slots of `size` (..., S, 3); `is_capsule` (S,) bool."""
+    return xp.sqrt(xp.sum(size**2, axis=-1)) + size[..., 1] * is_capsule
 
 
 def _widen_object_bounds(model: mujoco.MjModel) -> None:
@@ -221,7 +257,7 @@ def _widen_object_bounds(model: mujoco.MjModel) -> None:
     marks geoms that the compiler found centred in their body, whose pose MuJoCo then does not read.
     """
     body = model.body("object").id
-    slots = [model.geom(name).id for name in SLOT_NAMES]
+    slots = slot_ids(model)
     model.geom_sameframe[slots] = 0
     model.geom_aabb[slots] = [0.0, 0.0, 0.0, 0.15, 0.15, 0.15]
     first, count = model.body_bvhadr[body], model.body_bvhnum[body]

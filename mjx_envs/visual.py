@@ -9,6 +9,7 @@ import numpy as np
 from ddgrasp import contract
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import Camera, nominal_camera
+from mjx_envs.objects import DEFAULT_SLOTS, SlotLayout
 from mjx_envs.physics import ModelParams
 from mjx_envs.raycast import Geoms, render, render_depth
 from mjx_envs.visible_geoms import visible_geoms
@@ -20,17 +21,17 @@ class Viewer:
 
     Args:
       profile: the camera at the scale wanted.
+      layout: the object's slots, as the environments have them (`ObjectTable.layout`).
     """
 
-    def __init__(self, profile: contract.CameraProfile):
+    def __init__(self, profile: contract.CameraProfile, layout: SlotLayout = DEFAULT_SLOTS):
         self.profile = profile
-        model = scene.build_model()
+        model = scene.build_model(layout=layout)
         table = visible_geoms(model)
         self._types = table.types
         self._size, self._rgb = table.size, table.rgb
         self._pos, self._quat = model.geom_pos[table.ids], model.geom_quat[table.ids]
-        names = [model.geom(i).name for i in table.ids]
-        self._slots = np.array([names.index(name) for name in scene.SLOT_NAMES])
+        self._slots = np.searchsorted(table.ids, scene.slot_ids(model))
         self._bodies = [model.body(int(b)).name for b in model.geom_bodyid[table.ids]]
         self._camera = nominal_camera(profile)
 
@@ -40,7 +41,7 @@ class Viewer:
         return self._camera.T_world_cam
 
     def geoms(self, qpos: jax.Array, params: ModelParams, object_rgb) -> Geoms:
-        """World geometry of the configuration qpos (16,) with object colour (3,)."""
+        """World geometry of the configuration qpos (16,) with the slots' colours (S, 3), or one (3,)."""
         poses = kinematics.body_poses(qpos, jp)
         poses["world"] = (jp.zeros(3), jp.asarray([1.0, 0.0, 0.0, 0.0]))
         body_pos = jp.stack([poses[name][0] for name in self._bodies])

@@ -7,6 +7,7 @@ import jax.numpy as jp
 import numpy as np
 
 from mjx_envs.grasp_env import GraspEnv
+from ppo.motion import motion_metrics
 from ppo.policy import TeacherPolicy
 
 
@@ -17,22 +18,35 @@ def _episodes(env: GraspEnv, count: int, layers, mean, std, key):
 
     def step(carry, _):
         state, alive, success = carry
-        state = jax.vmap(env.step)(state, policy(state.obs, jp))
+        action = policy(state.obs, jp)
+        state = jax.vmap(env.step)(state, action)
         success = jp.where(alive, state.metrics["success"], success)
-        saturated = state.metrics["saturated"]
-        return (state, alive & (state.done == 0), success), saturated
+        motion = (state.data.qvel[:, :7], action, alive)
+        return (state, alive & (state.done == 0), success), motion
 
     start = (state, jp.ones(count, bool), jp.zeros(count))
-    (state, _, success), saturated = jax.lax.scan(step, start, None, env.config.episode_steps)
-    return success, state.info["episode"].object_index, saturated.mean()
+    (state, _, success), motion = jax.lax.scan(step, start, None, env.config.episode_steps)
+    return success, state.info["episode"].object_index, motion
 
 
 def evaluate(env: GraspEnv, policy: TeacherPolicy, trials: int, seed: int) -> dict:
-    """Success over `trials` episodes: {"success": {"successes", "n"}, "objects": {...}, "saturated"}."""
-    success, index, saturated = _episodes(
+    """Success and motion over `trials` episodes.
+
+    Returns:
+      success {"successes", "n"}; objects {name: {"successes", "n"}}; saturated_actions; motion, a row
+      {"object", ...} of `motion_metrics` for each object that came up, and one for all.
+    """
+    success, index, motion = _episodes(
         env, trials, policy.layers, policy.mean, policy.std, jax.random.PRNGKey(seed)
     )
     success, index = np.asarray(success) > 0, np.asarray(index)
+    motion = [np.asarray(part) for part in motion]
+    chosen = {name: index == i for i, name in enumerate(env.table.names)} | {"all": index >= 0}
+    rows = [
+        {"object": name} | motion_metrics(*(part[:, which] for part in motion))
+        for name, which in chosen.items()
+        if which.any()
+    ]
     objects = {
         name: {"successes": int(success[index == i].sum()), "n": int((index == i).sum())}
         for i, name in enumerate(env.table.names)
@@ -40,5 +54,6 @@ def evaluate(env: GraspEnv, policy: TeacherPolicy, trials: int, seed: int) -> di
     return {
         "success": {"successes": int(success.sum()), "n": trials},
         "objects": objects,
-        "saturated_actions": float(saturated),
+        "saturated_actions": rows[-1]["saturated_actions"],
+        "motion": rows,
     }

@@ -1,6 +1,6 @@
-"""Action diffusion: forward process and deterministic sampler, one equation per function.
+"""Action diffusion: its schedule and deterministic sampler; the forward process is `ddg_jax.schedule`'s.
 
-`alpha_bar` is the cumulative product of (1 - beta); steps are counted k = 0 .. K-1.
+a is alpha_bar, the cumulative product of (1 - beta); steps are counted k = 0 .. K-1.
 """
 
 from collections.abc import Callable
@@ -9,26 +9,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ddg_jax.schedule import timesteps
+from ddg_jax.schedule import Schedule, timesteps
 
 TERMINAL_TIME = 0.98
 
 
-def cosine_alpha_bar(steps: int) -> np.ndarray:
-    """(K,) float32 squared-cosine schedule (Nichol and Dhariwal, 2021, eq. 17), stopped just short of t = 1.
+def cosine_schedule(steps: int) -> Schedule:
+    """K steps of the squared-cosine schedule (Nichol and Dhariwal, 2021, eq. 17), short of t = 1.
 
     At t = 1 the schedule reaches zero and DDIM's first division by sqrt(alpha_bar) would amplify rounding
     a thousandfold; at TERMINAL_TIME sqrt(alpha_bar) is 0.03, still indistinguishable from noise.
     """
     t = np.arange(steps + 1) / steps * TERMINAL_TIME
     f = np.cos((t + 0.008) / 1.008 * np.pi / 2) ** 2
-    return (f[1:] / f[0]).astype(np.float32)
-
-
-def q_sample(x0: jax.Array, noise: jax.Array, k: jax.Array, alpha_bar: np.ndarray) -> jax.Array:
-    """x_k = sqrt(alpha_bar_k) x_0 + sqrt(1 - alpha_bar_k) noise (Ho et al., 2020, eq. 4). k: (B,) int."""
-    a = jnp.asarray(alpha_bar)[k].reshape((-1,) + (1,) * (x0.ndim - 1))
-    return jnp.sqrt(a) * x0 + jnp.sqrt(1.0 - a) * noise
+    betas = 1.0 - f[1:] / f[:-1]
+    return Schedule(betas.astype(np.float32), (f[1:] / f[0]).astype(np.float32))
 
 
 def ddim_timesteps(steps: int, iterations: int) -> np.ndarray:
@@ -36,12 +31,12 @@ def ddim_timesteps(steps: int, iterations: int) -> np.ndarray:
     return timesteps(steps, iterations, "trailing")
 
 
-def ddim_coefficients(alpha_bar: np.ndarray, iterations: int) -> np.ndarray:
+def ddim_coefficients(schedule: Schedule, iterations: int) -> np.ndarray:
     """(iterations, 4) float32 rows [1/sqrt(a), sqrt(1-a)/sqrt(a), sqrt(a'), sqrt(1-a')]; a' = 1 at the end.
 
     a and a' are alpha_bar at a step and at the next (less noisy) one.
     """
-    a = alpha_bar.astype(np.float64)[ddim_timesteps(len(alpha_bar), iterations)]
+    a = schedule.alpha_bars.astype(np.float64)[ddim_timesteps(schedule.steps, iterations)]
     after = np.append(a[1:], 1.0)
     return np.stack(
         [1 / np.sqrt(a), np.sqrt(1 - a) / np.sqrt(a), np.sqrt(after), np.sqrt(1 - after)], axis=1
@@ -61,12 +56,12 @@ def ddim_step(x: jax.Array, eps: jax.Array, row: jax.Array) -> jax.Array:
 def ddim_sample(
     predict: Callable[[jax.Array, jax.Array], jax.Array],
     noise: jax.Array,
-    alpha_bar: np.ndarray,
+    schedule: Schedule,
     iterations: int,
 ) -> jax.Array:
     """Noise (B, ...) to samples in [-1, 1]; `predict(x, k (B,)) -> eps`."""
-    rows = jnp.asarray(ddim_coefficients(alpha_bar, iterations))
-    ks = jnp.asarray(ddim_timesteps(len(alpha_bar), iterations))
+    rows = jnp.asarray(ddim_coefficients(schedule, iterations))
+    ks = jnp.asarray(ddim_timesteps(schedule.steps, iterations))
 
     def body(x: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         k, row = step

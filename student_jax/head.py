@@ -110,18 +110,16 @@ def _join(a: Samples, b: Samples) -> Samples:
 
 
 def _encode_all(config: Config, params: dict, frames: Frames, rng, progress: Progress) -> Seen:
-    """What perception reports of all frames, each under one random crop."""
+    """What perception reports of all frames, each under one random crop and disparity noise."""
     student, profile, parts = config.student, config.world.profile, []
     batches = range(0, len(frames), _ENCODE_BATCH)
     for start in progress.track(batches, "features", len(batches)):
         index = np.minimum(np.arange(start, start + _ENCODE_BATCH), len(frames) - 1)
         crops = random_crops(rng, _ENCODE_BATCH, profile, student.crop_shift_px)
-        depth = frames.depth_stack(index)
-        parts.append(
-            jax.tree.map(
-                np.asarray, train.encode(student, profile, params, depth, frames.state[index], crops)
-            )
-        )
+        key = jax.random.fold_in(jax.random.key(config.seed), start)
+        depth, state = frames.depth_stack(index), frames.state[index]
+        seen = train.encode(student, profile, params, depth, state, crops, key)
+        parts.append(jax.tree.map(np.asarray, seen))
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(frames)], *parts)
 
 

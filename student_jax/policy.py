@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
+from ddg_jax.schedule import Schedule
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
@@ -150,9 +151,9 @@ def feature_count(config: StudentConfig) -> int:
     return config.feature_size + (config.hand_view_features if config.hand_view_px else 0)
 
 
-def alpha_bar(config: StudentConfig) -> np.ndarray:
-    """(K,) noise schedule of the action diffusion."""
-    return diffusion.cosine_alpha_bar(config.diffusion_steps)
+def noise_schedule(config: StudentConfig) -> Schedule:
+    """Noise schedule of the action diffusion."""
+    return diffusion.cosine_schedule(config.diffusion_steps)
 
 
 def init_params(key: jax.Array, config: StudentConfig, profile: CameraProfile) -> dict:
@@ -193,7 +194,7 @@ def sample_from_seen(
     def predict(x: jax.Array, k: jax.Array) -> jax.Array:
         return cast(jax.Array, policy.apply({"params": params}, x, k, cond, method="denoise"))
 
-    return diffusion.ddim_sample(predict, noise, alpha_bar(config), steps or config.ddim_steps)
+    return diffusion.ddim_sample(predict, noise, noise_schedule(config), steps or config.ddim_steps)
 
 
 def sample_actions(

@@ -10,10 +10,11 @@ import numpy as np
 import optax
 from jax import Array
 
+from ddg_jax.schedule import q_sample
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
-from student_jax import diffusion
+from student_jax.augment import disparity_noise
 from student_jax.data import Frames, aux_targets, random_crops, sharpen_gripper
 from student_jax.encoder import POSITION_SCALE_M
 from student_jax.policy import (
@@ -21,7 +22,7 @@ from student_jax.policy import (
     Aux,
     Seen,
     StudentPolicy,
-    alpha_bar,
+    noise_schedule,
     sample_from_seen,
 )
 
@@ -116,7 +117,7 @@ def diffusion_loss(config, policy, params, seen, state, action, key) -> Array:
     k_step, k_noise = jax.random.split(key)
     k = jax.random.randint(k_step, (len(cond),), 0, config.diffusion_steps)
     eps = jax.random.normal(k_noise, action.shape)
-    noisy = diffusion.q_sample(action, eps, k, alpha_bar(config))
+    noisy = q_sample(noise_schedule(config), action, k, eps)
     predicted = policy.apply({"params": params}, noisy, k, cond, method="denoise")
     return jnp.mean((eps - predicted) ** 2)
 
@@ -138,7 +139,10 @@ def train_step(
     """One optimiser step on pictures. Pure: noise comes from fold_in(state.key, state.step)."""
     policy = StudentPolicy(config, profile)
     key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
+    key, k_noise = jax.random.split(key)
     depth_m = batch.depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
+    if config.disparity_noise_px:
+        depth_m = disparity_noise(k_noise, depth_m, profile, config)
 
     def loss_fn(params):
         params = params | frozen
@@ -168,10 +172,18 @@ def _update(config: StudentConfig, steps: int, state: TrainState, grads) -> Trai
 
 @partial(jax.jit, static_argnums=(0, 1))
 def encode(
-    config: StudentConfig, profile: CameraProfile, params, depth_mm: Array, state: Array, crop_rc: Array
+    config: StudentConfig,
+    profile: CameraProfile,
+    params,
+    depth_mm: Array,
+    state: Array,
+    crop_rc: Array,
+    key: Array | None = None,
 ) -> Any:
-    """`policy.Seen` of a batch."""
+    """`policy.Seen` of a batch; with `key`, under the disparity noise of training."""
     depth_m = depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
+    if key is not None:
+        depth_m = disparity_noise(key, depth_m, profile, config)
     return StudentPolicy(config, profile).apply({"params": params}, depth_m, state, crop_rc, method="encode")
 
 

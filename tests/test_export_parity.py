@@ -8,11 +8,12 @@ import numpy as np
 import optax
 import pytest
 
+from ddg_jax.schedule import q_sample
 from ddgrasp import contract
 from ddgrasp.config import ExportConfig, StudentConfig
 from ddgrasp.errors import UserError
 from export import graph, metadata, parity
-from student_jax import diffusion, policy
+from student_jax import policy
 
 PROFILE = contract.D455.scaled(0.125)
 SMALL = StudentConfig(
@@ -59,7 +60,7 @@ def trained_head(params: dict, config: StudentConfig) -> dict:
         seen = net.apply({"params": params}, frames, state, method="encode")
         return net.apply({"params": params}, seen, state, method="condition")
 
-    size, schedule = jax.eval_shape(condition).shape[-1], policy.alpha_bar(config)
+    size, schedule = jax.eval_shape(condition).shape[-1], policy.noise_schedule(config)
     optimiser = optax.adam(3e-3)
 
     def loss(head, key):
@@ -68,7 +69,7 @@ def trained_head(params: dict, config: StudentConfig) -> dict:
         action = 0.6 * jnp.tanh(cond[:, :8])[:, None] * jnp.ones((1, config.chunk, 1))
         k = jax.random.randint(keys[1], (64,), 0, config.diffusion_steps)
         noise = jax.random.normal(keys[2], action.shape)
-        noisy = diffusion.q_sample(action, noise, k, schedule)
+        noisy = q_sample(schedule, action, k, noise)
         predicted = net.apply({"params": {**params, "denoiser": head}}, noisy, k, cond, method="denoise")
         return jnp.mean((predicted - noise) ** 2)
 

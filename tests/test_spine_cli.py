@@ -123,3 +123,6 @@ def test_unknown_objects_suggest_the_nearest():
     wrong = dataclasses.replace(debug, world=dataclasses.replace(debug.world, objects=("cubes",)))
     with pytest.raises(UserError, match="Did you mean 'cube'"):
         check_config_values(wrong)
+    nothing = dataclasses.replace(debug, world=dataclasses.replace(debug.world, objects=()))
+    with pytest.raises(UserError, match="world.objects is empty; expected at least one of cube, apple"):
+        check_config_values(nothing)

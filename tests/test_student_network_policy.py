@@ -113,22 +113,22 @@ def test_time_embedding_by_value():
 
 
 def test_schedule_falls_from_almost_one_to_almost_zero():
-    schedule = diffusion.cosine_alpha_bar(50)
+    schedule = diffusion.cosine_schedule(50).alpha_bars
     assert schedule[0] > 0.99 and np.all(np.diff(schedule) < 0)
     assert np.sqrt(schedule[-1]) == pytest.approx(0.0310, abs=1e-3)
 
 
 @pytest.mark.parametrize("iterations", [1, 3, 10])
 def test_ddim_with_perfect_noise_prediction_returns_the_clean_sample(iterations):
-    schedule = jnp.asarray(diffusion.cosine_alpha_bar(50))
+    schedule = diffusion.cosine_schedule(50)
     x0 = jax.random.uniform(jax.random.key(0), (5, 4, 8), minval=-1, maxval=1)
 
     def predict(x, k):
-        a = schedule[k][:, None, None]
+        a = jnp.asarray(schedule.alpha_bars)[k][:, None, None]
         return (x - jnp.sqrt(a) * x0) / jnp.sqrt(1 - a)
 
     noise = jax.random.normal(jax.random.key(1), x0.shape)
-    sampled = diffusion.ddim_sample(predict, noise, np.asarray(schedule), iterations)
+    sampled = diffusion.ddim_sample(predict, noise, schedule, iterations)
     np.testing.assert_allclose(sampled, x0, atol=1e-4)
 
 

@@ -11,6 +11,7 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
 from student_jax import train
+from student_jax.augment import disparity_noise
 from student_jax.data import aux_targets, check_chunk, make_frames, random_crops, sharpen_gripper
 from student_jax.frames_io import useful_steps
 from student_jax.policy import Aux, init_params, position_to_world
@@ -158,3 +159,18 @@ def test_pose_errors_shrink_near_the_object():
 def test_executing_more_than_a_chunk_is_refused():
     with pytest.raises(UserError, match=r"execute_steps is 3: expected 1 to student.chunk = 2"):
         check_chunk(dataclasses.replace(CONFIG, execute_steps=3))
+
+
+def test_disparity_noise_grows_with_the_square_of_depth_and_keeps_holes():
+    config = dataclasses.replace(CONFIG, disparity_noise_px=0.2)
+    depth = np.zeros((40, 3, 40, 60), np.float32)
+    depth[:, :, :20, :30], depth[:, :, 20:, :30] = 0.5, 1.0  # the right half is invalid
+    noisy = np.asarray(disparity_noise(jax.random.key(0), jnp.asarray(depth), PROFILE, config))
+    assert np.all(noisy[..., 30:] == 0) and np.all(noisy[..., :30] > 0)
+    error = np.abs(noisy - depth)
+    near, far = (np.median(error[:, :, rows, :30]) for rows in (slice(20), slice(20, 40)))
+    assert far / near == pytest.approx(4.0, rel=0.1)
+    # strength uniform up to 0.2: its mean 0.1 px at 1 m is 0.1 / (f b) metres; median of |normal| is 0.674
+    assert far == pytest.approx(0.674 * 0.1 / (PROFILE.fx_px * PROFILE.baseline_m), rel=0.35)
+    one = error[:, 0, ::2, :30:2] > 0.2
+    assert 0.0 < one.mean() < 0.004  # wrong matches are rare

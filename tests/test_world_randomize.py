@@ -1,0 +1,187 @@
+"""Each range of RandomConfig moves what it names, over its whole width, and nothing else."""
+
+from dataclasses import fields, replace
+
+import jax
+import jax.numpy as jp
+import numpy as np
+import pytest
+
+from ddgrasp import contract
+from ddgrasp.config import RandomConfig, WorldConfig
+from mjx_envs import grasp_math, kinematics, physics, randomize, scene
+from mjx_envs.camera import nominal_camera
+from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.objects import OBJECTS
+from mjx_envs.rig import RigWorld
+
+COUNT = 400
+NOTHING = RandomConfig(**{field.name: 0 for field in fields(RandomConfig)})
+CAMERA = nominal_camera(contract.D455).T_world_cam
+CUBE = OBJECTS["cube"]
+
+MOVES = {
+    "joint_rad": {"joints": (-0.1, 0.1)},
+    "pregrasp_share": {"joints": None},
+    "size": {"size": (0.95, 1.05), "slots": (0.95, 1.05), "object_inertia": (0.95**2, 1.05**2)},
+    "object_mass": {"object_mass": (0.7, 1.3), "object_inertia": (0.7, 1.3)},
+    "object_friction": {"object_friction": (0.8, 1.2)},
+    "link_mass": {"link_mass_scale": (0.9, 1.1)},
+    "damping": {"joint_damping": (0.7, 1.3)},
+    "friction_nm": {"joint_friction": (0.0, 0.3)},
+    "stiffness": {"gain_scale": (0.9, 1.1)},
+    "camera_position_m": {"camera_position": (-0.01, 0.01)},
+    "camera_angle_rad": {"camera_angle": (-0.015, 0.015)},
+}
+"""Field -> what it moves at its default, with the bounds (relative to nominal, or absolute where nominal is
+0). Nothing reads crop_px: the student's training shifts the window (student.crop_shift_px)."""
+
+
+@pytest.fixture(scope="module")
+def table():
+    return randomize.ObjectTable(("cube",))
+
+
+@pytest.fixture(scope="module")
+def sampler(table):
+    """RandomConfig -> quantity -> (COUNT, ...) draws; object pose is drawn in any case and left out."""
+
+    names = [field.name for field in fields(RandomConfig)]
+
+    @jax.jit
+    def draw_all(ranges, keys):
+        config = RandomConfig(**dict(zip(names, ranges, strict=True)))  # traced: one program for all ranges
+
+        def one(key):
+            k_params, k_qpos, k_start, k_camera = jax.random.split(key, 4)
+            params, size = randomize.sample_params(k_params, config, table, 0)
+            qpos = randomize.sample_qpos(k_qpos, config, jp.asarray(CUBE.rest_height_m))
+            grasp = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], jp.asarray(4), 0.0, jp)
+            qpos = randomize.maybe_pregrasp(k_start, config, qpos, *grasp)
+            turn = CAMERA[:3, :3].T @ randomize.sample_camera(k_camera, config, CAMERA)[:3, :3]
+            return {
+                "size": size,
+                "slots": params.slot_size[0] / jp.asarray(CUBE.slot_arrays(table.layout)[0][0]),
+                "object_mass": params.object_mass / CUBE.mass_kg,
+                "object_inertia": params.object_inertia / jp.asarray(CUBE.inertia_kg_m2()),
+                "object_friction": params.object_friction / CUBE.friction,
+                "link_mass_scale": params.link_mass_scale,
+                "joint_damping": params.joint_damping / scene.JOINT_DAMPING_NMS_RAD,
+                "joint_friction": params.joint_friction,
+                "gain_scale": params.gain_scale,
+                "joints": qpos[:7] - jp.asarray(scene.HOME_RAD),
+                "fingers": qpos[7:9],
+                "camera_position": randomize.sample_camera(k_camera, config, CAMERA)[:3, 3] - CAMERA[:3, 3],
+                "camera_angle": jp.stack([turn[2, 1], turn[0, 2], turn[1, 0]]),
+            }
+
+        return jax.vmap(one)(keys)
+
+    def draw(config: RandomConfig) -> dict[str, np.ndarray]:
+        ranges = [float(getattr(config, name)) for name in names]
+        keys = jax.random.split(jax.random.PRNGKey(3), COUNT)
+        return {name: np.asarray(value) for name, value in draw_all(ranges, keys).items()}
+
+    return draw
+
+
+def test_every_range_is_listed():
+    assert {field.name for field in fields(RandomConfig)} == {*MOVES, "crop_px", "latency_share"}
+
+
+@pytest.mark.parametrize("field", MOVES)
+def test_a_range_moves_what_it_names_and_nothing_else(field, sampler):
+    value = 1.0 if field == "pregrasp_share" else getattr(RandomConfig(), field)
+    draws = sampler(replace(NOTHING, **{field: value}))
+    moved = {name for name, values in draws.items() if np.ptp(values, axis=0).max() > 1e-5}
+    assert moved == set(MOVES[field])
+    for name, bounds in MOVES[field].items():
+        if bounds is None:
+            continue
+        low, high = bounds
+        values, slack = draws[name].reshape(COUNT, -1), 1e-3 * (high - low)
+        assert values.min() >= low - slack and values.max() <= high + slack, name
+        assert (values.min(axis=0) < low + 0.05 * (high - low)).all(), name  # every component, all the way
+        assert (values.max(axis=0) > high - 0.05 * (high - low)).all(), name
+
+
+def test_without_ranges_everything_is_nominal(sampler):
+    for name, values in sampler(NOTHING).items():
+        nominal = {"joint_friction": 0.0, "joints": 0.0, "fingers": 0.04}.get(name)
+        nominal = 0.0 if name.startswith("camera") else 1.0 if nominal is None else nominal
+        np.testing.assert_allclose(values, nominal, atol=1e-5, err_msg=name)
+
+
+def test_ranges_are_drawn_independently(sampler):
+    draws = sampler(RandomConfig())
+    names = ("size", "object_mass", "object_friction", "link_mass_scale", "joint_damping", "joint_friction",
+             "gain_scale", "joints", "camera_position", "camera_angle")  # fmt: skip
+    columns = np.concatenate([draws[name].reshape(COUNT, -1) for name in names], axis=1)
+    correlation = np.corrcoef(columns.T) - np.eye(columns.shape[1])
+    assert np.abs(correlation).max() < 0.25  # 5 standard deviations at 400 draws
+
+
+def test_the_pose_covers_the_workspace_and_all_yaws():
+    qpos = jax.vmap(lambda k: randomize.sample_qpos(k, RandomConfig(), jp.asarray(0.025)))(
+        jax.random.split(jax.random.PRNGKey(0), 1000)
+    )
+    lower = np.subtract(contract.WORKSPACE_CENTER_M, np.array(contract.WORKSPACE_SIZE_M) / 2)
+    upper = np.add(contract.WORKSPACE_CENTER_M, np.array(contract.WORKSPACE_SIZE_M) / 2)
+    xy = np.asarray(qpos[:, 9:11])
+    assert (xy >= lower - 1e-6).all() and (xy <= upper + 1e-6).all()
+    assert (xy.min(axis=0) < lower + 0.01).all() and (xy.max(axis=0) > upper - 0.01).all()
+    yaw = np.asarray(kinematics.yaw_of(qpos[:, 12:16]))
+    assert np.histogram(yaw, bins=8, range=(-np.pi, np.pi))[0].min() > 80
+    np.testing.assert_allclose(qpos[:, 11], 0.025, rtol=1e-6)
+
+
+def test_pregrasp_share_is_a_share(sampler):
+    home = np.abs(sampler(replace(NOTHING, pregrasp_share=0.25))["joints"]).max(axis=1) < 1e-6
+    assert 1 - home.mean() == pytest.approx(0.25, abs=0.06)
+
+
+MODEL_FIELDS = {
+    "size": {"geom_size", "geom_rbound", "body_inertia"},
+    "object_mass": {"body_mass", "body_inertia"},
+    "object_friction": {"geom_friction"},
+    "link_mass": {"body_mass", "body_inertia"},
+    "damping": {"dof_damping"},
+    "friction_nm": {"dof_frictionloss"},
+    "stiffness": {"actuator_gainprm", "actuator_biasprm"},
+}
+"""Field of RandomConfig -> arrays of MuJoCo's model that it reaches."""
+
+
+@pytest.mark.parametrize("field", MODEL_FIELDS)
+def test_a_range_reaches_the_model_of_both_worlds(field, table):
+    config = replace(NOTHING, **{field: getattr(RandomConfig(), field)})
+    params, _ = randomize.sample_params(jax.random.PRNGKey(0), config, table, 0)
+    nominal, _ = randomize.sample_params(jax.random.PRNGKey(0), NOTHING, table, 0)
+    model = scene.build_model()
+    index = physics.ModelIndex(model)
+    one, base = (index.fields(model, jax.tree.map(np.asarray, p)) for p in (params, nominal))
+    assert {name for name in one if not np.allclose(one[name], base[name], rtol=1e-6)} == MODEL_FIELDS[field]
+
+    rig, plain = RigWorld(("cube",), random=config), RigWorld(("cube",), random=NOTHING)
+    rig.reset(5, "cube")
+    plain.reset(5, "cube")
+    moved = {name for name in one if not np.allclose(getattr(rig.model, name), getattr(plain.model, name))}
+    assert moved == MODEL_FIELDS[field]
+
+
+def test_latency_delays_commands_by_one_step_in_its_share_of_the_episodes():
+    env = GraspEnv(WorldConfig(objects=("cube",), random=replace(NOTHING, latency_share=0.5)))
+    reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+    state = reset(jax.random.split(jax.random.PRNGKey(0), 64))
+    late = np.asarray(state.info["episode"].latency.late)
+    assert 16 < late.sum() < 48
+    bend = jp.zeros((64, 8)).at[:, 3].set(0.5).at[:, 7].set(1.0)  # elbow, and close
+    path = []
+    for action in (bend, -bend, -bend):
+        state = step(state, action)
+        path.append(np.asarray(state.data.qpos[:, :9]) - np.append(scene.HOME_RAD, (0.04, 0.04)))
+    path = np.stack(path)  # all start alike, far from the cube: only latency tells them apart
+    prompt, delayed = path[:, ~late], path[:, late]
+    assert np.abs(prompt[0, :, 3]).min() > 0.01 and prompt[0, :, 7].max() < -0.01
+    assert np.abs(delayed[0]).max() < 1e-3  # holds still
+    np.testing.assert_allclose(delayed[1], np.broadcast_to(prompt[0, :1], delayed[1].shape), atol=1e-3)
