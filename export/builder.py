@@ -67,6 +67,10 @@ class GraphBuilder:
         """x[start:end] along each of the axes."""
         return self.op("Slice", x, self.integers(starts), self.integers(ends), self.integers(axes))
 
+    def columns(self, x: str, first: int, last: int) -> str:
+        """Columns first..last - 1 of (B, n)."""
+        return self.slice(x, [first], [last], [1])
+
     def dense(self, x: str, params: dict) -> str:
         """Flax Dense on (B, n): x @ kernel + bias."""
         return self.affine(x, params["kernel"], params.get("bias"))
