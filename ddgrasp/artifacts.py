@@ -259,9 +259,10 @@ def check_config(artifact: Artifact, config: Config) -> None:
 
 
 def has_work(directory: Path | str) -> bool:
-    """Whether an attempt left anything in `directory` besides the notes about itself."""
-    names = os.listdir(directory) if Path(directory).is_dir() else ()
-    return any(name != STARTED and not name.startswith(".") for name in names)
+    """Whether an attempt left a file in `directory` or below it, besides the notes about itself."""
+    directory = Path(directory)
+    files = (path for path in directory.rglob("*") if not path.is_dir())
+    return any(path.name != STARTED and not path.name.startswith(".") for path in files)
 
 
 def begin(directory: Path | str, stage: str, config: Config, inputs: Mapping[str, str] | None = None) -> None:
@@ -394,7 +395,24 @@ def load_params(path: Path | str, target: Any = None) -> Any:
     if target is None:
         return state
     try:
-        return serialization.from_state_dict(target, state)
+        restored = serialization.from_state_dict(target, state)
+        if difference := _shape_difference(restored, target):
+            raise ValueError(difference)
     except (ValueError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"{path} does not fit this configuration's network ({reason}).") from None
+    return restored
+
+
+def _shape_difference(given: Any, wanted: Any) -> str:
+    """The first array of two trees of the same structure whose shapes differ, in words; empty if none."""
+    import jax
+    import numpy as np
+
+    pairs = zip(
+        jax.tree_util.tree_leaves_with_path(given), jax.tree_util.tree_leaves_with_path(wanted), strict=True
+    )
+    for (path, here), (_, there) in pairs:
+        if np.shape(here) != np.shape(there):
+            return f"{jax.tree_util.keystr(path)} is {np.shape(here)}, the network's {np.shape(there)}"
+    return ""

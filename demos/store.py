@@ -57,15 +57,22 @@ class EpisodeStore:
         """Per-step array of the complete episodes, or rows first..last of it."""
         ends = self.ends
         count = int(ends[-1]) if len(ends) else 0
-        try:
-            rows = _array(self._data, field)
-            return np.asarray(rows[first : count if last is None else min(last, count)])
-        except (KeyError, ValueError, OSError, RuntimeError) as error:
-            raise UserError(f"{self.path}: steps of {field!r} cannot be read ({error}).") from None
+        return self._read("data", field, first, count if last is None else min(last, count))
 
     def episodes(self, field: str) -> np.ndarray:
         """Per-episode array."""
-        return np.asarray(_array(self._meta, field)[: len(self)])
+        return self._read("meta", field, 0, len(self))
+
+    def _read(self, group: str, field: str, first: int, last: int) -> np.ndarray:
+        try:
+            rows = _array(_group(self._root, group), field)
+            _check_chunks(self.path / group / field, rows, first, last)
+            return np.asarray(rows[first:last])
+        except (KeyError, ValueError, OSError, RuntimeError) as error:
+            raise UserError(
+                f"{self.path}: {group}/{field} cannot be read ({error}). Delete {self.path.parent} and make "
+                "it again."
+            ) from None
 
     def append(self, steps: Mapping[str, np.ndarray], episode: Mapping[str, ArrayLike]) -> None:
         """Adds one episode: arrays (T, ...) per step and (...) per episode."""
@@ -92,14 +99,24 @@ def _array(group: zarr.Group, name: str) -> zarr.Array:
     return node
 
 
+def _check_chunks(path: Path, rows: zarr.Array, first: int, last: int) -> None:
+    """ValueError if a file of rows first..last is gone: Zarr would read zeros instead."""
+    size = rows.chunks[0]
+    for i in range(first // size, -(-last // size)):
+        name = "/".join(["c", str(i), *["0"] * (rows.ndim - 1)])
+        if not (path / name).exists():
+            raise ValueError(f"its file {name} is missing")
+
+
 def _put(group: zarr.Group, name: str, start: int, rows: np.ndarray) -> None:
     """Writes rows at `start`, cutting off whatever an interrupted append left from there on."""
     if name not in group:
         image = rows.ndim >= 3
         chunks = (_IMAGE_CHUNK if image else _ROW_CHUNK, *rows.shape[1:])
         group.create_array(
-            name, shape=(0, *rows.shape[1:]), chunks=chunks, dtype=rows.dtype, compressors=[_CODEC]
-        )
+            name, shape=(0, *rows.shape[1:]), chunks=chunks, dtype=rows.dtype, compressors=[_CODEC],
+            config={"write_empty_chunks": True},
+        )  # fmt: skip
     array = _array(group, name)
     array.resize((start + len(rows), *rows.shape[1:]))
     array[start:] = rows

@@ -62,6 +62,19 @@ def test_a_damaged_chunk_names_the_store_and_spares_other_episodes(tmp_path):
         again.steps("depth_mm", 32, 48)
 
 
+@pytest.mark.parametrize("field", ["data/depth_mm/c/1/0/0", "data/action/c/0/0", "meta/object_index/c/0"])
+def test_a_lost_chunk_is_refused_not_read_as_zeros(tmp_path, field):
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    for i in range(3):
+        store.append(*episode(16, i))  # the first episode's values are all zero: stored nevertheless
+    (tmp_path / "s.zarr" / field).unlink()
+    again = EpisodeStore(tmp_path / "s.zarr")
+    np.testing.assert_array_equal(np.unique(again.steps("depth_mm", 32, 48)), [2])
+    group, name = field.split("/")[:2]
+    with pytest.raises(UserError, match=f"{group}/{name} cannot be read .*is missing.* make it again"):
+        again.steps(name) if group == "data" else again.episodes(name)
+
+
 def test_no_store_there(tmp_path):
     with pytest.raises(UserError, match="no episode store"):
         EpisodeStore(tmp_path / "nothing.zarr")

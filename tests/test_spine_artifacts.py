@@ -171,6 +171,9 @@ def test_parameters_round_trip_bit_for_bit(tmp_path):
     np.testing.assert_array_equal(shaped["dense"]["kernel"], tree["dense"]["kernel"])
     with pytest.raises(UserError, match="does not fit"):
         artifacts.load_params(tmp_path / "p.msgpack", target={"dense": {"other": np.zeros(3)}, "step": 0})
+    other = {"dense": {"kernel": np.zeros((3, 5), np.float32)}, "step": np.int32(0)}
+    with pytest.raises(UserError, match=r"does not fit .*the network's \(3, 5\)"):
+        artifacts.load_params(tmp_path / "p.msgpack", target=other)
 
 
 def test_damaged_truncated_or_foreign_parameters_are_refused(tmp_path):
