@@ -31,7 +31,7 @@ def closed_loop(
     for name, camera in cameras.items():
         rng = np.random.default_rng([config.seed, _SEED])
         actor = StudentActor(params, config.student, config.world.profile, camera, rng, config.deploy.noise)
-        with progress.task(f"trials, {name}", roller.steps) as task:
+        with progress.task(f"steps of {roller.count} trials, {name}", roller.steps) as task:
             episodes = roller.run(jax.random.PRNGKey(_SEED + config.seed), actor, lambda _: task.advance())  # noqa: B023
         metrics[name] = _counts(episodes, config.world.objects)
         best = int(np.argmax(episodes.success))
