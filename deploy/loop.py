@@ -64,7 +64,7 @@ class LoopReport:
     holds: int = 0
     """Steps that held position instead of following the policy."""
     interrupted: bool = False
-    """Ended by Ctrl-C."""
+    """Ended by Ctrl-C, or by SIGTERM in `ddgrasp deploy`."""
     timings: Timings = field(default_factory=Timings)
     safety: SafetyCounts = field(default_factory=SafetyCounts)
     events: list[Event] = field(default_factory=list)

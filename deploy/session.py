@@ -1,6 +1,9 @@
 """`ddgrasp deploy`: an exported policy on a robot and a camera chosen by name."""
 
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,9 +44,18 @@ def deploy(
 ) -> LoopReport:
     """Run the loop on the machine's clock; events go to `say` as they happen.
 
+    SIGTERM ends it as Ctrl-C does: the robot holds, both devices are stopped, the report comes back.
+
     Raises UserError for an unknown name, a combination that cannot work, or a device that is absent.
     """
     _check(options)
+    with _terminable():
+        return _run(config, policy_path, options, say)
+
+
+def _run(
+    config: Config, policy_path: Path, options: SessionOptions, say: Callable[[str], None]
+) -> LoopReport:
     policy = OnnxPolicy(
         policy_path,
         noise=config.deploy.noise,
@@ -56,6 +68,24 @@ def deploy(
     loop = ControlLoop(camera, robot, policy, safety_filter(config.deploy, policy.info), clock, settings, say)
     steps = round(options.seconds * policy.info.control_hz) if options.seconds > 0 else None
     return loop.run(steps)
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Turns the first SIGTERM into KeyboardInterrupt; a second one does not cut the stopping short."""
+
+    def interrupt(signum, frame):
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():  # signals are someone else's
+        yield
+        return
+    previous = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 def describe(report: LoopReport) -> str:

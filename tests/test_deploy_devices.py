@@ -1,6 +1,9 @@
 """Camera and robot drivers as far as they go without hardware, and what a user sees who chose wrongly."""
 
+import os
+import signal
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +20,15 @@ from deploy.realsense_camera import RealSenseCamera
 from deploy.replay_camera import ReplayCamera
 from deploy.safety import SafetyFilter, SafetyLimits
 from deploy.session import SessionOptions, deploy
-from deploy_support import HOME_RAD, KinematicRobot, constant_bias, describe, write_policy
+from deploy_support import (
+    HOME_RAD,
+    KinematicRobot,
+    ScriptedCamera,
+    constant_bias,
+    depth_mm,
+    describe,
+    write_policy,
+)
 from sensors.recordings import RecordingWriter
 
 SIZE = (45, 80)
@@ -136,3 +147,26 @@ def test_drivers_that_never_started_can_be_stopped():
 def test_wrong_combination_gets_one_line(options, message):
     with pytest.raises(UserError, match=message):
         deploy(get_preset("debug"), Path("absent.onnx"), options)
+
+
+def test_sigterm_holds_and_stops_the_robot_as_ctrl_c_does(tmp_path, monkeypatch):
+    devices = []
+
+    def kinematic(config, options, info, clock):
+        devices.extend([KinematicRobot(clock), ScriptedCamera(clock, [depth_mm()])])
+        return devices
+
+    def terminate_twice():  # `timeout` and supervisors signal the process and its group
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr("deploy.session._devices", kinematic)
+    before, said = signal.getsignal(signal.SIGTERM), []
+    path = write_policy(tmp_path / "p.onnx", describe(), bias=constant_bias(0.2))
+    threading.Timer(0.5, terminate_twice).start()
+    report = deploy(get_preset("debug"), path, SessionOptions(seconds=30.0), said.append)
+    robot, camera = devices
+    assert report.interrupted and 0 < report.steps < 300
+    assert robot.calls[-2:] == ["hold", "stop"] and camera.stopped
+    assert said[-1].endswith("stop: interrupted; the robot holds position")
+    assert signal.getsignal(signal.SIGTERM) is before
