@@ -10,6 +10,7 @@ when their turn comes, so that `--help` needs none of them and the robot side ne
 
 import importlib
 import signal
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+_REPEAT_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -142,22 +146,28 @@ def _check_parents(artifact: Artifact, parents: dict[str, Artifact]) -> None:
 def _interruptible(name: str) -> Iterator[None]:
     """Turns Ctrl-C and SIGTERM into KeyboardInterrupt with a message, wherever in the stage they arrive.
 
-    A KeyboardInterrupt raised inside a JAX host callback surfaces as some other error; the flag tells.
+    A KeyboardInterrupt raised inside a JAX host callback surfaces as some other error; the flag tells. Raised
+    in a destructor or a garbage collector's callback it is dropped: a timer repeats it until it surfaces.
     """
     arrived = False
 
     def interrupt(signum, frame):
         nonlocal arrived
+        if signum == signal.SIGALRM and _is_unwinding():
+            return
         arrived = True
+        signal.setitimer(signal.ITIMER_REAL, _REPEAT_S, _REPEAT_S)
         raise KeyboardInterrupt
 
     try:
-        previous = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+        previous = {number: signal.signal(number, interrupt) for number in _SIGNALS}
     except ValueError:  # not in the main thread: signals are someone else's
         previous = {}
     message = f"Interrupted in stage {name!r}. Finished work is kept: the same command with --resume goes on."
     try:
         yield
+        if arrived:
+            raise KeyboardInterrupt
     except KeyboardInterrupt:
         raise KeyboardInterrupt(message) from None
     except Exception:
@@ -165,5 +175,15 @@ def _interruptible(name: str) -> Iterator[None]:
             raise KeyboardInterrupt(message) from None
         raise
     finally:
+        if arrived:
+            signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def _is_unwinding() -> bool:
+    """Whether a KeyboardInterrupt is being handled right now: cleaning up is not to be disturbed."""
+    error = sys.exception()
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None

@@ -4,7 +4,6 @@ import dataclasses
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -122,39 +121,60 @@ def test_a_child_of_a_replaced_parent_is_refused(stages, tmp_path):
         _run(stages, run_dir, resume=True)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_says_how_to_go_on_and_keeps_the_time_spent(tmp_path, number):
-    """A real process gets a real signal while its stage works, as after Ctrl-C."""
-    code = f"""
-        import sys, time, types
-        from pathlib import Path
-        from ddgrasp import cli, commands, pipeline
-        from ddgrasp.config import Config
+SLOW = """
+import gc, sys, time, types
+from pathlib import Path
+from ddgrasp import cli, commands, pipeline
+from ddgrasp.config import Config
 
-        def work(config, run_dir, *, resume, progress):
-            print("working", flush=True)
-            try:
-                time.sleep(60)
-            except KeyboardInterrupt:
-                raise RuntimeError("a host callback wraps the interrupt")
+{work}
 
-        module = types.ModuleType("slow_pkg.stage")
-        module.run = work
-        sys.modules["slow_pkg"] = types.ModuleType("slow_pkg")
-        sys.modules["slow_pkg.stage"] = module
-        stage = pipeline.Stage("teacher", "slow_pkg", (), "nothing")
+module = types.ModuleType("slow_pkg.stage")
+module.run = work
+sys.modules["slow_pkg"] = types.ModuleType("slow_pkg")
+sys.modules["slow_pkg.stage"] = module
+stage = pipeline.Stage("teacher", "slow_pkg", (), "nothing")
 
-        RUN_DIR = Path({str(tmp_path)!r})
+class Slow:
+    def run(self):
+        pipeline.run_stage(stage, Config(preset="debug"), Path({run_dir!r}), resume=True, quiet=True)
 
-        class Slow:
-            def run(self):
-                pipeline.run_stage(stage, Config(preset="debug"), RUN_DIR, resume=True, quiet=True)
+commands.parse = lambda name, args: Slow()
+sys.exit(cli.main(["teacher", "train"]))
+"""
+WRAPS_THE_INTERRUPT = """
+def work(config, run_dir, *, resume, progress):
+    print("working", flush=True)
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        raise RuntimeError("a host callback wraps the interrupt")
+"""
+DROPS_THE_FIRST_INTERRUPT = """
+def callback(phase, info):
+    gc.callbacks.clear()
+    print("working", flush=True)
+    time.sleep(30)
 
-        commands.parse = lambda name, args: Slow()
-        sys.exit(cli.main(["teacher", "train"]))
-    """
+def work(config, run_dir, *, resume, progress):
+    gc.callbacks.append(callback)
+    gc.collect()
+    print("dropped", flush=True)
+    try:
+        time.sleep(30)
+    finally:
+        time.sleep(1.2)
+        print("cleaned up", flush=True)
+"""
+INTERRUPTED = (
+    "ddgrasp: Interrupted in stage 'teacher'. Finished work is kept: the same command with --resume goes on."
+)
+
+
+def _interrupt(work: str, run_dir: Path, number: int) -> tuple[str, list[str]]:
+    """A real process gets a real signal while its stage works, as after Ctrl-C: stdout, lines of stderr."""
     process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)],
+        [sys.executable, "-c", SLOW.format(work=work, run_dir=str(run_dir))],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -162,13 +182,24 @@ def test_an_interrupt_says_how_to_go_on_and_keeps_the_time_spent(tmp_path, numbe
     assert process.stdout and process.stdout.readline() == "working\n"
     time.sleep(0.3)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=20)
+    out, errors = process.communicate(timeout=20)
     assert process.returncode == 130
-    assert errors.strip() == (
-        "ddgrasp: Interrupted in stage 'teacher'. Finished work is kept: "
-        "the same command with --resume goes on."
-    )
+    return out, errors.splitlines()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_says_how_to_go_on_and_keeps_the_time_spent(tmp_path, number):
+    _, errors = _interrupt(WRAPS_THE_INTERRUPT, tmp_path, number)
+    assert errors == [INTERRUPTED]
     assert Progress(tmp_path / "teacher").seconds >= 0.3
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_a_gc_callback_drops_still_ends_the_work_and_lets_it_clean_up(tmp_path, number):
+    out, errors = _interrupt(DROPS_THE_FIRST_INTERRUPT, tmp_path, number)
+    assert out == "dropped\ncleaned up\n"
+    assert errors[0].startswith("Exception ignored in")
+    assert errors[-1] == INTERRUPTED
 
 
 def test_curves_count_a_repeated_step_once_and_skip_a_torn_line(tmp_path):
