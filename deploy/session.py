@@ -1,5 +1,6 @@
 """`ddgrasp deploy`: an exported policy on a robot and a camera chosen by name."""
 
+import math
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -36,7 +37,7 @@ class SessionOptions:
     object_name: str = ""
     """Object on the rig's table; empty takes the first configured one."""
     seconds: float = 6.0
-    """How long to run; 0 runs until Ctrl-C."""
+    """How long to run; inf runs until Ctrl-C."""
 
 
 def deploy(
@@ -66,7 +67,7 @@ def _run(
     robot, camera = _devices(config, options, policy.info, clock)
     settings = loop_settings(config.deploy, policy.info)
     loop = ControlLoop(camera, robot, policy, safety_filter(config.deploy, policy.info), clock, settings, say)
-    steps = round(options.seconds * policy.info.control_hz) if options.seconds > 0 else None
+    steps = round(options.seconds * policy.info.control_hz) if math.isfinite(options.seconds) else None
     return loop.run(steps)
 
 
@@ -126,6 +127,8 @@ def _check(options: SessionOptions) -> None:
         )
     if options.camera == "replay" and options.recording is None:
         raise UserError("camera 'replay' needs --recording DIR (one recording, as `ddgrasp record` writes).")
+    if not options.seconds > 0:
+        raise UserError(f"--seconds is {options.seconds:g}: choose more than 0, or inf to run until Ctrl-C.")
 
 
 def _devices(

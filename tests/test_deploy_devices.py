@@ -1,5 +1,6 @@
 """Camera and robot drivers as far as they go without hardware, and what a user sees who chose wrongly."""
 
+import math
 import os
 import signal
 import sys
@@ -142,6 +143,9 @@ def test_drivers_that_never_started_can_be_stopped():
         (SessionOptions(robot="franka", camera="stereo"), "use --camera realsense"),
         (SessionOptions(robot="franka", camera="replay", recording=Path("r")), "would move blindly"),
         (SessionOptions(camera="replay"), "needs --recording"),
+        (SessionOptions(seconds=-1.0), "--seconds is -1: choose more than 0"),
+        (SessionOptions(seconds=0.0), "--seconds is 0: choose more than 0"),
+        (SessionOptions(seconds=float("nan")), "--seconds is nan: choose more than 0"),
     ],
 )
 def test_wrong_combination_gets_one_line(options, message):
@@ -164,7 +168,7 @@ def test_sigterm_holds_and_stops_the_robot_as_ctrl_c_does(tmp_path, monkeypatch)
     before, said = signal.getsignal(signal.SIGTERM), []
     path = write_policy(tmp_path / "p.onnx", describe(), bias=constant_bias(0.2))
     threading.Timer(0.5, terminate_twice).start()
-    report = deploy(get_preset("debug"), path, SessionOptions(seconds=30.0), said.append)
+    report = deploy(get_preset("debug"), path, SessionOptions(seconds=math.inf), said.append)
     robot, camera = devices
     assert report.interrupted and 0 < report.steps < 300
     assert robot.calls[-2:] == ["hold", "stop"] and camera.stopped
