@@ -7,10 +7,12 @@ from typing import NamedTuple
 import numpy as np
 import onnxruntime as ort
 
-from ddgrasp import contract
+from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
 from export import metadata
 
+POLICY_FILE = "policy.onnx"
+"""As the stage `export` names it."""
 NOISES = ("zero", "normal")
 PLAUSIBLE_MEDIAN_M = (0.05, 20.0)
 """A scene's median depth outside this is another unit, not another scene."""
@@ -46,7 +48,7 @@ class OnnxPolicy:
                 file's own.
 
         Raises:
-            UserError: no such file, not ONNX, not ours, or of another contract.
+            UserError: no such file, a folder, not ONNX, not ours, or of another contract.
         """
         if noise not in NOISES:
             raise UserError(f"noise is {noise!r}; expected one of {', '.join(NOISES)}.")
@@ -151,8 +153,10 @@ class OnnxPolicy:
 
 
 def _open(path: Path) -> ort.InferenceSession:
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: name the file, {_file_in(path)}.")
     if not path.is_file():
-        raise UserError(f"{path}: no such file; make one with `ddgrasp export`.")
+        raise UserError(f"{path}: no such file; {_remedy(path)}.")
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -161,9 +165,20 @@ def _open(path: Path) -> ort.InferenceSession:
         return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises classes of its own, without a common base
         reason = str(error).splitlines()[0]
-        raise UserError(
-            f"{path}: onnxruntime cannot load it ({reason}); make one with `ddgrasp export`."
-        ) from error
+        raise UserError(f"{path}: onnxruntime cannot load it ({reason}); {_remedy(path)}.") from error
+
+
+def _file_in(folder: Path) -> Path:
+    """The policy in a run's folder or in its stage's."""
+    export = folder / "export"
+    return (export if export.is_dir() else folder) / POLICY_FILE
+
+
+def _remedy(path: Path) -> str:
+    """A finished export stage is not made again while its folder is there."""
+    if artifacts.is_finished(path.parent):
+        return f"delete {path.parent}, then make it again with `ddgrasp export`"
+    return metadata.REMEDY
 
 
 def _metadata(session: ort.InferenceSession, path: Path) -> metadata.PolicyMetadata:

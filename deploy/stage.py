@@ -14,11 +14,11 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from deploy.film import Film, contact_sheet
+from deploy.policy import POLICY_FILE
 from deploy.rig_eval import TrialResult, plan, run_trials
 from deploy.timing import Timings
 
 STAGE = "deploy"
-POLICY_FILE = "policy.onnx"
 TRIALS_FILE = "trials.jsonl"
 
 
@@ -115,7 +115,9 @@ def _complete_lines(path: Path) -> list[dict[str, Any]]:
 
 def _header(config: Config, policy_path: Path) -> dict[str, Any]:
     if not policy_path.is_file():
-        raise UserError(f"{policy_path}: no such file; run `ddgrasp export` again.")
+        raise UserError(
+            f"{policy_path}: no such file; delete {policy_path.parent}, then run `ddgrasp export` again."
+        )
     return {
         "policy_sha256": hashlib.sha256(policy_path.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),

@@ -121,6 +121,29 @@ def test_wrong_files_get_one_line(tmp_path):
         OnnxPolicy(write_policy(tmp_path / "p.onnx", describe(contract_version=99)))
 
 
+def test_folder_in_place_of_the_file_names_the_file(tmp_path):
+    export = tmp_path / "run" / "export"
+    export.mkdir(parents=True)
+    for folder in (export, export.parent):
+        with pytest.raises(UserError) as error:
+            OnnxPolicy(folder)
+        assert str(error.value) == f"{folder} is a folder: name the file, {export / 'policy.onnx'}."
+
+
+def test_damaged_file_of_a_finished_export_says_what_to_delete(tmp_path):
+    path = write_policy(tmp_path / "policy.onnx")
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(UserError, match=r"cannot load it .*; make one with `ddgrasp export`\.$"):
+        OnnxPolicy(path)
+    (tmp_path / "manifest.json").write_text("{}")
+    for present in (True, False):
+        with pytest.raises(UserError) as error:
+            OnnxPolicy(path)
+        assert str(error.value).endswith(f"; delete {tmp_path}, then make it again with `ddgrasp export`.")
+        assert ("cannot load it" in str(error.value)) is present
+        path.unlink(missing_ok=True)
+
+
 def test_graph_that_contradicts_its_metadata_is_refused(tmp_path):
     lying = describe(depth_height=SHAPE[0] + 1).to_json()
     with pytest.raises(UserError, match="'depth' has shape"):
