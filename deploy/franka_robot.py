@@ -1,4 +1,4 @@
-"""A Franka arm through franky (`pip install ddgrasp[franka]`).
+"""A Franka arm through franky (`pip install -e '.[franka]'`).
 
 Written against franky-control 2.0's documented API and tried against franky-sim, a simulator that
 speaks the arm's network protocol; it has not been run on an arm by us. Keep the emergency stop in
@@ -156,4 +156,4 @@ def _franky() -> Any:
     try:
         return importlib.import_module("franky")
     except ImportError as error:
-        raise UserError(f"robot 'franka' needs franky ({error}): pip install 'ddgrasp[franka]'.") from error
+        raise UserError(f"robot 'franka' needs franky ({error}): pip install -e '.[franka]'.") from error

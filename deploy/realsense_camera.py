@@ -1,4 +1,4 @@
-"""A RealSense D4xx through pyrealsense2 (`pip install ddgrasp[realsense]`).
+"""A RealSense D4xx through pyrealsense2 (`pip install -e '.[realsense]'`).
 
 Written against pyrealsense2 2.59's documented API and tried through librealsense's own playback of
 a synthetic stream; it has not been run on a camera by us.
@@ -124,5 +124,5 @@ def _pyrealsense2() -> Any:
         return importlib.import_module("pyrealsense2")
     except ImportError as error:
         raise UserError(
-            f"camera 'realsense' needs pyrealsense2 ({error}): pip install 'ddgrasp[realsense]'."
+            f"camera 'realsense' needs pyrealsense2 ({error}): pip install -e '.[realsense]'."
         ) from error
