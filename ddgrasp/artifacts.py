@@ -261,8 +261,8 @@ def check_config(artifact: Artifact, config: Config) -> None:
 def has_work(directory: Path | str) -> bool:
     """Whether an attempt left a file in `directory` or below it, besides the notes about itself."""
     directory = Path(directory)
-    files = (path for path in directory.rglob("*") if not path.is_dir())
-    return any(path.name != STARTED and not path.name.startswith(".") for path in files)
+    files = (path.relative_to(directory) for path in directory.rglob("*") if not path.is_dir())
+    return any(path != Path(STARTED) and not any(p.startswith(".") for p in path.parts) for path in files)
 
 
 def begin(directory: Path | str, stage: str, config: Config, inputs: Mapping[str, str] | None = None) -> None:
@@ -282,7 +282,7 @@ def begin(directory: Path | str, stage: str, config: Config, inputs: Mapping[str
                 f"{directory} was begun with contract version {started.get('contract_version')}, this code "
                 f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
             )
-        _check_same_config(Path(directory), stage, started.get("config", {}), config)
+        _check_same_config(Path(directory), stage, started.get("config", {}), config, "begun")
         if difference := next(_differences(started.get("inputs", {}), inputs), None):
             raise UserError(
                 f"{directory} was begun with other inputs: {difference}. Use those, another --out, or delete "
@@ -293,14 +293,16 @@ def begin(directory: Path | str, stage: str, config: Config, inputs: Mapping[str
         atomic_write_json(path, value)
 
 
-def _check_same_config(directory: Path, stage: str, made_with: Mapping[str, Any], config: Config) -> None:
+def _check_same_config(
+    directory: Path, stage: str, made_with: Mapping[str, Any], config: Config, how: str = "made"
+) -> None:
     there, here = _relevant(made_with, stage), _relevant(to_json(config), stage)
     if there == here:
         return
     before, expected = _hash(there), _hash(here)
     difference = next(_differences(there, here), "a field that no longer exists")
     raise UserError(
-        f"{directory} was made with another configuration (hash {before}, "
+        f"{directory} was {how} with another configuration (hash {before}, "
         f"this run has {expected}): {difference}. "
         "Use that configuration, another --out, or delete the directory."
     )

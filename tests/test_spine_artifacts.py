@@ -114,6 +114,18 @@ def test_an_attempt_that_left_nothing_binds_nobody(tmp_path):
     assert artifacts.read_json(tmp_path / "ddg" / artifacts.STARTED)["inputs"] == {"data": "/b"}
 
 
+def test_empty_folders_bind_nobody_and_a_file_in_them_does(tmp_path):
+    directory, other = tmp_path / "teacher", dataclasses.replace(CONFIG, seed=5)
+    artifacts.begin(directory, "teacher", CONFIG)
+    (directory / "checkpoints" / "0").mkdir(parents=True)
+    assert not artifacts.has_work(directory)
+    artifacts.begin(directory, "teacher", other)
+    (directory / "checkpoints" / "0" / "state").touch()
+    assert artifacts.has_work(directory)
+    with pytest.raises(UserError, match="teacher was begun with another configuration .*seed is 5 there, 0"):
+        artifacts.begin(directory, "teacher", CONFIG)
+
+
 def test_an_artefact_of_another_contract_version_is_refused(tmp_path):
     _finish(tmp_path / "export")
     path = tmp_path / "export" / artifacts.MANIFEST
