@@ -75,6 +75,8 @@ def _one_line(error: BaseException) -> str | None:
         cause = cause.__cause__ or cause.__context__
     if isinstance(error, PermissionError):
         return f"No permission for {error.filename}: choose another --out, or change its owner."
+    if isinstance(error, (FileExistsError, NotADirectoryError, IsADirectoryError)):
+        return f"{error.filename} cannot be written ({error.strerror}): choose another --out."
     return None
 
 

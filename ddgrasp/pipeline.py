@@ -8,6 +8,7 @@ It works in `run_dir / <stage>` and ends by writing its manifest (`artifacts.fin
 when their turn comes, so that `--help` needs none of them and the robot side never imports JAX.
 """
 
+import errno
 import importlib
 import signal
 import sys
@@ -25,6 +26,9 @@ from ddgrasp.progress import Progress
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
 _REPEAT_S = 0.5
+_NO_SUCH_PLACE = (
+    errno.EEXIST, errno.ENOTDIR, errno.ENOENT, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,7 @@ def make(
     attempt with other inputs is not continued.
     """
     directory = run_dir / stage.name
+    _create(directory)
     if not resume:
         _refuse_occupied(run_dir, [stage.name])
     progress = Progress(directory, stage.name, quiet=quiet)
@@ -117,6 +122,16 @@ def make(
 def get_stage(name: str) -> Stage:
     """The stage of that name."""
     return next(stage for stage in STAGES if stage.name == name)
+
+
+def _create(directory: Path) -> None:
+    """UserError if `directory` is or lies below a file, or cannot exist."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if error.errno not in _NO_SUCH_PLACE:
+            raise
+        raise UserError(f"{directory} cannot be created ({error.strerror}): choose another --out.") from None
 
 
 def _refuse_occupied(run_dir: Path, names: Sequence[str]) -> None:
