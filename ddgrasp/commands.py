@@ -12,7 +12,7 @@ import tyro
 
 from ddgrasp import artifacts, pipeline
 from ddgrasp.config import Config
-from ddgrasp.errors import UserError
+from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.presets import get_preset
 
 DEFAULT_PRESET = "demo"
@@ -80,6 +80,7 @@ class TeacherEval:
         from ppo.evaluate import evaluate
         from ppo.policy import load_policy
 
+        _check_count("--trials", self.trials)
         config = load_config(self.run_dir, "teacher")
         policy = load_policy(self.run_dir / "teacher")
         result = evaluate(GraspEnv(config.world), policy, self.trials, self.seed)
@@ -112,6 +113,7 @@ class StudentEval:
         from student_jax.evaluate import closed_loop
         from student_jax.policy import PARAMS_FILE
 
+        _check_count("--trials", self.trials)
         config = load_config(self.run_dir, "student")
         evaluation = replace(config.evaluation, student_trials=self.trials)
         config = replace(config, seed=self.seed, evaluation=evaluation)
@@ -181,6 +183,7 @@ class DDGSample:
     def run(self) -> None:
         from ddg_jax.stage import sample_folder
 
+        _check_count("--count", self.count)
         print(sample_folder(self.model, self.data, self.out, seed=self.seed, count=self.count))
 
 
@@ -369,15 +372,51 @@ _PRESET_HELP = (
 )
 
 
+CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
+"""File that `<stage>.init_from` must hold, itself or in a folder named after the stage. Named here too, since
+the stages' own modules import JAX."""
+
+
 def check_config_values(config: Config) -> Config:
-    """`config` if the names in it exist; UserError that suggests the nearest right name otherwise."""
+    """`config` if the names and files in it exist; UserError with the remedy otherwise."""
+    from ddg_jax.depth_prior import IN_SIMULATION
+    from ddg_jax.prior import make_prior
+    from export.metadata import check_depth_dtype
     from mjx_envs.objects import OBJECTS, get_object
 
     if not config.world.objects:
         raise UserError(f"world.objects is empty; expected at least one of {', '.join(OBJECTS)}.")
     for name in config.world.objects:
         get_object(name)
+    for stage, file in CHECKPOINTS.items():
+        _check_start(stage, getattr(config, stage).init_from, file)
+    if config.ddg.prior_in_sim not in IN_SIMULATION:
+        raise unknown_name("ddg.prior_in_sim", config.ddg.prior_in_sim, IN_SIMULATION)
+    make_prior(config.ddg)
+    check_depth_dtype(config.export.depth_dtype)
+    if config.student.encoder_weights:
+        from student_jax import pretrained_encoder
+
+        pretrained_encoder.source(config.student)
     return config
+
+
+def _check_start(stage: str, init_from: str, file: str) -> None:
+    """UserError unless `init_from` is empty or holds the checkpoint `file`."""
+    source = Path(init_from)
+    if not init_from or any(path.is_file() for path in (source / file, source / stage / file)):
+        return
+    pretrained = source.parts[:1] == ("pretrained",)
+    remedy = (
+        "run it from the repository root" if pretrained else "give a run or pretrained folder, or nothing"
+    )
+    trouble = f"holds no {file}" if source.exists() else "does not exist"
+    raise UserError(f"{stage}.init_from is {init_from!r}, which {trouble}: {remedy}.")
+
+
+def _check_count(option: str, value: int) -> None:
+    if value < 1:
+        raise UserError(f"{option} is {value}; expected at least 1.")
 
 
 def load_config(run_dir: Path, stage: str) -> Config:

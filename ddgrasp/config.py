@@ -1,9 +1,16 @@
 """Configuration of every stage. Frozen dataclasses; field docstrings are the command line's help."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
+
+
+def _check_counts(section: str, config: Any, *names: str) -> None:
+    for name in names:
+        if (value := getattr(config, name)) < 1:
+            raise UserError(f"{section}.{name} is {value}; expected at least 1.")
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,9 @@ class WorldConfig:
         """The depth camera at this configuration's scale."""
         return contract.D455.scaled(self.camera_scale)
 
+    def __post_init__(self) -> None:
+        _check_counts("world", self, "episode_steps")
+
 
 @dataclass(frozen=True)
 class TeacherConfig:
@@ -139,6 +149,12 @@ class TeacherConfig:
     init_from: str = ""
     """Run directory or pretrained folder whose policy to start from; total_steps 0 uses it as it is."""
 
+    def __post_init__(self) -> None:
+        _check_counts(
+            "teacher", self, "num_envs", "unroll_steps", "minibatches",
+            "epochs", "eval_every", "checkpoint_every",
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class DemosConfig:
@@ -154,6 +170,9 @@ class DemosConfig:
     """Probability per step that a perturbation of four steps starts."""
     rgb: bool = True
     """Keep colour as well."""
+
+    def __post_init__(self) -> None:
+        _check_counts("demos", self, "episodes", "parallel")
 
 
 @dataclass(frozen=True)
@@ -219,6 +238,9 @@ class RecordConfig:
     """Half width of its uniform roll."""
     stereo: StereoConfig = field(default_factory=StereoConfig)
     """The camera itself."""
+
+    def __post_init__(self) -> None:
+        _check_counts("record", self, "trajectories", "frames")
 
 
 @dataclass(frozen=True)
@@ -305,6 +327,11 @@ class DDGConfig:
     """Share of the initial noise's variance that the frames of an episode have in common."""
     sample_batch: int = 16
     """Frames generated together."""
+
+    def __post_init__(self) -> None:
+        _check_counts(
+            "ddg", self, "diffusion_steps", "batch_size", "checkpoint_every", "sample_steps", "sample_batch",
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -430,6 +457,12 @@ class StudentConfig:
     init_from: str = ""
     """Run directory or pretrained folder whose student to start from; empty starts from nothing."""
 
+    def __post_init__(self) -> None:
+        _check_counts(
+            "student", self, "chunk", "execute_steps", "diffusion_steps",
+            "ddim_steps", "batch_size", "noise_draws", "head_batch_size",
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class ExportConfig:
@@ -445,6 +478,9 @@ class ExportConfig:
     """Single inferences timed on one thread."""
     max_abs_diff: float = 1e-4
     """Largest accepted difference between the JAX and the ONNX action."""
+
+    def __post_init__(self) -> None:
+        _check_counts("export", self, "parity_batches", "latency_runs")
 
 
 @dataclass(frozen=True)
@@ -504,6 +540,9 @@ class EvalConfig:
     """Episodes of the student on clean depth and on generated depth."""
     rig_trials: int = 60
     """Episodes of the exported student in the pseudo-real rig."""
+
+    def __post_init__(self) -> None:
+        _check_counts("evaluation", self, "teacher_trials", "student_trials", "rig_trials")
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
 """The command line as a person meets it: in a process of its own."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from ddgrasp.commands import COMMANDS, check_config_values, parse
+from ddgrasp.commands import CHECKPOINTS, COMMANDS, check_config_values, parse
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 
@@ -67,6 +68,20 @@ def test_version_names_the_libraries():
         (("teacher", "trian"), "Unknown command 'teacher trian'. Did you mean 'teacher train'?"),
         (("run", "--world.objects", "cube", "aple"), "Unknown object 'aple'. Did you mean 'apple'?"),
         (("report", "nowhere"), "nowhere holds no finished stage"),
+        (
+            ("run", "--out", "README.md"),
+            "README.md/teacher cannot be created (Not a directory): choose another",
+        ),
+        (("teacher", "train", "--out", "README.md/a"), "README.md/a/teacher cannot be created (Not a"),
+        (("teacher", "train", "--out", "/proc/a"), "/proc/a/teacher cannot be created (No such file or"),
+        (("run", "--demos.episodes", "0"), "demos.episodes is 0; expected at least 1."),
+        (("teacher", "eval", "nowhere", "--trials", "0"), "--trials is 0; expected at least 1."),
+        (("student", "eval", "nowhere", "--trials", "-1"), "--trials is -1; expected at least 1."),
+        (
+            ("ddg", "sample", "--model", "x", "--data", "x", "--count", "0"),
+            "--count is 0; expected at least 1.",
+        ),
+        (("export", "--export.depth-dtype", "uint8"), "Depth type is 'uint8'; expected one of uint16_mm,"),
         (("demos", "collect", "--out", "nowhere"), "nowhere has no finished stage 'teacher': run it first"),
     ],
 )
@@ -75,6 +90,13 @@ def test_wrong_input_gets_one_line_and_status_2(args, expected):
     assert result.returncode == 2
     assert expected in _one_error_line(result)
     assert not (ROOT / "nowhere").exists()
+
+
+def test_an_out_that_is_a_file_gets_one_line_from_other_commands(tmp_path):
+    (tmp_path / "file").touch()
+    result = ddgrasp("objects", "sheet", "--objects", "cube", "--out", str(tmp_path / "file" / "a.png"))
+    assert result.returncode == 1
+    assert "file cannot be written (File exists): choose another --out." in _one_error_line(result)
 
 
 def test_an_unknown_option_is_named():
@@ -117,8 +139,6 @@ def test_single_values_override_a_preset():
 
 
 def test_unknown_objects_suggest_the_nearest():
-    import dataclasses
-
     debug = PRESETS["debug"]
     wrong = dataclasses.replace(debug, world=dataclasses.replace(debug.world, objects=("cubes",)))
     with pytest.raises(UserError, match="Did you mean 'cube'"):
@@ -126,3 +146,64 @@ def test_unknown_objects_suggest_the_nearest():
     nothing = dataclasses.replace(debug, world=dataclasses.replace(debug.world, objects=()))
     with pytest.raises(UserError, match="world.objects is empty; expected at least one of cube, apple"):
         check_config_values(nothing)
+
+
+def _with(section: str, **values):
+    debug = PRESETS["debug"]
+    return dataclasses.replace(debug, **{section: dataclasses.replace(getattr(debug, section), **values)})
+
+
+@pytest.mark.parametrize(
+    ("section", "values", "expected"),
+    [
+        ("student", {"init_from": "runs/no"}, "student.init_from is 'runs/no', which does not exist: give a"),
+        ("student", {"init_from": "ddgrasp"}, "'ddgrasp', which holds no params.msgpack: give a run or"),
+        ("teacher", {"init_from": "pretrained/x"}, "does not exist: run it from the repository root."),
+        ("teacher", {"init_from": "pretrained/student"}, "holds no policy.msgpack: run it from the rep"),
+        ("ddg", {"init_from": "runs/no"}, "ddg.init_from is 'runs/no', which does not exist"),
+        ("ddg", {"prior": "inverse_dept"}, "Unknown prior 'inverse_dept'. Did you mean 'inverse_depth'"),
+        ("ddg", {"prior_in_sim": "deph"}, "Unknown ddg.prior_in_sim 'deph'. Did you mean 'depth'"),
+        ("ddg", {"prior": "depth_anything_v2", "prior_weights": "no"}, "no holds no converted weights"),
+        ("export", {"depth_dtype": "uint8"}, "'uint8'; expected one of uint16_mm, float32_m"),
+        ("student", {"encoder_weights": "no", "init_from": "pretrained/student"}, "both say where to start"),
+        ("student", {"encoder_weights": "no"}, "needs|holds no converted weights"),
+    ],
+)
+def test_names_and_files_are_checked_before_any_stage(section, values, expected, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    with pytest.raises(UserError, match=expected):
+        check_config_values(_with(section, **values))
+
+
+def test_a_start_is_found_in_a_run_and_in_a_stage_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    (tmp_path / "student").mkdir()
+    (tmp_path / "student" / "params.msgpack").touch()
+    for folder in (tmp_path, tmp_path / "student"):
+        config = _with("student", init_from=str(folder))
+        assert check_config_values(config) is config
+
+
+def test_the_checkpoints_are_those_the_stages_write():
+    import ddg_jax.sample
+    import ppo.policy
+    import student_jax.policy
+
+    modules = {"teacher": ppo.policy, "ddg": ddg_jax.sample, "student": student_jax.policy}
+    assert {name: module.PARAMS_FILE for name, module in modules.items()} == CHECKPOINTS
+
+
+@pytest.mark.parametrize(
+    ("section", "name"),
+    [
+        ("demos", "episodes"), ("demos", "parallel"), ("record", "trajectories"), ("record", "frames"),
+        ("evaluation", "teacher_trials"), ("evaluation", "student_trials"), ("evaluation", "rig_trials"),
+        ("student", "batch_size"), ("teacher", "num_envs"), ("ddg", "sample_steps"),
+        ("export", "latency_runs"), ("world", "episode_steps"),
+    ],
+)  # fmt: skip
+def test_a_count_below_one_is_named_with_its_minimum(section, name):
+    assert getattr(getattr(_with(section, **{name: 1}), section), name) == 1
+    for value in (0, -3):
+        with pytest.raises(UserError, match=rf"{section}\.{name} is {value}; expected at least 1\."):
+            _with(section, **{name: value})
