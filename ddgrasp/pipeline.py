@@ -9,6 +9,7 @@ when their turn comes, so that `--help` needs none of them and the robot side ne
 """
 
 import errno
+import gc
 import importlib
 import signal
 import sys
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from ddgrasp import artifacts
@@ -26,6 +28,7 @@ from ddgrasp.progress import Progress
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
 _REPEAT_S = 0.5
+_SOON_S = 0.001
 _NO_SUCH_PLACE = (
     errno.EEXIST, errno.ENOTDIR, errno.ENOENT, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL,
 )  # fmt: skip
@@ -162,7 +165,8 @@ def _interruptible(name: str) -> Iterator[None]:
     """Turns Ctrl-C and SIGTERM into KeyboardInterrupt with a message, wherever in the stage they arrive.
 
     A KeyboardInterrupt raised inside a JAX host callback surfaces as some other error; the flag tells. Raised
-    in a destructor or a garbage collector's callback it is dropped: a timer repeats it until it surfaces.
+    in a destructor it is dropped, and in the garbage collector's callbacks (JAX has one), where it would be
+    too, it is put off: a timer repeats it until it surfaces.
     """
     arrived = False
 
@@ -171,8 +175,10 @@ def _interruptible(name: str) -> Iterator[None]:
         if signum == signal.SIGALRM and _is_unwinding():
             return
         arrived = True
-        signal.setitimer(signal.ITIMER_REAL, _REPEAT_S, _REPEAT_S)
-        raise KeyboardInterrupt
+        put_off = _in_gc_callback(frame)
+        signal.setitimer(signal.ITIMER_REAL, _SOON_S if put_off else _REPEAT_S, _REPEAT_S)
+        if not put_off:
+            raise KeyboardInterrupt
 
     try:
         previous = {number: signal.signal(number, interrupt) for number in _SIGNALS}
@@ -202,3 +208,11 @@ def _is_unwinding() -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__
     return error is not None
+
+
+def _in_gc_callback(frame: FrameType | None) -> bool:
+    """Whether `frame` runs in a callback of the garbage collector, from where no exception gets out."""
+    codes = {getattr(callback, "__code__", None) for callback in gc.callbacks}
+    while frame is not None and frame.f_code not in codes:
+        frame = frame.f_back
+    return frame is not None

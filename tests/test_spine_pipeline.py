@@ -151,20 +151,29 @@ def work(config, run_dir, *, resume, progress):
         raise RuntimeError("a host callback wraps the interrupt")
 """
 DROPS_THE_FIRST_INTERRUPT = """
-def callback(phase, info):
-    gc.callbacks.clear()
-    print("working", flush=True)
-    time.sleep(30)
+class Drops:
+    def __del__(self):
+        print("working", flush=True)
+        time.sleep(30)
 
 def work(config, run_dir, *, resume, progress):
-    gc.callbacks.append(callback)
-    gc.collect()
+    Drops()
     print("dropped", flush=True)
     try:
         time.sleep(30)
     finally:
         time.sleep(1.2)
         print("cleaned up", flush=True)
+"""
+COLLECTS_GARBAGE_MOST_OF_THE_TIME = """
+def work(config, run_dir, *, resume, progress):
+    gc.callbacks.append(lambda phase, info: None)
+    ballast = [[] for _ in range(1_000_000)]
+    print("working", flush=True)
+    end = time.monotonic() + 30
+    while time.monotonic() < end:
+        gc.collect()
+        time.sleep(0.01)
 """
 INTERRUPTED = (
     "ddgrasp: Interrupted in stage 'teacher'. Finished work is kept: the same command with --resume goes on."
@@ -195,11 +204,16 @@ def test_an_interrupt_says_how_to_go_on_and_keeps_the_time_spent(tmp_path, numbe
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_that_a_gc_callback_drops_still_ends_the_work_and_lets_it_clean_up(tmp_path, number):
+def test_an_interrupt_that_a_destructor_drops_still_ends_the_work_and_lets_it_clean_up(tmp_path, number):
     out, errors = _interrupt(DROPS_THE_FIRST_INTERRUPT, tmp_path, number)
     assert out == "dropped\ncleaned up\n"
     assert errors[0].startswith("Exception ignored in")
     assert errors[-1] == INTERRUPTED
+
+
+def test_an_interrupt_that_arrives_in_a_gc_callback_ends_the_work(tmp_path):
+    _, errors = _interrupt(COLLECTS_GARBAGE_MOST_OF_THE_TIME, tmp_path, signal.SIGINT)
+    assert errors == [INTERRUPTED]
 
 
 def test_curves_count_a_repeated_step_once_and_skip_a_torn_line(tmp_path):
