@@ -218,7 +218,7 @@ class Deploy:
     object_name: str = ""
     """Object on the rig's table; empty takes the first configured one."""
     seconds: float = 6.0
-    """How long to run; 0 runs until Ctrl-C."""
+    """How long to run; inf runs until Ctrl-C."""
 
     def run(self) -> None:
         from deploy.session import SessionOptions, deploy, describe
@@ -367,7 +367,7 @@ def describe_commands(group: str = "") -> str:
 
 
 _PRESET_HELP = (
-    "Presets (--preset): debug (tests), demo (a real result on two cores), laptop (an evening on two cores),",
+    "Presets (--preset): debug (tests), demo (a real result on two cores), laptop (all from nothing, 40 minutes on two cores),",
     "paper (one GPU). Any value of a preset can be given on its own, for example --teacher.num-envs 64.",
 )
 
