@@ -68,7 +68,8 @@ class RandomConfig:
     camera_angle_rad: float = 0.015
     """Each axis."""
     crop_px: int = 24
-    """Shift of the crop window at scale 1, each axis."""
+    """Not read by any stage: the student's training shifts its window by student.crop_shift_px. Kept so
+    that earlier manifests load."""
     latency_share: float = 0.0
     """Share of episodes in which every command takes effect one control step late."""
 

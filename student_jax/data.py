@@ -8,11 +8,12 @@ import numpy as np
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
-from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M
-from student_jax.policy import Aux
+from student_jax.policy import Aux, position_from_world
 
-_OBJECT_POS = slice(25, 28)
+GRIP_POS = slice(18, 21)
+OBJECT_POS = slice(25, 28)
 _GRASP_QUAT = slice(35, 39)
+"""Parts of the teacher's observation (ddgrasp/contract.py)."""
 YAW_MULTIPLE = 2
 """The gripper looks the same after half a turn: the auxiliary target is the angle's double."""
 
@@ -71,7 +72,7 @@ def aux_targets(observation: np.ndarray, held: np.ndarray) -> Aux:
     """What perception is to report of the teacher's observations (N, 40); `held_logit` is 0 or 1."""
     quat = observation[:, _GRASP_QUAT]
     yaw = 2.0 * np.arctan2(quat[:, 2], quat[:, 1]) * YAW_MULTIPLE
-    position = (observation[:, _OBJECT_POS] - np.array(POSITION_CENTER_M)) / POSITION_SCALE_M
+    position = position_from_world(observation[:, OBJECT_POS])
     return Aux(
         position.astype(np.float32),
         np.stack([np.cos(yaw), np.sin(yaw)], axis=1).astype(np.float32),

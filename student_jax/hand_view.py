@@ -21,6 +21,8 @@ from mjx_envs.camera import nominal_camera
 from student_jax import preprocess
 from student_jax.encoder import STEM_STRIDE, BasicBlock, Stem, newest_channel_index
 
+STEM = "space_to_depth"
+"""Patches keep every pixel, and are cheap on CPU."""
 MIN_CAMERA_DEPTH_M = 0.1
 """A hand nearer to the camera than this is drawn as if it were there."""
 MIN_COVERAGE = 0.25
@@ -147,7 +149,3 @@ class HandView(nn.Module):
             x = BasicBlock(config.hand_view_width, 1, config.norm, name=f"block{block}")(x)
         cells = nn.relu(nn.Dense(config.hand_view_channels, name="cells")(x))
         return nn.relu(nn.Dense(config.hand_view_features, name="features")(cells.reshape(len(cells), -1)))
-
-
-STEM = "space_to_depth"
-"""Patches keep every pixel; at this size they are as cheap as convolutions are dear."""

@@ -8,7 +8,7 @@
     eps = policy.apply({"params": params}, noisy_action, k, cond, method="denoise")
 """
 
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,8 @@ from student_jax.denoiser import Denoiser, StateStream, normalise_state
 from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M, DepthEncoder
 from student_jax.hand_view import HandView
 from student_jax.preprocess import crop_origin, prepare_depth
+
+Positions = TypeVar("Positions", jax.Array, np.ndarray)
 
 AUX_SIZE = 6
 BESIDE_SIZE = 4
@@ -58,9 +60,9 @@ class Seen(NamedTuple):
     aux: Aux
 
 
-def position_from_world(position_m: Numbers) -> jax.Array:
+def position_from_world(position_m: Positions) -> Positions:
     """(..., 3) metres in the world to network units."""
-    return (jnp.asarray(position_m) - jnp.array(POSITION_CENTER_M)) / POSITION_SCALE_M
+    return (position_m - np.array(POSITION_CENTER_M, np.float32)) / POSITION_SCALE_M
 
 
 def position_to_world(position: Numbers) -> jax.Array:

@@ -10,11 +10,10 @@ import numpy as np
 from ddgrasp.config import StudentConfig
 from demos.rollout import Scene
 from student_jax import train
-from student_jax.data import aux_targets
+from student_jax.data import GRIP_POS, OBJECT_POS, aux_targets
 from student_jax.encoder import POSITION_SCALE_M
 from student_jax.policy import Aux, Seen, feature_count
 
-_GRIP_POS = slice(18, 21)
 NEAR_ERROR_M = 0.002
 ERROR_PER_DISTANCE = 0.08
 FAR_ERROR_M = 0.010
@@ -43,8 +42,8 @@ def noisy_seen(
         bias: (B, 5) standard normal: position and yaw errors in units of their size.
     """
     truth = aux_targets(observation, held)
-    position = observation[:, 25:28]
-    distance = np.linalg.norm(observation[:, _GRIP_POS] - position, axis=1, keepdims=True)
+    way = observation[:, GRIP_POS] - observation[:, OBJECT_POS]
+    distance = np.linalg.norm(way, axis=1, keepdims=True)
     size_m = np.minimum(NEAR_ERROR_M + ERROR_PER_DISTANCE * distance, FAR_ERROR_M)
     wrong = rng.random(len(held)) < HELD_WRONG
     logit = HELD_LOGIT * (2 * (truth.held_logit > 0.5) - 1.0) * np.where(wrong, -1.0, 1.0)
