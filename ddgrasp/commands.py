@@ -10,7 +10,7 @@ from typing import Annotated, Any, Protocol
 
 import tyro
 
-from ddgrasp import artifacts, pipeline
+from ddgrasp import artifacts, contract, pipeline
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.presets import get_preset
@@ -311,9 +311,9 @@ class ObjectsSheet:
 
     def run(self) -> None:
         from evaluation.object_sheet import draw
-        from mjx_envs.objects import OBJECTS, SEEN, UNSEEN
+        from mjx_envs.objects import OBJECTS
 
-        everything = tuple(dict.fromkeys((*SEEN, *UNSEEN, *OBJECTS)))
+        everything = tuple(dict.fromkeys((*contract.SEEN_OBJECTS, *contract.UNSEEN_OBJECTS, *OBJECTS)))
         artifacts.atomic_write_bytes(self.out, draw(self.objects or everything))
         print(self.out)
 

@@ -49,6 +49,8 @@ class RandomConfig:
     """Initial arm joints around home."""
     pregrasp_share: float = 0.0
     """Share of episodes that start with the hand above the object (exploring starts, for training only)."""
+    other_pose_share: float = 0.5
+    """Share of episodes in which an object that can both lie and stand rests in its other pose."""
     size: float = 0.05
     """Relative size of the object."""
     object_mass: float = 0.3
@@ -78,8 +80,8 @@ class RandomConfig:
 class WorldConfig:
     """Scene, objects, randomisation."""
 
-    objects: tuple[str, ...] = ("cube", "apple", "banana")
-    """Objects to train on, mixed in one batch."""
+    objects: tuple[str, ...] = contract.SEEN_OBJECTS
+    """Objects, mixed in one batch (`ddgrasp objects list` names them all)."""
     backend: str = "cpu"
     """Physics: cpu (MuJoCo's C engine on all cores) or jax (MJX)."""
     episode_steps: int = 60

@@ -41,6 +41,11 @@ LIFT_TOLERANCE_M = 0.05
 HOLD_STEPS = 5
 """An episode succeeds if its last HOLD_STEPS steps all had the object within tolerance."""
 
+# --- objects ---------------------------------------------------------------------------------
+SEEN_OBJECTS = ("apple", "pear", "peach", "banana", "cube", "block")
+"""The paper trains on these and tests on the others as well; `mjx_envs.objects` describes them all."""
+UNSEEN_OBJECTS = ("persimmon", "starfruit", "lemon", "can", "wheel", "bread")
+
 # --- depth -----------------------------------------------------------------------------------
 DEPTH_FRAMES = 3
 DEPTH_UNIT_M = 0.001

@@ -40,6 +40,9 @@ class Episode:
 
     params: physics.ModelParams
     object_index: jax.Array
+    """() position in `GraspEnv.table.names`."""
+    variant: jax.Array
+    """() index into the table's arrays: the object in one of its rest poses."""
     rest_height: jax.Array
     """() m."""
     branch: jax.Array
@@ -68,22 +71,24 @@ class GraspEnv(mjx_env.MjxEnv):
 
     def reset(self, rng: jax.Array) -> mjx_env.State:
         """A new episode: object, pose, dynamics and joints drawn from `rng`."""
-        k_object, k_params, k_qpos, k_start, k_next = jax.random.split(rng, 5)
+        k_object, k_variant, k_params, k_qpos, k_start, k_next = jax.random.split(rng, 6)
         index = jax.random.randint(k_object, (), 0, len(self.table.names))
-        params, size = randomize.sample_params(k_params, self.config.random, self.table, index)
-        rest = jp.asarray(self.table.rest_height, jp.float32)[index] * size
+        variant = randomize.sample_variant(k_variant, self.config.random, self.table, index)
+        params, size = randomize.sample_params(k_params, self.config.random, self.table, variant)
+        rest = jp.asarray(self.table.rest_height, jp.float32)[variant] * size
         qpos = randomize.sample_qpos(k_qpos, self.config.random, rest)
-        branch = grasp_math.yaw_branch(qpos[12:16], self._symmetry(index), jp)
+        branch = grasp_math.yaw_branch(qpos[12:16], self._symmetry(variant), jp)
         if self.config.random.pregrasp_share > 0:
-            grasp = self._grasp_pose(qpos, index, branch)
+            grasp = self._grasp_pose(qpos, variant, branch)
             qpos = randomize.maybe_pregrasp(k_start, self.config.random, qpos, *grasp)
         state = physics.initial_state(qpos)
         episode = Episode(
             params=params,
             object_index=index,
+            variant=variant,
             rest_height=rest,
             branch=branch,
-            distances=self._distances(state.qpos, index, branch),
+            distances=self._distances(state.qpos, variant, branch),
             action=jp.zeros(contract.ACTION_SIZE).at[7].set(-1.0),
             steps=jp.zeros((), jp.int32),
             hold_count=jp.zeros((), jp.int32),
@@ -105,7 +110,7 @@ class GraspEnv(mjx_env.MjxEnv):
         finite = jp.all(jp.isfinite(new.qpos)) & jp.all(jp.isfinite(new.qvel))
         new = jax.tree.map(lambda a, b: jp.where(finite, a, b), new, old)
 
-        distances = self._distances(new.qpos, episode.object_index, episode.branch)
+        distances = self._distances(new.qpos, episode.variant, episode.branch)
         object_pos = new.qpos[9:12]
         grasped = jp.all(new.touch > TOUCH_N) & (action[7] > 0)
         held = jp.linalg.norm(object_pos - jp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
@@ -143,14 +148,14 @@ class GraspEnv(mjx_env.MjxEnv):
         )
 
     def _get_obs(self, state: physics.PhysicsState, episode: Episode) -> jax.Array:
-        log_category = jp.asarray(self.table.log_category, jp.float32)[episode.object_index]
-        symmetry, offset = self._symmetry(episode.object_index), self._grasp_offset(episode.object_index)
+        log_category = jp.asarray(self.table.log_category, jp.float32)[episode.variant]
+        symmetry, offset = self._symmetry(episode.variant), self._grasp_offset(episode.variant)
         return grasp_math.observation(
             state.qpos, state.qvel, symmetry, episode.branch, log_category, jp, offset
         )
 
-    def _distances(self, qpos, index, branch) -> rewards.Distances:
-        grasp_pos, grasp_quat = self._grasp_pose(qpos, index, branch)
+    def _distances(self, qpos, variant, branch) -> rewards.Distances:
+        grasp_pos, grasp_quat = self._grasp_pose(qpos, variant, branch)
         return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[:7], jp))
 
     def _latency(self, rng, qpos) -> Latency | None:
@@ -168,15 +173,15 @@ class GraspEnv(mjx_env.MjxEnv):
         now = jp.where(latency.late, latency.controls, controls)
         return now, replace(latency, controls=controls)
 
-    def _grasp_pose(self, qpos, index, branch) -> tuple[jax.Array, jax.Array]:
-        symmetry, offset = self._symmetry(index), self._grasp_offset(index)
+    def _grasp_pose(self, qpos, variant, branch) -> tuple[jax.Array, jax.Array]:
+        symmetry, offset = self._symmetry(variant), self._grasp_offset(variant)
         return grasp_math.grasp_pose(qpos[9:12], qpos[12:16], symmetry, branch, jp, offset)
 
-    def _symmetry(self, index) -> jax.Array:
-        return jp.asarray(self.table.symmetry)[index]
+    def _symmetry(self, variant) -> jax.Array:
+        return jp.asarray(self.table.symmetry)[variant]
 
-    def _grasp_offset(self, index) -> jax.Array:
-        return jp.asarray(self.table.grasp_offset, jp.float32)[index]
+    def _grasp_offset(self, variant) -> jax.Array:
+        return jp.asarray(self.table.grasp_offset, jp.float32)[variant]
 
     @property
     def xml_path(self) -> str:

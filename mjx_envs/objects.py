@@ -11,8 +11,9 @@ around or between them.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 
 from ddgrasp.errors import unknown_name
@@ -20,6 +21,13 @@ from ddgrasp.errors import unknown_name
 _HIDDEN_M = 0.001
 
 Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+_HALF_ROOT = math.sqrt(0.5)
+_QUARTER_TURN: dict[str, Quaternion] = {
+    "x": (_HALF_ROOT, _HALF_ROOT, 0.0, 0.0),
+    "y": (_HALF_ROOT, 0.0, _HALF_ROOT, 0.0),
+}
 
 
 @dataclass(frozen=True)
@@ -104,6 +112,20 @@ class Plate:
 
 
 @dataclass(frozen=True)
+class RestPose:
+    """Another way for an object to rest on the table: its shape turned by a quarter turn in its frame."""
+
+    about: str
+    """Axis of the quarter turn: "x" or "y"."""
+    rest_height_m: float
+    """As the object's own, in this pose."""
+    grasp_symmetry: int
+    """As the object's own, in this pose."""
+    grasp_offset_m: Vector = (0.0, 0.0, 0.0)
+    """As the object's own, in this pose."""
+
+
+@dataclass(frozen=True)
 class ObjectSpec:
     """An object that lies on the table with its frame's z axis up.
 
@@ -116,8 +138,7 @@ class ObjectSpec:
     """1, 2, ...: the teacher sees log(category_id)."""
     mass_kg: float
     friction: float
-    """Sliding friction coefficient. MuJoCo takes the larger one of two surfaces in contact: against the
-    finger pads (1.0) and the table (0.7) it counts where it exceeds theirs."""
+    """Sliding friction coefficient against whatever touches it: its geoms have MuJoCo's contact priority."""
     rgb: Vector
     rest_height_m: float
     """Height of the frame's origin above the table when the object lies still."""
@@ -129,8 +150,21 @@ class ObjectSpec:
     plates: tuple[Plate, ...] = ()
     grasp_offset_m: Vector = (0.0, 0.0, 0.0)
     """From the origin to the grasp, object frame; not scaled with the object's randomised size."""
+    other_pose: RestPose | None = None
+    """Lying, for what stands above; standing, for what lies."""
+    turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    """From the parts' frame to the object frame: nothing or a quarter turn (`in_other_pose`)."""
     source: str = ""
     """Where size, mass and friction come from."""
+
+    def in_other_pose(self) -> "ObjectSpec":
+        """The same object in its other pose, which must exist."""
+        assert self.other_pose is not None
+        pose = self.other_pose
+        return replace(
+            self, rest_height_m=pose.rest_height_m, grasp_symmetry=pose.grasp_symmetry,
+            grasp_offset_m=pose.grasp_offset_m, turn=_QUARTER_TURN[pose.about], other_pose=None,
+        )  # fmt: skip
 
     def slot_arrays(self, layout: SlotLayout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(S, 3) sizes, (S, 3) positions, (S, 4) quaternions of the slots in the object frame.
@@ -154,7 +188,9 @@ class ObjectSpec:
             up = np.array([0.0, -math.sin(plate.roll_rad), math.cos(plate.roll_rad)])
             size[i] = (plate.half_length_m, plate.half_thickness_m, plate.height_m / 2)
             pos[i], quat[i] = plate.height_m / 2 * up, _quat_z_to(up)
-        return size, pos, quat
+        for i in range(count):
+            mujoco.mju_mulQuat(quat[i], np.array(self.turn), quat[i].copy())
+        return size, self._turned(pos), quat
 
     def slot_rgb(self, layout: SlotLayout) -> np.ndarray:
         """(S, 3) colours of the slots."""
@@ -181,7 +217,7 @@ class ObjectSpec:
         return upper - lower
 
     def _bounds_m(self) -> np.ndarray:
-        """(2, 3) lower and upper corner of the box and the capsules together."""
+        """(2, 3) lower and upper corner of the box and the capsules together, object frame."""
         lower, upper = [], []
         if self.box is not None:
             lower.append(np.subtract(self.box.center_m, self.box.half_m))
@@ -189,7 +225,14 @@ class ObjectSpec:
         for c in self.capsules:
             lower.append(np.minimum(c.start_m, c.end_m) - c.radius_m)
             upper.append(np.maximum(c.start_m, c.end_m) + c.radius_m)
-        return np.stack([np.min(lower, axis=0), np.max(upper, axis=0)])
+        corners = np.stack([np.min(lower, axis=0), np.max(upper, axis=0)])
+        return np.sort(self._turned(corners), axis=0)
+
+    def _turned(self, points_m: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the parts' frame in the object frame."""
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, np.array(self.turn))
+        return points_m @ matrix.reshape(3, 3).T
 
 
 def slot_layout(specs: Iterable[ObjectSpec]) -> SlotLayout:
@@ -250,6 +293,12 @@ def _torus(ring_m: float, radius_m: float) -> tuple[Capsule, ...]:
     """Eight capsules around z; the corners of their octagon reach as far out as a torus would."""
     corners = [(x, y, 0.0) for x, y in _around_z(8, ring_m, math.pi / 8)]
     return tuple(Capsule(corners[i - 1], corners[i], radius_m) for i in range(8))
+
+
+def _staves(radius_m: float, half_m: float, edge_m: float) -> tuple[Capsule, ...]:
+    """Eight capsules of radius `edge_m` parallel to z; between two of them lies the cylinder's radius."""
+    ring_m = (radius_m - edge_m) / math.cos(math.pi / 8)
+    return tuple(_upright(half_m, edge_m, x, y) for x, y in _around_z(8, ring_m, math.pi / 8))
 
 
 def _disc(across_m: float, height_m: float) -> tuple[Capsule, ...]:
@@ -313,6 +362,7 @@ OBJECTS: dict[str, ObjectSpec] = {
         ObjectSpec(
             "block", 6, mass_kg=0.028, friction=0.7, rgb=(0.70, 0.30, 0.22), rest_height_m=0.025,
             grasp_symmetry=2, box=Box((0.0375, 0.025, 0.025)),
+            other_pose=RestPose("y", 0.0375, grasp_symmetry=4, grasp_offset_m=(0.0, 0.0, 0.010)),
             source="50 x 75 x 50 mm, 28 g: YCB foam brick (Calli et al. 2015); friction: our estimate",
         ),
         ObjectSpec(
@@ -340,7 +390,8 @@ OBJECTS: dict[str, ObjectSpec] = {
             "can", 10, mass_kg=0.349, friction=0.5, rgb=(0.75, 0.10, 0.12), rest_height_m=0.0505,
             grasp_symmetry=0, grasp_offset_m=(0.0, 0.0, 0.020),
             box=Box((0.0233, 0.0233, 0.0505)),
-            capsules=tuple(_upright(0.0425, 0.008, x, y) for x, y in _around_z(4, 0.025)),
+            capsules=_staves(radius_m=0.033, half_m=0.0425, edge_m=0.008),
+            other_pose=RestPose("y", rest_height_m=0.033, grasp_symmetry=2),
             cylinders=(Cylinder(0.033, 0.0495), Cylinder(0.031, 0.0507, rgb=(0.75, 0.75, 0.78))),
             source="66 x 101 mm, 349 g: YCB tomato soup can (Calli et al. 2015); friction: our estimate",
         ),
@@ -361,10 +412,6 @@ OBJECTS: dict[str, ObjectSpec] = {
         ),
     )
 }  # fmt: skip
-"""The paper trains on the first six and tests on all twelve (`SEEN`, `UNSEEN`)."""
-
-SEEN = ("apple", "pear", "peach", "banana", "cube", "block")
-UNSEEN = ("persimmon", "starfruit", "lemon", "can", "wheel", "bread")
 
 
 def get_object(name: str) -> ObjectSpec:

@@ -14,11 +14,17 @@ PREGRASP_HEIGHT_M = 0.15
 
 
 class ObjectTable:
-    """The objects' constants as arrays indexed by position in `names`."""
+    """The objects' constants as arrays over variants: the objects in the order of `names`, then the other
+    rest poses of those that have one."""
 
     def __init__(self, names: tuple[str, ...]):
         specs = [get_object(name) for name in names]
         self.layout = slot_layout(specs)
+        self.rgb = np.stack([spec.slot_rgb(self.layout) for spec in specs])
+        turning = [i for i, spec in enumerate(specs) if spec.other_pose is not None]
+        self.other_variant = np.arange(len(specs))
+        self.other_variant[turning] = len(specs) + np.arange(len(turning))
+        specs += [specs[i].in_other_pose() for i in turning]
         slots = [spec.slot_arrays(self.layout) for spec in specs]
         self.names = tuple(names)
         self.slot_size = np.stack([s[0] for s in slots])
@@ -31,7 +37,12 @@ class ObjectTable:
         self.symmetry = np.array([s.grasp_symmetry for s in specs])
         self.log_category = np.log([s.category_id for s in specs])
         self.grasp_offset = np.array([s.grasp_offset_m for s in specs])
-        self.rgb = np.stack([s.slot_rgb(self.layout) for s in specs])
+
+
+def sample_variant(key: jax.Array, config: RandomConfig, table: ObjectTable, index) -> jax.Array:
+    """() index into the table's arrays of object `index`, in one of its rest poses."""
+    other = jax.random.uniform(key) < config.other_pose_share
+    return jp.where(other, jp.asarray(table.other_variant)[index], index)
 
 
 def _around(key, half_range, shape=()):
@@ -40,13 +51,13 @@ def _around(key, half_range, shape=()):
 
 
 def sample_params(
-    key: jax.Array, config: RandomConfig, table: ObjectTable, index
+    key: jax.Array, config: RandomConfig, table: ObjectTable, variant
 ) -> tuple[ModelParams, jax.Array]:
-    """Model parameters of one episode with object `index`; also the object's size factor ()."""
+    """Model parameters of one episode with `variant` of the table; also the object's size factor ()."""
     keys = jax.random.split(key, 7)
     size = _around(keys[0], config.size)
     mass = _around(keys[1], config.object_mass)
-    take = lambda a: jp.asarray(a, jp.float32)[index]  # noqa: E731
+    take = lambda a: jp.asarray(a, jp.float32)[variant]  # noqa: E731
     params = ModelParams(
         slot_size=take(table.slot_size) * size,
         slot_pos=take(table.slot_pos) * size,

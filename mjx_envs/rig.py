@@ -43,7 +43,7 @@ class RigWorld:
         if object_name not in self.objects:
             raise unknown_name("object", object_name, self.objects)
         rng = np.random.default_rng(seed)
-        self._spec = self.objects[object_name]
+        self._spec = self._choose_pose(rng, self.objects[object_name])
         size = self._set_object(rng)
         self._set_dynamics(rng)
         mujoco.mj_setConst(self.model, self.data)  # inertia that MuJoCo precomputes for free bodies
@@ -87,6 +87,10 @@ class RigWorld:
     def _around(self, rng: np.random.Generator, half_range: float, shape=()) -> np.ndarray:
         scale = half_range if self._randomise else 0.0
         return 1.0 + scale * rng.uniform(-1.0, 1.0, shape)
+
+    def _choose_pose(self, rng: np.random.Generator, spec: ObjectSpec) -> ObjectSpec:
+        other = rng.random() < self._random.other_pose_share
+        return spec.in_other_pose() if other and spec.other_pose is not None else spec
 
     def _set_object(self, rng: np.random.Generator) -> float:
         random = self._random

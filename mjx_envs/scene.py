@@ -171,7 +171,7 @@ def scene_xml(sim_dt_s: float = 0.005, layout: SlotLayout = DEFAULT_SLOTS) -> st
     return f"""
 <mujoco model="franka_table">
   <compiler angle="radian" autolimits="true"/>
-  <option timestep="{sim_dt_s}" integrator="implicitfast" cone="elliptic" impratio="3"
+  <option timestep="{sim_dt_s}" integrator="implicitfast" cone="elliptic" impratio="10"
           iterations="50" ls_iterations="50"><flag eulerdamp="disable" midphase="disable"/></option>
   <default>
     <default class="arm"><geom contype="0" conaffinity="0" group="1" rgba="0.92 0.92 0.92 1"/></default>
@@ -181,7 +181,7 @@ def scene_xml(sim_dt_s: float = 0.005, layout: SlotLayout = DEFAULT_SLOTS) -> st
             friction="{PAD_FRICTION} 0.01 0.0001" solref="{2 * sim_dt_s} 1" rgba="0.15 0.15 0.15 1"/>
     </default>
     <default class="slot">
-      <geom contype="1" conaffinity="1" group="1" condim="4" friction="0.9 0.005 0.0001"
+      <geom contype="1" conaffinity="1" group="1" condim="4" priority="1" friction="0.9 0.005 0.0001"
             solref="{2 * sim_dt_s} 1"/>
     </default>
     <default class="drawn_slot"><geom contype="0" conaffinity="0" group="1"/></default>

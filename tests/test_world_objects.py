@@ -18,8 +18,6 @@ from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.objects import (
     DEFAULT_SLOTS,
     OBJECTS,
-    SEEN,
-    UNSEEN,
     Box,
     Capsule,
     ObjectSpec,
@@ -32,6 +30,7 @@ from mjx_envs.rig import RigWorld
 from mjx_envs.visual import Viewer
 from ppo.guide import guide
 
+SEEN, UNSEEN = contract.SEEN_OBJECTS, contract.UNSEEN_OBJECTS
 TWELVE = (*SEEN, *UNSEEN)
 X, Y, Z = 0, 1, 2
 SIZES_MM = [
@@ -135,6 +134,53 @@ def test_the_largest_one_fits_between_fingers_and_palm(name):
     assert largest * spec.extents_m()[Z] - grasp_pos[2] < PALM_ABOVE_GRIP_M
 
 
+def heights_m(depth_m, shown, camera):
+    """(N,) height above the table of the pixels `shown` (H, W) of a depth picture."""
+    rows, columns = np.nonzero(shown)
+    ray = np.stack([
+        (columns + 0.5 - camera.cx_px) / camera.fx_px, (rows + 0.5 - camera.cy_px) / camera.fy_px,
+        np.ones(len(rows)),
+    ])  # fmt: skip
+    return (camera.T_world_cam[:3, :3] @ ray * depth_m[shown])[2] + camera.T_world_cam[2, 3]
+
+
+BOTH_POSES = tuple(name for name, spec in OBJECTS.items() if spec.other_pose is not None)
+
+
+@pytest.mark.parametrize("name", BOTH_POSES)
+def test_in_its_other_pose_it_stays_and_has_turned(name):
+    usual, other = get_object(name), get_object(name).in_other_pose()
+    assert other.extents_m()[Z] == pytest.approx(usual.extents_m()[X], abs=1e-9)
+    assert other.extents_m()[Y] == pytest.approx(usual.extents_m()[Y], abs=1e-9)
+    np.testing.assert_allclose(other.inertia_kg_m2(), usual.inertia_kg_m2()[[Z, Y, X]])
+    model, data = place(other)
+    camera = object_sheet.close_camera(other.rest_height_m)
+    picture = raycast_numpy.render(model, data, camera)
+    shown = np.isin(picture.segmentation, scene.slot_ids(model))
+    assert heights_m(picture.depth_m, shown, camera).max() == pytest.approx(other.extents_m()[Z], abs=0.003)
+    start = data.qpos[9:16].copy()
+    mujoco.mj_step(model, data, nstep=round(1.0 / model.opt.timestep))
+    assert np.linalg.norm(data.qpos[9:12] - start[:3]) < 0.003
+    assert np.degrees(2 * np.arccos(min(1.0, abs(data.qpos[12:16] @ start[3:])))) < 3.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_the_other_pose_comes_up_in_its_share_of_the_episodes_and_stays(share):
+    env = GraspEnv(WorldConfig(objects=("block", "cube"), random=RandomConfig(other_pose_share=share)))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 128))
+    episode = state.info["episode"]
+    other = np.asarray(episode.variant) == 2
+    assert not other[np.asarray(episode.object_index) == 1].any()  # a cube has one
+    assert other[np.asarray(episode.object_index) == 0].mean() == pytest.approx(share, abs=0.15)
+    step = jax.jit(jax.vmap(env.step))
+    for _ in range(5):
+        state = step(state, jp.zeros((128, 8)).at[:, 7].set(-1.0))
+    height = np.asarray(state.data.qpos[:, 11])
+    np.testing.assert_allclose(height, np.asarray(episode.rest_height), atol=0.002)
+    rest = np.where(other, 0.0375, 0.025)
+    np.testing.assert_allclose(height, rest, rtol=RandomConfig().size + 0.02)
+
+
 def test_the_guide_lifts_all_of_them_in_one_batch():
     env = GraspEnv(WorldConfig(objects=tuple(OBJECTS)))
     reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
@@ -166,7 +212,7 @@ def test_the_scene_has_as_many_slots_as_the_chosen_objects_need():
     assert ObjectTable(("cube", "wheel")).layout == SlotLayout(capsules=8, cylinders=2)
     twelve = ObjectTable(TWELVE)
     assert twelve.layout == SlotLayout(capsules=8, cylinders=2, plates=5)
-    assert twelve.slot_size.shape == (12, 16, 3) and twelve.rgb.shape == (12, 16, 3)
+    assert twelve.slot_size.shape == (12 + len(BOTH_POSES), 16, 3) and twelve.rgb.shape == (12, 16, 3)
     model = scene.build_model(layout=twelve.layout)
     assert [model.geom(i).name for i in scene.slot_ids(model)] == list(twelve.layout.names)
 
@@ -235,12 +281,7 @@ def test_a_panel_shows_the_whole_object_as_high_as_it_is(name):
     assert 0.03 < shown.mean() < 0.6
     assert not np.concatenate([shown[0], shown[-1], shown[:, 0], shown[:, -1]]).any()
     camera = object_sheet.close_camera(spec.rest_height_m)
-    rows, columns = np.nonzero(shown)
-    ray = np.stack([
-        (columns + 0.5 - camera.cx_px) / camera.fx_px, (rows + 0.5 - camera.cy_px) / camera.fy_px,
-        np.ones(len(rows)),
-    ])  # fmt: skip
-    height_m = (camera.T_world_cam[:3, :3] @ ray * seen.depth_m[shown])[2] + camera.T_world_cam[2, 3]
+    height_m = heights_m(seen.depth_m, shown, camera)
     assert height_m.max() == pytest.approx(spec.extents_m()[Z], abs=0.002)
     assert height_m.min() > -0.001
 

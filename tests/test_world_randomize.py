@@ -86,7 +86,12 @@ def sampler(table):
 
 
 def test_every_range_is_listed():
-    assert {field.name for field in fields(RandomConfig)} == {*MOVES, "crop_px", "latency_share"}
+    assert {field.name for field in fields(RandomConfig)} == {
+        *MOVES,
+        "crop_px",
+        "latency_share",
+        "other_pose_share",
+    }
 
 
 @pytest.mark.parametrize("field", MOVES)
