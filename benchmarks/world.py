@@ -1,0 +1,48 @@
+"""Speed of the world against its peers, in one run on one machine: physics, PPO rollout, rendering.
+
+    python -m benchmarks.world [--out world.json]
+
+A few minutes on two cores, most of it compilation. A ratio is ours over the peer's; lines with a target say
+whether it is met. Other work on the machine slows both sides, but not equally: the load is printed.
+"""
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+if sys.platform.startswith("linux"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
+
+from benchmarks import physics_speed, render_speed
+from benchmarks.compare import as_json, print_table
+from ddgrasp import artifacts
+from ddgrasp.presets import LAPTOP
+from evaluation.report import describe_machine
+
+
+def main() -> None:
+    """Prints the table, and writes it as JSON if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    parser.add_argument("--rounds", type=int, default=7, help="repetitions, taken in turns")
+    arguments = parser.parse_args()
+    start, load = time.monotonic(), os.getloadavg()[0]
+    rows, trouble = render_speed.render_rows(LAPTOP, 3 * arguments.rounds)
+    rows = physics_speed.rollout_rows(LAPTOP, arguments.rounds) + rows
+    rows = physics_speed.playground_rows(LAPTOP, arguments.rounds) + rows
+    machine, loads = describe_machine(), [load, os.getloadavg()[0]]
+    seconds = time.monotonic() - start
+    title = f"{machine['processor']}, {machine['cores']} cores, load {loads[0]:.1f} to {loads[1]:.1f}"
+    print_table(f"{title}; {arguments.rounds} rounds, {seconds:.0f} s", rows)
+    if trouble:
+        print(f"No OpenGL here: {trouble}")
+    if arguments.out:
+        figures = {"machine": machine, "load": loads, "seconds": seconds, "rows": as_json(rows)}
+        artifacts.atomic_write_json(arguments.out, figures)
+        print(arguments.out)
+
+
+if __name__ == "__main__":
+    main()
