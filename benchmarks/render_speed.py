@@ -1,8 +1,10 @@
 """Frames per second of the project's ray casters against MuJoCo's OpenGL renderer, on the same scenes."""
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import jax
 import mujoco
@@ -19,6 +21,8 @@ SIZES = ((180, 320), (64, 64))
 TARGETS = (1.0, 5.0)
 """Depth frames/s of the JAX ray caster over OpenGL's, at each size."""
 SCENES = 16
+MEDIAN_ERROR_M = 0.001
+"""Depths of the two must agree within this in the median for their speeds to be compared."""
 
 
 def render_rows(config: Config, rounds: int) -> tuple[list[Row], str]:
@@ -31,11 +35,12 @@ def render_rows(config: Config, rounds: int) -> tuple[list[Row], str]:
     for (height, width), target in zip(SIZES, TARGETS, strict=True):
         camera = camera_of(config, height, width)
         contenders = ray_casters(model, scenes, camera)
-        try:
-            renderers = open_gl(model, scenes, camera)
-        except Exception as error:  # the back ends raise whatever their loaders do
-            renderers, trouble = {}, f"{type(error).__name__}: {error}"
-        rates = measure(contenders | renderers, rounds)
+        with contextlib.ExitStack() as stack:
+            try:
+                contenders |= open_gl(stack, model, scenes, camera)
+            except Exception as error:  # the back ends raise whatever their loaders do
+                trouble = f"{type(error).__name__}: {error}"
+            rates = measure(contenders, rounds)
         size = f"{width}x{height}"
         for picture in ("depth", "depth and RGB"):
             goal = target if picture == "depth" else None
@@ -96,11 +101,20 @@ def ray_casters(
     return {name: Contender(run, len(scenes)) for name, run in runs.items()}
 
 
-def open_gl(model: mujoco.MjModel, scenes: Sequence[mujoco.MjData], camera: Camera) -> dict[str, Contender]:
-    """MuJoCo's renderer on the scenes; raises what its back end raises where there is none."""
+def open_gl(
+    stack: contextlib.ExitStack, model: mujoco.MjModel, scenes: Sequence[mujoco.MjData], camera: Camera
+) -> dict[str, Contender]:
+    """MuJoCo's renderer on the scenes, without the shadows and reflections that the ray casters lack.
+
+    `stack` closes it: a second one next to it draws nothing. Raises what its back end raises where there is
+    none, and RuntimeError if it draws other depth than the ray caster.
+    """
     model.vis.global_.fovy = math.degrees(2 * math.atan(camera.height_px / 2 / camera.fy_px))
-    renderer = mujoco.Renderer(model, camera.height_px, camera.width_px)
+    renderer = stack.enter_context(mujoco.Renderer(model, camera.height_px, camera.width_px))
+    for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        renderer.scene.flags[flag] = 0
     view = _free_camera()
+    _check_depth(renderer, model, scenes[0], camera, view)
 
     def depth() -> None:
         renderer.enable_depth_rendering()
@@ -119,6 +133,19 @@ def open_gl(model: mujoco.MjModel, scenes: Sequence[mujoco.MjData], camera: Came
 
     runs = {"MuJoCo OpenGL, depth": depth, "MuJoCo OpenGL, depth and RGB": everything}
     return {name: Contender(run, len(scenes)) for name, run in runs.items()}
+
+
+def _check_depth(
+    renderer: mujoco.Renderer, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, view: Any
+) -> None:
+    renderer.enable_depth_rendering()
+    renderer.update_scene(data, view)
+    depth = renderer.render()
+    renderer.disable_depth_rendering()
+    cast = raycast_numpy.render_depth(model, data, camera)
+    off_m = np.median(np.abs(depth - cast)[cast > 0])
+    if off_m > MEDIAN_ERROR_M:
+        raise RuntimeError(f"its depth differs by {1000 * off_m:.1f} mm in the median")
 
 
 def _free_camera() -> mujoco.MjvCamera:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Protocol
 import tyro
 
 from ddgrasp import artifacts, contract, pipeline
-from ddgrasp.config import Config
+from ddgrasp.config import Config, WorldConfig
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.presets import get_preset
 
@@ -65,33 +65,42 @@ class TeacherTrain(_OneStage):
 
 @dataclass(frozen=True)
 class TeacherEval:
-    """Measure a trained teacher again: success and motion per object, over as many trials as asked for."""
+    """Measure a trained teacher again, per object: success, motion, what the camera sees, a contact sheet."""
 
     run_dir: tyro.conf.Positional[Path]
-    """Directory of the run."""
-    trials: int = 1000
-    """Episodes."""
+    """Directory of the run, or pretrained folder."""
+    world: WorldConfig
+    """Objects, seen or not, and randomisation; by default those that the teacher was trained on."""
+    trials: int = 200
+    """Episodes of each object."""
+    watched: int = 8
+    """How many of them are drawn, to count the object's visible pixels."""
     seed: int = 0
     """Of the episodes."""
+    out: Path | None = None
+    """Where trials.json and pictures/episodes.png go; by default beside the teacher, for the report."""
 
     def run(self) -> None:
-        from evaluation import wilson
+        from ddgrasp.progress import Progress
+        from evaluation import teacher_trials
         from mjx_envs.grasp_env import GraspEnv
-        from ppo.evaluate import evaluate
+        from ppo import trials
         from ppo.policy import load_policy
+        from ppo.visible import MOMENTS
 
         _check_count("--trials", self.trials)
-        config = load_config(self.run_dir, "teacher")
-        policy = load_policy(self.run_dir / "teacher")
-        result = evaluate(GraspEnv(config.world), policy, self.trials, self.seed)
-        for name, counts in {**result["objects"], "all": result["success"]}.items():
-            print(f"{name:<12} {wilson.describe(wilson.success(counts['successes'], counts['n']))}")
-        columns = list(result["motion"][-1])
-        print("\n" + "  ".join([f"{columns[0]:<12}", *columns[1:]]))
-        for row in result["motion"]:
-            numbers = (f"{row[column]:>{len(column)}.3f}" for column in columns[1:])
-            print("  ".join([f"{row['object']:<12}", *numbers]))
-        print("acceleration and jerk relative to Franka's limits, over 100 ms; toggles per episode")
+        _check_count("--watched", self.watched)
+        check_objects(self.world)
+        directory = self.run_dir / "teacher"
+        teacher = artifacts.read_artifact(directory).hash
+        env, policy = GraspEnv(self.world), load_policy(directory)
+        progress = Progress(name="teacher eval")
+        result, pictures = trials.measure(env, policy, self.trials, self.watched, self.seed, progress)
+        summary = teacher_trials.summarise(result)
+        teacher_trials.print_summary(summary)
+        out = self.out or directory
+        for path in teacher_trials.save(out, teacher, self.world, self.seed, summary, pictures, MOMENTS):
+            print(path)
 
 
 @dataclass(frozen=True)
@@ -348,6 +357,8 @@ def parse(name: str, args: Sequence[str]) -> Command:
     elif cls is Deploy:
         policy = Path(_option(args, "--policy") or Path("runs") / DEFAULT_PRESET / "export" / "policy.onnx")
         options["default"] = Deploy(config=_config_of(policy, _option(args, "--preset")), policy=policy)
+    elif cls is TeacherEval:
+        options["default"] = _teacher_eval(Path(args[0]) if args and args[0][0] != "-" else None)
     return tyro.cli(
         cls,
         prog=f"ddgrasp {name}",
@@ -382,12 +393,8 @@ def check_config_values(config: Config) -> Config:
     from ddg_jax.depth_prior import IN_SIMULATION
     from ddg_jax.prior import make_prior
     from export.metadata import check_depth_dtype
-    from mjx_envs.objects import OBJECTS, get_object
 
-    if not config.world.objects:
-        raise UserError(f"world.objects is empty; expected at least one of {', '.join(OBJECTS)}.")
-    for name in config.world.objects:
-        get_object(name)
+    check_objects(config.world)
     for stage, file in CHECKPOINTS.items():
         _check_start(stage, getattr(config, stage).init_from, file)
     if config.ddg.prior_in_sim not in IN_SIMULATION:
@@ -399,6 +406,16 @@ def check_config_values(config: Config) -> Config:
 
         pretrained_encoder.source(config.student)
     return config
+
+
+def check_objects(world: WorldConfig) -> None:
+    """UserError unless `world` has objects, all of them known."""
+    from mjx_envs.objects import OBJECTS, get_object
+
+    if not world.objects:
+        raise UserError(f"world.objects is empty; expected at least one of {', '.join(OBJECTS)}.")
+    for name in world.objects:
+        get_object(name)
 
 
 def _check_start(stage: str, init_from: str, file: str) -> None:
@@ -422,6 +439,14 @@ def _check_count(option: str, value: int) -> None:
 def load_config(run_dir: Path, stage: str) -> Config:
     """The configuration that made the finished `stage` of a run."""
     return artifacts.config_from_json(artifacts.read_manifest(run_dir / stage).config)
+
+
+def _teacher_eval(run_dir: Path | None) -> TeacherEval:
+    """The command with the world of the run in `run_dir`, where there is one."""
+    run_dir = run_dir or Path("runs") / DEFAULT_PRESET
+    there = artifacts.is_finished(run_dir / "teacher")
+    config = load_config(run_dir, "teacher") if there else get_preset(DEFAULT_PRESET)
+    return TeacherEval(run_dir=run_dir, world=config.world)
 
 
 def _config_of(policy: Path, preset: str | None) -> Config:

@@ -63,6 +63,11 @@ def draw_panels(panels: Mapping[str, np.ndarray]) -> bytes:
     return to_png(figure)
 
 
+def draw_sheet(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str]) -> bytes:
+    """PNG of colour pictures (H, W, 3), uint8 or in [0, 1], one named row each; `titles` of the columns."""
+    return to_png(_grid([list(_to_rgb(np.stack(row))) for row in rows.values()], list(titles), list(rows)))
+
+
 def draw_curves(curves: Mapping[str, Sequence[tuple[int, float]]], columns: int = 4) -> bytes:
     """PNG of small multiples, one per named curve of (step, value) points."""
     rows = -(-len(curves) // columns)

@@ -13,7 +13,7 @@ from typing import Any
 from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
 from ddgrasp.pipeline import STAGES
-from evaluation import wilson
+from evaluation import teacher_trials, wilson
 
 REPORT = "report.json"
 _TOP_LEVEL = "student_"
@@ -25,6 +25,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     Keys: `stages.<name>.{seconds, trained, loaded}`; `<name>` holds what that stage measured, except keys
     that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top; `machine`,
     `versions`, `preset`, `seed`, `config`. A success rate is {rate, n, successes, low, high}.
+    `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows.
     """
     finished = {
         stage.name: artifacts.read_manifest(run_dir / stage.name)
@@ -55,6 +56,8 @@ def build_report(run_dir: Path) -> dict[str, Any]:
         metrics = with_intervals(manifest.metrics)
         report[name] = {key: value for key, value in metrics.items() if not key.startswith(_TOP_LEVEL)}
         report.update({key: value for key, value in metrics.items() if key.startswith(_TOP_LEVEL)})
+    if "teacher" in finished and (rows := teacher_trials.load(run_dir / "teacher")):
+        report["teacher"]["trials"] = rows
     report["config"] = latest.config
     return report
 

@@ -71,8 +71,8 @@ class GraspEnv(mjx_env.MjxEnv):
 
     def reset(self, rng: jax.Array) -> mjx_env.State:
         """A new episode: object, pose, dynamics and joints drawn from `rng`."""
-        k_object, k_variant, k_params, k_qpos, k_start, k_next = jax.random.split(rng, 6)
-        index = jax.random.randint(k_object, (), 0, len(self.table.names))
+        _, k_variant, k_params, k_qpos, k_start, k_next = jax.random.split(rng, 6)
+        index = self.object_drawn(rng)
         variant = randomize.sample_variant(k_variant, self.config.random, self.table, index)
         params, size = randomize.sample_params(k_params, self.config.random, self.table, variant)
         rest = jp.asarray(self.table.rest_height, jp.float32)[variant] * size
@@ -100,6 +100,10 @@ class GraspEnv(mjx_env.MjxEnv):
         metrics |= {"success": jp.zeros(()), "saturated": jp.zeros(())}
         info = {"episode": episode, "rng": k_next, "truncation": jp.zeros(())}
         return mjx_env.State(state, obs, jp.zeros(()), jp.zeros(()), metrics, info)
+
+    def object_drawn(self, rng: jax.Array) -> jax.Array:
+        """() index of the object that `reset(rng)` takes."""
+        return jax.random.randint(jax.random.split(rng, 6)[0], (), 0, len(self.table.names))
 
     def step(self, state: mjx_env.State, action: jax.Array) -> mjx_env.State:
         """One control step with `action` (8,)."""

@@ -69,6 +69,16 @@ class Viewer:
 
         return jax.lax.map(draw, (geoms, T_world_cam))
 
+    def object_pixels(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
+        """(B,) int32 pixels of the object in the centred crop window, for a batch of scenes."""
+        window = (self.profile.crop_height_px, self.profile.crop_width_px)
+
+        def count(a):
+            picture = render(a[0], self._seen_from(a[1]), *self.profile.crop_origin_px, window)
+            return jp.isin(picture.segmentation, self._slots).sum()
+
+        return jax.lax.map(count, (geoms, T_world_cam))
+
     def _seen_from(self, T_world_cam: jax.Array) -> Camera:
         return dataclasses.replace(self._camera, T_world_cam=T_world_cam)
 

@@ -1,0 +1,88 @@
+"""What `ddgrasp teacher eval` measured: kept beside the teacher, shown by the report."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddgrasp import artifacts, contract
+from ddgrasp.config import WorldConfig
+from ddgrasp.progress import PICTURES
+from evaluation import figures, wilson
+
+TRIALS_FILE = "trials.json"
+SHEET_FILE = "episodes.png"
+
+
+def summarise(result: Mapping[str, Any]) -> dict[str, Any]:
+    """`result` of `ppo.trials.measure` as it is kept.
+
+    Keys: success, and the same of the objects the paper trains on (`seen`) and of the others (`unseen`), if
+    there are any: {rate, n, successes, low, high}; objects: a row per object and one for all, {object,
+    success, motion and visibility}.
+    """
+    counts = {**result["objects"], "all": result["success"]}
+    groups = {
+        "seen": [c for name, c in result["objects"].items() if name in contract.SEEN_OBJECTS],
+        "unseen": [c for name, c in result["objects"].items() if name not in contract.SEEN_OBJECTS],
+    }
+    pooled = {name: _pool(some) for name, some in groups.items() if some}
+    rows = [
+        {"object": row["object"], "success": _pool([counts[row["object"]]])}
+        | {key: value for key, value in row.items() if key != "object"}
+        for row in result["motion"]
+    ]
+    return {"success": _pool([result["success"]])} | pooled | {"objects": rows}
+
+
+def save(
+    directory: Path, teacher: str, world: WorldConfig, seed: int, summary: Mapping[str, Any],
+    pictures: Mapping[str, np.ndarray], titles: tuple[str, ...],
+) -> tuple[Path, Path]:  # fmt: skip
+    """Writes the JSON and the contact sheet into `directory`; returns both files.
+
+    Args:
+      directory: the teacher's, if the report is to show them.
+      teacher: hash of the teacher's artefact.
+      world: where it was measured.
+      seed: of the episodes.
+      summary: of `summarise`.
+      pictures: object -> (M, H, W, 3).
+      titles: M names.
+    """
+    path, sheet = directory / TRIALS_FILE, directory / PICTURES / SHEET_FILE
+    artifacts.atomic_write_json(path, {"teacher": teacher, "seed": seed, **summary, "world": world})
+    artifacts.atomic_write_bytes(sheet, figures.draw_sheet({k: list(v) for k, v in pictures.items()}, titles))
+    return path, sheet
+
+
+def load(directory: Path) -> list[dict[str, Any]]:
+    """The rows that `save` kept of the teacher now in `directory`; none if there are none of it."""
+    path = directory / TRIALS_FILE
+    if not path.exists():
+        return []
+    saved = artifacts.read_json(path)
+    return saved["objects"] if saved["teacher"] == artifacts.read_artifact(directory).hash else []
+
+
+def print_summary(summary: Mapping[str, Any]) -> None:
+    """Prints success, and the table of motion and visibility."""
+    rows = summary["objects"]
+    lines = {row["object"]: row["success"] for row in rows}
+    lines |= {name: summary[name] for name in ("seen", "unseen") if name in summary}
+    for name, success in lines.items():
+        print(f"{name:<12} {wilson.describe(success)}")
+    columns = [column for column in rows[-1] if column not in ("object", "success")]
+    print("\n" + "  ".join([f"{'object':<12}", *columns]))
+    for row in rows:
+        numbers = (f"{row[column]:>{len(column)}.3f}" for column in columns)
+        print("  ".join([f"{row['object']:<12}", *numbers]))
+    print(
+        "acceleration and jerk relative to Franka's limits, over 100 ms; toggles per episode; pixels of the "
+        "object\nin the student's crop, over the steps before the first contact"
+    )
+
+
+def _pool(counts: list[Mapping[str, int]]) -> dict[str, Any]:
+    return wilson.success(sum(c["successes"] for c in counts), sum(c["n"] for c in counts))

@@ -1,0 +1,150 @@
+"""Recorded episodes of a teacher, the same number of each object: how often it succeeds, how it moves and how
+much of the object the camera sees.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jp
+import numpy as np
+from flax import struct
+
+from ddgrasp.progress import Progress
+from mjx_envs.grasp_env import TOUCH_N, GraspEnv
+from mjx_envs.physics import ModelParams
+from ppo.motion import motion_metrics
+from ppo.policy import TeacherPolicy
+from ppo.visible import Watcher, moments
+
+
+@struct.dataclass
+class Trials:
+    """N episodes of T control steps, NumPy. A state is the one at the beginning of a step."""
+
+    params: ModelParams
+    """Of each environment, (N, ...)."""
+    qpos: np.ndarray
+    """(T, N, 16)."""
+    touched: np.ndarray
+    """(T, N) bool, whether a finger pad touches the object or has touched it."""
+    running: np.ndarray
+    """(T, N) bool, whether the episode was still going on."""
+    action: np.ndarray
+    """(T, N, 8)."""
+    velocity_rad_s: np.ndarray
+    """(T, N, 7) of the joints at the end of each step."""
+    success: np.ndarray
+    """(N,) bool."""
+
+
+def episode_keys(env: GraspEnv, per_object: int, seed: int) -> np.ndarray:
+    """(objects, per_object, 2) keys whose resets take each object equally often."""
+    drawn = jax.jit(jax.vmap(env.object_drawn))
+    found: list[np.ndarray] = [np.empty((0, 2), np.uint32) for _ in env.table.names]
+    key, lot = jax.random.PRNGKey(seed), 0
+    while min(map(len, found)) < per_object:
+        keys = jax.random.split(jax.random.fold_in(key, lot), 2 * per_object * len(found))
+        index, lot = np.asarray(drawn(keys)), lot + 1
+        found = [np.concatenate([have, keys[index == i]]) for i, have in enumerate(found)]
+    return np.stack([have[:per_object] for have in found])
+
+
+def record(env: GraspEnv, policy: TeacherPolicy, keys: np.ndarray) -> Trials:
+    """The deterministic `policy` in the episodes of `keys` (N, 2)."""
+    recorded = _record(env, policy.layers, policy.mean, policy.std, jp.asarray(keys))
+    return Trials(*jax.tree.map(np.asarray, recorded))
+
+
+@partial(jax.jit, static_argnums=0)
+def _record(env: GraspEnv, layers, mean, std, keys):
+    policy = TeacherPolicy(mean, std, layers)
+    state = jax.vmap(env.reset)(keys)
+    params = state.info["episode"].params
+
+    def step(carry, _):
+        state, alive, touched, success = carry
+        touched = touched | jp.any(state.data.touch > TOUCH_N, axis=-1)
+        action = policy(state.obs, jp)
+        new = jax.vmap(env.step)(state, action)
+        success = jp.where(alive, new.metrics["success"] > 0, success)
+        kept = (state.data.qpos, touched, alive, action, new.data.qvel[:, :7])
+        return (new, alive & (new.done == 0), touched, success), kept
+
+    never = jp.zeros(len(keys), bool)
+    start = (state, ~never, never, never)
+    (*_, success), kept = jax.lax.scan(step, start, None, env.config.episode_steps)
+    return (params, *kept, success)
+
+
+def measure(
+    env: GraspEnv, policy: TeacherPolicy, trials: int, watched: int, seed: int, progress: Progress
+) -> tuple[dict, dict[str, np.ndarray]]:
+    """Success, motion and visibility over `trials` episodes of each object.
+
+    Args:
+      env: objects, randomisation and backend.
+      trials: episodes of each object.
+      watched: how many of them the camera watches; pictures take longer than physics.
+      seed: of the episodes.
+
+    Returns:
+      What `ppo.evaluate.evaluate` returns, its motion rows with `visible_object_pixels_mean` and `_min`
+      (pixels of the object in the student's crop, over all steps before the first contact) added; and
+      (5, H, W, 3) uint8 pictures per object of one episode at `ppo.visible.MOMENTS`.
+    """
+    recorded: list[Trials] = []
+    keys = episode_keys(env, trials, seed)
+    with progress.task("episodes", keys[..., 0].size) as task:
+        for some in keys:
+            recorded.append(record(env, policy, some))
+            task.advance(trials)
+    watch = [_first(some, min(watched, trials)) for some in recorded]
+    watcher, pixels, pictures = Watcher(env), [], {}
+    for i, some in enumerate(progress.track(watch, "pictures")):
+        before = some.running & ~some.touched
+        pixels.append(watcher.visible_pixels(some.qpos, some.params, i, before, seed))
+        pictures[env.table.names[i]] = _story(watcher, some, i)
+    names = env.table.names
+    rows = [_row(name, [r], [p]) for name, r, p in zip(names, recorded, pixels, strict=True)]
+    rows.append(_row("all", recorded, pixels))
+    counts = {name: _count(some.success) for name, some in zip(names, recorded, strict=True)}
+    result = {
+        "success": _count(np.concatenate([some.success for some in recorded])),
+        "objects": counts,
+        "saturated_actions": rows[-1]["saturated_actions"],
+        "motion": rows,
+    }
+    return result, pictures
+
+
+def _story(watcher: Watcher, watched: Trials, index: int) -> np.ndarray:
+    """Pictures of the first successful episode, or of the first."""
+    n = int(np.argmax(watched.success))
+    steps = moments(watched.qpos[:, n], watched.touched[:, n], watched.running[:, n])
+    params = jax.tree.map(lambda leaf: leaf[n], watched.params)
+    return watcher.pictures(watched.qpos[steps, n], params, index)
+
+
+def _first(trials: Trials, count: int) -> Trials:
+    """The first `count` episodes."""
+    per_step = ("qpos", "touched", "running", "action", "velocity_rad_s")
+    return Trials(
+        params=jax.tree.map(lambda leaf: leaf[:count], trials.params),
+        success=trials.success[:count],
+        **{name: getattr(trials, name)[:, :count] for name in per_step},
+    )
+
+
+def _row(name: str, recorded: Sequence[Trials], pixels: Sequence[np.ndarray]) -> dict:
+    def joined(field: str) -> np.ndarray:
+        return np.concatenate([getattr(some, field) for some in recorded], axis=1)
+
+    seen = np.concatenate(pixels)
+    motion = motion_metrics(joined("velocity_rad_s"), joined("action"), joined("running"))
+    visible = {"mean": float(seen.mean()), "min": int(seen.min())}
+    return {"object": name} | motion | {f"visible_object_pixels_{k}": v for k, v in visible.items()}
+
+
+def _count(success: np.ndarray) -> dict[str, int]:
+    return {"successes": int(success.sum()), "n": len(success)}
