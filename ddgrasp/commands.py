@@ -96,10 +96,9 @@ class TeacherEval:
         env, policy = GraspEnv(self.world), load_policy(directory)
         progress = Progress(name="teacher eval")
         result, pictures = trials.measure(env, policy, self.trials, self.watched, self.seed, progress)
-        summary = teacher_trials.summarise(result)
+        summary = teacher_trials.summarise(result, teacher, self.world, self.seed)
         teacher_trials.print_summary(summary)
-        out = self.out or directory
-        for path in teacher_trials.save(out, teacher, self.world, self.seed, summary, pictures, MOMENTS):
+        for path in teacher_trials.save(self.out or directory, summary, pictures, MOMENTS):
             print(path)
 
 

@@ -1,6 +1,6 @@
 """What `ddgrasp teacher eval` measured: kept beside the teacher, shown by the report."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,18 @@ TRIALS_FILE = "trials.json"
 SHEET_FILE = "episodes.png"
 
 
-def summarise(result: Mapping[str, Any]) -> dict[str, Any]:
+def summarise(result: Mapping[str, Any], teacher: str, world: WorldConfig, seed: int) -> dict[str, Any]:
     """`result` of `ppo.trials.measure` as it is kept.
 
-    Keys: success, and the same of the objects the paper trains on (`seen`) and of the others (`unseen`), if
-    there are any: {rate, n, successes, low, high}; objects: a row per object and one for all, {object,
-    success, motion and visibility}.
+    Args:
+      result: see there.
+      teacher: hash of the teacher's artefact.
+      world: where it was measured.
+      seed: of the episodes.
+
+    Keys: teacher, seed, world; success, and the same of the objects the paper trains on (`seen`) and of the
+    others (`unseen`), if there are any: {rate, n, successes, low, high}; objects: a row per object and one
+    for all, {object, success, motion and visibility}.
     """
     counts = {**result["objects"], "all": result["success"]}
     groups = {
@@ -33,26 +39,23 @@ def summarise(result: Mapping[str, Any]) -> dict[str, Any]:
         | {key: value for key, value in row.items() if key != "object"}
         for row in result["motion"]
     ]
-    return {"success": _pool([result["success"]])} | pooled | {"objects": rows}
+    origin = {"teacher": teacher, "seed": seed, "world": artifacts.to_json(world)}
+    return origin | {"success": _pool([result["success"]])} | pooled | {"objects": rows}
 
 
 def save(
-    directory: Path, teacher: str, world: WorldConfig, seed: int, summary: Mapping[str, Any],
-    pictures: Mapping[str, np.ndarray], titles: tuple[str, ...],
-) -> tuple[Path, Path]:  # fmt: skip
+    directory: Path, summary: Mapping[str, Any], pictures: Mapping[str, np.ndarray], titles: Sequence[str]
+) -> tuple[Path, Path]:
     """Writes the JSON and the contact sheet into `directory`; returns both files.
 
     Args:
       directory: the teacher's, if the report is to show them.
-      teacher: hash of the teacher's artefact.
-      world: where it was measured.
-      seed: of the episodes.
       summary: of `summarise`.
       pictures: object -> (M, H, W, 3).
       titles: M names.
     """
     path, sheet = directory / TRIALS_FILE, directory / PICTURES / SHEET_FILE
-    artifacts.atomic_write_json(path, {"teacher": teacher, "seed": seed, **summary, "world": world})
+    artifacts.atomic_write_json(path, summary)
     artifacts.atomic_write_bytes(sheet, figures.draw_sheet({k: list(v) for k, v in pictures.items()}, titles))
     return path, sheet
 

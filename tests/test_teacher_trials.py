@@ -121,8 +121,8 @@ def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     result, pictures = measured
     directory = tmp_path / "teacher"
     artifact = artifacts.finish(directory, "teacher", Config(preset="mine"), seconds=1.0, metrics={})
-    summary = teacher_trials.summarise(result)
-    teacher_trials.save(directory, artifact.hash, WORLD, 3, summary, pictures, MOMENTS)
+    summary = teacher_trials.summarise(result, artifact.hash, WORLD, seed=3)
+    teacher_trials.save(directory, summary, pictures, MOMENTS)
     saved = json.loads((directory / teacher_trials.TRIALS_FILE).read_text())
     assert saved["seen"]["n"] == saved["unseen"]["n"] == 4
     assert saved["objects"][0]["success"] == {**result["objects"]["cube"], **saved["objects"][0]["success"]}
@@ -132,7 +132,7 @@ def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     page = render_html(report, tmp_path)
     assert 'alt="episodes" src="data:image/png' in page
     assert "visible_object_pixels_min" in page
-    teacher_trials.save(directory, "another teacher", WORLD, 3, summary, pictures, MOMENTS)
+    teacher_trials.save(directory, summary | {"teacher": "another"}, pictures, MOMENTS)
     assert "trials" not in build_report(tmp_path)["teacher"]
 
 
