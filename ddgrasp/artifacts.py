@@ -265,15 +265,23 @@ def has_work(directory: Path | str) -> bool:
     return any(path != Path(STARTED) and not any(p.startswith(".") for p in path.parts) for path in files)
 
 
-def begin(directory: Path | str, stage: str, config: Config, inputs: Mapping[str, str] | None = None) -> None:
+def begin(
+    directory: Path | str,
+    stage: str,
+    config: Config,
+    inputs: Mapping[str, str] | None = None,
+    *,
+    write: bool = True,
+) -> None:
     """Marks `directory` as the place where `stage` is being made with this configuration and these inputs.
 
     UserError if an unfinished attempt there used others, or another contract version: its checkpoints would
-    not fit.
+    not fit. Without `write` it only looks: another process marks the place.
     """
     inputs = dict(inputs or {})
-    for litter in Path(directory).glob(f"{_TEMPORARY}*"):  # of an attempt that was killed mid-write
-        litter.unlink(missing_ok=True)
+    if write:
+        for litter in Path(directory).glob(f"{_TEMPORARY}*"):  # of an attempt that was killed mid-write
+            litter.unlink(missing_ok=True)
     path = Path(directory) / STARTED
     if path.exists() and has_work(directory):
         started = read_json(path)
@@ -288,7 +296,7 @@ def begin(directory: Path | str, stage: str, config: Config, inputs: Mapping[str
                 f"{directory} was begun with other inputs: {difference}. Use those, another --out, or delete "
                 "the directory."
             )
-    else:
+    elif write:
         value = {"contract_version": contract.CONTRACT_VERSION, "inputs": inputs, "config": config}
         atomic_write_json(path, value)
 

@@ -4,14 +4,14 @@ Stages are imported inside `run`, so that `--help` starts without JAX.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
 import tyro
 
 from ddgrasp import artifacts, contract, pipeline
-from ddgrasp.config import Config, WorldConfig
+from ddgrasp.config import Config, HostsConfig, WorldConfig
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.presets import get_preset
 
@@ -43,7 +43,9 @@ class Run(_FromPreset):
     def run(self) -> None:
         from evaluation.report import print_summary
 
-        report = pipeline.run(check_config_values(self.config), self.out, resume=self.resume)
+        check_config_values(self.config)
+        _check_devices(self.config, self.out)
+        report = pipeline.run(self.config, self.out, resume=self.resume)
         print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
         print_summary(report)
 
@@ -58,9 +60,21 @@ class _OneStage(_FromPreset):
 
 @dataclass(frozen=True)
 class TeacherTrain(_OneStage):
-    """Train the privileged teacher by PPO."""
+    """Train the privileged teacher by PPO, on every device there is, on one host or several."""
+
+    hosts: HostsConfig = field(default_factory=HostsConfig)
+    """Several hosts: start the same command on each, with an --out that all of them share."""
 
     stage = "teacher"
+
+    def run(self) -> None:
+        from ppo import hosts
+
+        hosts.connect(self.hosts)
+        check_config_values(self.config)
+        _check_devices(self.config, self.out)
+        stage = pipeline.get_stage(self.stage)
+        pipeline.run_stage(stage, self.config, self.out, resume=self.resume, leads=hosts.leads())
 
 
 @dataclass(frozen=True)
@@ -415,6 +429,14 @@ def check_objects(world: WorldConfig) -> None:
         raise UserError(f"world.objects is empty; expected at least one of {', '.join(OBJECTS)}.")
     for name in world.objects:
         get_object(name)
+
+
+def _check_devices(config: Config, run_dir: Path) -> None:
+    """UserError if the teacher, unless it is finished, cannot be trained on the devices present."""
+    if not artifacts.is_finished(run_dir / "teacher"):
+        from ppo.stage import check
+
+        check(config)
 
 
 def _check_start(stage: str, init_from: str, file: str) -> None:

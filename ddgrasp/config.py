@@ -157,6 +157,43 @@ class TeacherConfig:
             "teacher", self, "num_envs", "unroll_steps", "minibatches",
             "epochs", "eval_every", "checkpoint_every",
         )  # fmt: skip
+        if self.num_envs % self.minibatches:
+            raise UserError(
+                f"teacher.num_envs {self.num_envs} is no multiple of teacher.minibatches {self.minibatches}: "
+                "change one of them."
+            )
+
+
+@dataclass(frozen=True)
+class HostsConfig:
+    """Several processes, usually one per host, that train as one. Not part of a run's configuration: the same
+    run may go on with another number of them."""
+
+    coordinator: str = ""
+    """Address (host:port) of process 0, the same on every host; auto asks Slurm, Open MPI, Kubernetes or a
+    TPU pod, which name the processes too; empty for one process."""
+    processes: int = 1
+    """Number of processes."""
+    process: int = 0
+    """This process, from 0; 0 alone writes logs, policies and manifests."""
+
+    def __post_init__(self) -> None:
+        named = self.coordinator not in ("", "auto")
+        _check_counts("hosts", self, "processes")
+        if named and not (
+            self.coordinator.rpartition(":")[0] and self.coordinator.rpartition(":")[2].isdigit()
+        ):
+            raise UserError(f"hosts.coordinator is {self.coordinator!r}; expected host:port, or auto.")
+        if not named and (self.processes, self.process) != (1, 0):
+            raise UserError(
+                f"hosts.processes is {self.processes}, hosts.process {self.process}, hosts.coordinator "
+                f"{self.coordinator!r}: give the address (host:port) of process 0."
+            )
+        if not 0 <= self.process < self.processes:
+            raise UserError(
+                f"hosts.process is {self.process}; expected 0 to {self.processes - 1} (hosts.processes is "
+                f"{self.processes})."
+            )
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,14 @@ JOINT_VELOCITY_LIMIT_RAD_S = (2.1750, 2.1750, 2.1750, 2.1750, 2.6100, 2.6100, 2.
 JOINT_ACCELERATION_LIMIT_RAD_S2 = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
 GRIPPER_MAX_WIDTH_M = 0.08
 
-OBSERVATION_SIZE = 40
-"""Teacher: q 9, qd 9, hand pose 7, object pose 7, grasp pose 7, log category id 1.
-Poses are position (m) + unit quaternion (w, x, y, z) in the world frame (robot base)."""
+OBSERVATION_PARTS = {
+    "joint_position": 9, "joint_velocity": 9, "hand_pose": 7,
+    "object_pose": 7, "grasp_pose": 7, "category": 1,
+}  # fmt: skip
+"""Teacher's observation, in order. Poses are position (m) + unit quaternion (w, x, y, z) in the world frame
+(robot base); the category is the logarithm of its id."""
+OBSERVATION_SIZE = sum(OBSERVATION_PARTS.values())
+"""40."""
 STATE_SIZE = 8
 """Student: seven arm joint positions (rad) and the gripper's opening width (m)."""
 ACTION_SIZE = 8

@@ -73,15 +73,21 @@ def run(
     return importlib.import_module("evaluation.stage").write_report(run_dir)
 
 
-def run_stage(stage: Stage, config: Config, run_dir: Path, *, resume: bool, quiet: bool = False) -> Artifact:
-    """Runs one stage from its parents in `run_dir`, or returns the finished one if `resume` is on."""
+def run_stage(
+    stage: Stage, config: Config, run_dir: Path, *, resume: bool, quiet: bool = False, leads: bool = True
+) -> Artifact:
+    """Runs one stage from its parents in `run_dir`, or returns the finished one if `resume` is on.
+
+    `leads` is off in all but the first of several processes that make the stage together: they keep quiet and
+    write nothing.
+    """
     parents = {name: artifacts.require(run_dir, name, config) for name in stage.parents}
 
     def work(progress: Progress) -> Artifact:
         module = importlib.import_module(f"{stage.package}.stage")
         return module.run(config, run_dir, resume=resume, progress=progress)
 
-    artifact = make(stage, config, run_dir, work, resume=resume, quiet=quiet)
+    artifact = make(stage, config, run_dir, work, resume=resume, quiet=quiet, leads=leads)
     _check_parents(artifact, parents)
     return artifact
 
@@ -95,24 +101,25 @@ def make(
     resume: bool,
     quiet: bool = False,
     inputs: Mapping[str, str] | None = None,
+    leads: bool = True,
 ) -> Artifact:
     """Lets `work` make the stage's artefact in `run_dir / stage.name`, unless it is finished and `resume` on.
 
     `inputs` names what the artefact is made from besides the configuration and the run's other stages: an
-    attempt with other inputs is not continued.
+    attempt with other inputs is not continued. `leads`: see `run_stage`.
     """
     directory = run_dir / stage.name
     _create(directory)
     if not resume:
         _refuse_occupied(run_dir, [stage.name])
-    progress = Progress(directory, stage.name, quiet=quiet)
+    progress = Progress(directory if leads else None, stage.name, quiet=quiet or not leads)
     if artifacts.is_finished(directory):
         artifact = artifacts.read_artifact(directory)
         artifacts.check_config(artifact, config)
         progress.note(f"finished before ({artifact.manifest.seconds:.0f} s, {artifact.manifest.origin})")
         return artifact
     progress.note(f"-> {directory}: {stage.makes}")
-    artifacts.begin(directory, stage.name, config, inputs)
+    artifacts.begin(directory, stage.name, config, inputs, write=leads)
     with _interruptible(stage.name):
         try:
             artifact = work(progress)

@@ -9,13 +9,14 @@ from dataclasses import replace
 import jax
 import jax.numpy as jp
 from flax import struct
+from jax.sharding import Mesh
 from ml_collections import config_dict
 from mujoco import mjx
 from mujoco_playground._src import mjx_env
 
 from ddgrasp import contract
 from ddgrasp.config import WorldConfig
-from mjx_envs import grasp_math, kinematics, physics, randomize, rewards, scene
+from mjx_envs import devices, grasp_math, kinematics, physics, randomize, rewards, scene
 
 TOUCH_N = 0.3
 """Pad force from which a pad counts as touching the object."""
@@ -209,19 +210,20 @@ class GraspEnv(mjx_env.MjxEnv):
 
 
 class AutoReset:
-    """Batched environment: where an episode ended, a new one takes its place.
+    """Batched environment over `mesh` (by default all devices): where an episode ended, a new one starts.
 
     The reward, done, metrics and truncation of the ending step are kept. New episodes wait in
     `info["next"]`; call `refresh` at least once an episode, not every step: drawing them costs as
     much as stepping.
     """
 
-    def __init__(self, env: GraspEnv):
+    def __init__(self, env: GraspEnv, mesh: Mesh | None = None):
         self.env = env
+        self.mesh = mesh or devices.make_mesh()
 
     def reset(self, rng: jax.Array) -> mjx_env.State:
         """Batch of new episodes from keys (B, 2), at staggered times so that they do not end together."""
-        state = jax.vmap(self.env.reset)(rng)
+        state = devices.each(self.mesh, self.env.reset)(rng)
         episode = state.info["episode"]
         stagger = jp.arange(rng.shape[0]) % self.env.config.episode_steps
         info = state.info | {"episode": replace(episode, steps=stagger.astype(jp.int32))}
@@ -229,7 +231,7 @@ class AutoReset:
 
     def refresh(self, state: mjx_env.State) -> mjx_env.State:
         """Draw the batch's next episodes."""
-        fresh = jax.vmap(self.env.reset)(state.info["rng"])
+        fresh = devices.each(self.mesh, self.env.reset)(state.info["rng"])
         waiting = (fresh.data, fresh.obs, fresh.info["episode"])
         return replace(state, info=state.info | {"next": waiting, "rng": fresh.info["rng"]})
 
@@ -237,7 +239,7 @@ class AutoReset:
         """One control step of the batch with `action` (B, 8)."""
         waiting = state.info["next"]
         bare = {k: v for k, v in state.info.items() if k != "next"}
-        state = jax.vmap(self.env.step)(replace(state, info=bare), action)
+        state = devices.each(self.mesh, self.env.step)(replace(state, info=bare), action)
 
         def pick(new, old):
             return jp.where(state.done.reshape((-1,) + (1,) * (old.ndim - 1)) > 0, new, old)

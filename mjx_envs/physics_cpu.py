@@ -1,46 +1,55 @@
 """MuJoCo's C engine on all cores, called from jitted JAX code."""
 
+import os
+
 import jax
 import numpy as np
 from mujoco.batch import Batch
 
-from mjx_envs import scene
+from mjx_envs import devices, scene
 from mjx_envs.objects import SlotLayout
 from mjx_envs.physics import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
 
 
 class CpuPhysics:
-    """`mujoco.batch` behind `jax.pure_callback`: one host call steps the whole vmapped batch."""
+    """`mujoco.batch` behind `jax.pure_callback`: a host call steps a device's share of the batch."""
 
     def __init__(self, sim_dt_s: float, substeps: int, layout: SlotLayout):
         self._model = scene.build_model(sim_dt_s, layout)
         self._substeps = substeps
         self._index = ModelIndex(self._model)
-        self._batches: dict[int, _HostBatch] = {}
+        self._batches: dict[tuple[int, int], _HostBatch] = {}
 
     def step(self, params: ModelParams, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         """See `Physics.step`."""
         out = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
-        return jax.pure_callback(self._host_step, out, params, state, ctrl, vmap_method="broadcast_all")
+        args = (devices.shard_index(), params, state, ctrl)
+        return jax.pure_callback(self._host_step, out, *args, vmap_method="broadcast_all")
 
-    def _host_step(self, params: ModelParams, state: PhysicsState, ctrl) -> PhysicsState:
+    def _host_step(self, shard, params: ModelParams, state: PhysicsState, ctrl) -> PhysicsState:
         lead = np.shape(ctrl)[:-1]
         params, state, ctrl = jax.tree.map(
             lambda x: np.asarray(x).reshape((-1,) + np.shape(x)[len(lead) :]), (params, state, ctrl)
         )
-        n = ctrl.shape[0]
-        if n not in self._batches:
-            self._batches[n] = _HostBatch(self._model, self._index, n)
-        new = self._batches[n].step(params, state, ctrl, self._substeps)
+        # Devices call at the same time, and a batch remembers whose parameters it holds: one batch for each.
+        key = (int(np.ravel(shard)[0]), ctrl.shape[0])
+        if key not in self._batches:
+            self._batches[key] = _HostBatch(self._model, self._index, ctrl.shape[0], _threads())
+        new = self._batches[key].step(params, state, ctrl, self._substeps)
         return jax.tree.map(lambda x: x.reshape(lead + x.shape[1:]), new)
+
+
+def _threads() -> int:
+    """Threads of one batch, so that the devices of this host share its cores."""
+    return max(1, (os.cpu_count() or 1) // jax.local_device_count())
 
 
 class _HostBatch:
     """A `mujoco.batch.Batch` of a fixed number of environments."""
 
-    def __init__(self, model, index: ModelIndex, n: int):
+    def __init__(self, model, index: ModelIndex, n: int, threads: int):
         self._model, self._index = model, index
-        self._batch = Batch(model, nsim=n)
+        self._batch = Batch(model, nsim=n, nthread=threads)
         self._params: ModelParams | None = None
         self._expanded: dict[str, np.ndarray] = {}
         self._qpos = self._batch.bind("qpos")

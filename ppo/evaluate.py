@@ -1,46 +1,56 @@
-"""Deterministic evaluation of a teacher: whole episodes, counted per object."""
+"""Deterministic evaluation of a teacher: whole episodes on all devices, counted per object."""
 
 from functools import partial
 
 import jax
 import jax.numpy as jp
 import numpy as np
+from jax.sharding import Mesh
 
+from mjx_envs import devices
 from mjx_envs.grasp_env import GraspEnv
 from ppo.motion import motion_metrics
 from ppo.policy import TeacherPolicy
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _episodes(env: GraspEnv, count: int, layers, mean, std, key):
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _episodes(env: GraspEnv, mesh: Mesh, count: int, layers, mean, std, key):
+    """Success (N,), object index (N,) and motion (T, N, ...) of N episodes, whole on every device.
+
+    N is `count` up to the next multiple of the devices, which repeat the last episode.
+    """
     policy = TeacherPolicy(mean, std, layers)
-    state = jax.vmap(env.reset)(jax.random.split(key, count))
+    keys = jax.random.split(key, count)
+    surplus = -count % mesh.size
+    keys = jp.concatenate([keys, jp.tile(keys[-1:], (surplus, 1))]) if surplus else keys
+    state = devices.each(mesh, env.reset)(keys)
 
     def step(carry, _):
         state, alive, success = carry
         action = policy(state.obs, jp)
-        state = jax.vmap(env.step)(state, action)
+        state = devices.each(mesh, env.step)(state, action)
         success = jp.where(alive, state.metrics["success"], success)
         motion = (state.data.qvel[:, :7], action, alive)
         return (state, alive & (state.done == 0), success), motion
 
-    start = (state, jp.ones(count, bool), jp.zeros(count))
+    start = (state, jp.ones(len(keys), bool), jp.zeros(len(keys)))
     (state, _, success), motion = jax.lax.scan(step, start, None, env.config.episode_steps)
-    return success, state.info["episode"].object_index, motion
+    outcome = (success, state.info["episode"].object_index, motion)
+    return jax.lax.with_sharding_constraint(outcome, devices.replicated(mesh))
 
 
 def evaluate(env: GraspEnv, policy: TeacherPolicy, trials: int, seed: int) -> dict:
-    """Success and motion over `trials` episodes.
+    """Success and motion over `trials` episodes. Every process of `ppo.hosts` must call it.
 
     Returns:
       success {"successes", "n"}; objects {name: {"successes", "n"}}; saturated_actions; motion, a row
       {"object", ...} of `motion_metrics` for each object that came up, and one for all.
     """
-    success, index, motion = _episodes(
-        env, trials, policy.layers, policy.mean, policy.std, jax.random.PRNGKey(seed)
-    )
-    success, index = np.asarray(success) > 0, np.asarray(index)
-    motion = [np.asarray(part) for part in motion]
+    key = np.asarray(jax.random.PRNGKey(seed))
+    mesh = devices.make_mesh()
+    success, index, motion = _episodes(env, mesh, trials, policy.layers, policy.mean, policy.std, key)
+    success, index = np.asarray(success)[:trials] > 0, np.asarray(index)[:trials]
+    motion = [np.asarray(part)[:, :trials] for part in motion]
     chosen = {name: index == i for i, name in enumerate(env.table.names)} | {"all": index >= 0}
     rows = [
         {"object": name} | motion_metrics(*(part[:, which] for part in motion))

@@ -1,7 +1,9 @@
 """PPO as pure functions over one state: Brax's networks, losses and normaliser under our own loop.
 
 `iteration` collects one batch of experience and takes the gradient steps on it. The whole learner,
-environments included, is one pytree, so that a checkpoint of it resumes exactly.
+environments included, is one pytree, so that a checkpoint of it resumes exactly. It lies on a mesh of
+devices: environments and batches are shared out, parameters are everywhere, and the numbers drawn are the
+same on any number of devices.
 """
 
 import math
@@ -18,11 +20,14 @@ from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
 from flax import linen, struct
+from jax.sharding import Mesh
 
 from ddgrasp import contract
 from ddgrasp.config import TeacherConfig
 from ddgrasp.errors import UserError
+from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset
+from ppo import health
 
 # The pyright ignores below are for annotations of Brax and optax: Brax's dataclasses get their decorator
 # through `import flax`, which types do not follow; optax has no type for "any pytree".
@@ -42,6 +47,26 @@ class LearnerState:
     key: jax.Array
     iteration: jax.Array
     """() iterations done."""
+
+
+def check_divisible(config: TeacherConfig, device_count: int) -> None:
+    """UserError unless every minibatch can be shared out over so many devices."""
+    unit = config.minibatches * device_count
+    if config.num_envs % unit:
+        raise UserError(
+            f"teacher.num_envs {config.num_envs} in {config.minibatches} minibatches cannot be shared by "
+            f"{device_count} devices: make it a multiple of {unit}, change teacher.minibatches, or show JAX "
+            "fewer devices (CUDA_VISIBLE_DEVICES; on a CPU XLA_FLAGS or JAX_NUM_CPU_DEVICES)."
+        )
+
+
+def shardings(mesh: Mesh) -> LearnerState:
+    """Where each part of a learner lies on `mesh`: one sharding in the place of each field."""
+    everywhere: Any = devices.replicated(mesh)
+    return LearnerState(
+        params=everywhere, normalizer=everywhere, opt_state=everywhere,
+        env_state=devices.over_envs(mesh), key=everywhere, iteration=everywhere,
+    )  # fmt: skip
 
 
 def make_networks(config: TeacherConfig) -> ppo_networks.PPONetworks:
@@ -110,12 +135,12 @@ def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
 
 def warm_start(state: LearnerState, saved: dict) -> LearnerState:
     """`state` with the policy and normaliser of `ppo.policy.load_state`; the value network stays fresh."""
-    policy = jax.tree.map(jp.asarray, {"params": saved["layers"]})
+    policy = {"params": saved["layers"]}
     if jax.tree.map(jp.shape, policy) != jax.tree.map(jp.shape, state.params.policy):
         raise UserError(
             "The teacher of teacher.init_from has other layers than teacher.hidden asks for: use the same."
         )
-    normalizer = replace(state.normalizer, mean=jp.asarray(saved["mean"]), std=jp.asarray(saved["std"]))
+    normalizer = replace(state.normalizer, mean=saved["mean"], std=saved["std"])
     return with_policy(state, policy, normalizer)
 
 
@@ -128,14 +153,18 @@ def with_policy(
 
 def iteration(
     config: TeacherConfig, env: AutoReset, state: LearnerState
-) -> tuple[LearnerState, dict[str, jax.Array]]:
-    """One batch of experience and the gradient steps on it. Pure; jit with config and env static."""
+) -> tuple[LearnerState, dict[str, jax.Array], dict[str, jax.Array]]:
+    """One batch of experience and the gradient steps on it. Pure; jit with config and env static.
+
+    Returns the new state, scalars for the curves, and scalars for the NaN guard (`ppo.health.watch`).
+    """
     networks = make_networks(config)
     key = jax.random.fold_in(state.key, state.iteration)
     k_unroll, k_sgd = jax.random.split(key)
     env_state = env.refresh(state.env_state)
     policy = ppo_networks.make_inference_fn(networks)((state.normalizer, state.params.policy))
     env_state, data, outcome = _unroll(env, env_state, policy, k_unroll, config.unroll_steps)
+    data = jax.lax.with_sharding_constraint(data, devices.over_envs(env.mesh))
     normalizer = state.normalizer
     if not (
         config.clone_rounds or config.init_from
@@ -143,9 +172,10 @@ def iteration(
         normalizer = running_statistics.update(
             normalizer, data.observation, std_min_value=OBSERVATION_STD_MIN
         )
-    (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state)
+    (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state, env.mesh)
     new = LearnerState(params, normalizer, opt_state, env_state, state.key, state.iteration + 1)
-    return new, losses | outcome
+    metrics = losses | outcome
+    return new, metrics, health.watch(data.next_observation, data.action, metrics, new)
 
 
 def _unroll(env, env_state, policy, key, length):
@@ -164,8 +194,8 @@ def _unroll(env, env_state, policy, key, length):
     return env_state, jax.tree.map(lambda x: jp.swapaxes(x, 0, 1), data), outcome
 
 
-def _improve(config, networks, normalizer, data, key, state):
-    """`epochs` passes of minibatch gradient steps; new (params, opt_state) and mean loss terms."""
+def _improve(config, networks, normalizer, data, key, state, mesh):
+    """`epochs` passes of minibatch gradient steps; new (params, opt_state), mean loss terms and gradients."""
     optimizer = make_optimizer(config)
     loss_fn = partial(
         ppo_losses.compute_ppo_loss,
@@ -181,6 +211,7 @@ def _improve(config, networks, normalizer, data, key, state):
         params, opt_state = carry
         batch, k_loss = batch_and_key
         (_, terms), grads = jax.value_and_grad(loss_fn, has_aux=True)(params, normalizer, batch, k_loss)
+        terms |= {f"gradient/{name}": optax.global_norm(getattr(grads, name)) for name in ("policy", "value")}
         learns = state.iteration >= config.critic_warmup
         policy_grads = jax.tree.map(lambda g: jp.where(learns, g, 0.0), grads.policy)
         grads = network_params(policy_grads, grads.value)
@@ -192,9 +223,11 @@ def _improve(config, networks, normalizer, data, key, state):
         k_permute, k_loss = jax.random.split(k_epoch)
         order = jax.random.permutation(k_permute, config.num_envs).reshape(config.minibatches, -1)
         batches = jax.tree.map(lambda x: x[order], data)
+        batches = jax.lax.with_sharding_constraint(batches, devices.over_envs(mesh, axis=1))
         return jax.lax.scan(minibatch, carry, (batches, jax.random.split(k_loss, config.minibatches)))
 
     carry = (state.params, state.opt_state)
     carry, terms = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
-    keep = ("total_loss", "policy_loss", "v_loss", "entropy_loss")
-    return carry, {f"loss/{name}": jp.mean(terms[name]) for name in keep if name in terms}
+    names = {name: f"loss/{name}" for name in ("policy_loss", "v_loss", "entropy_loss", "total_loss")}
+    names |= {name: name for name in ("gradient/policy", "gradient/value")}
+    return carry, {shown: jp.mean(terms[name]) for name, shown in names.items()}

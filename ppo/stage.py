@@ -7,29 +7,47 @@ from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
-from mjx_envs.grasp_env import GraspEnv
+from mjx_envs import devices
+from mjx_envs.grasp_env import AutoReset, GraspEnv
+from ppo import hosts, learner, memory
 from ppo import policy as teacher_policy
 from ppo.evaluate import evaluate
-from ppo.train import train
+from ppo.train import train, training_world
 
 STAGE = "teacher"
 _TEST_SEED = 20_000
 
 
+def check(config: Config) -> None:
+    """UserError if the teacher cannot be trained on these devices; takes a second and changes nothing."""
+    if _loads(config):
+        return
+    mesh = devices.make_mesh()
+    learner.check_divisible(config.teacher, mesh.size)
+    memory.check(config, AutoReset(GraspEnv(training_world(config)), mesh))
+
+
 def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
-    """Trains a teacher (or loads one, `config.teacher.init_from`) and evaluates it."""
+    """Trains a teacher (or loads one, `config.teacher.init_from`) and evaluates it, in every process."""
     directory = run_dir / STAGE
     path = directory / teacher_policy.PARAMS_FILE
-    loads = bool(config.teacher.init_from) and config.teacher.total_steps == 0
-    if loads:
-        policy = teacher_policy.load(config.teacher.init_from)
+    hosts.wait_for_all("teacher begins")
+    if not _loads(config):
+        train(config, directory, progress)
+    elif hosts.leads():
         with artifacts.atomic_path(path) as temporary:
             shutil.copyfile(teacher_policy.find(config.teacher.init_from), temporary)
-    else:
-        train(config, directory, progress)
-        policy = teacher_policy.load(directory)
+    hosts.wait_for_all("teacher is written")
+    policy = teacher_policy.load(directory)
     metrics = evaluate(GraspEnv(config.world), policy, config.evaluation.teacher_trials, _TEST_SEED)
-    return artifacts.finish(
-        directory, STAGE, config, seconds=progress.seconds, metrics=metrics,
-        origin="loaded" if loads else "trained",
-    )  # fmt: skip
+    if hosts.leads():
+        artifacts.finish(
+            directory, STAGE, config, seconds=progress.seconds, metrics=metrics,
+            origin="loaded" if _loads(config) else "trained",
+        )  # fmt: skip
+    hosts.wait_for_all("teacher is finished")
+    return artifacts.read_artifact(directory)
+
+
+def _loads(config: Config) -> bool:
+    return bool(config.teacher.init_from) and config.teacher.total_steps == 0

@@ -1,19 +1,19 @@
 """Training loop: iterations, evaluations, checkpoints, curves."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import jax
-import numpy as np
 import orbax.checkpoint as ocp
 
 from ddgrasp import artifacts
 from ddgrasp.config import Config, WorldConfig
-from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
-from ppo import learner
+from ppo import health, hosts, learner, memory
 from ppo.evaluate import evaluate
 from ppo.policy import PARAMS_FILE, TeacherPolicy, from_learner, load_state, save
 from ppo.warmup import clone_guide
@@ -26,47 +26,80 @@ _EVAL_SEED = 10_000
 
 
 def train(config: Config, directory: Path, progress: Progress) -> learner.LearnerState:
-    """Trains in `directory`, going on from its newest checkpoint if it has one.
+    """Trains in `directory` on all devices of all processes, from its newest checkpoint if there is one.
 
     Leaves the policy that did best in an evaluation in `ppo.policy.PARAMS_FILE`, or the last one if there
-    was no evaluation.
+    was no evaluation. Every process of `ppo.hosts` calls this, with the same directory. Raises UserError if
+    the batch cannot be shared out over the devices, does not fit in memory, or training diverges.
     """
-    teacher = config.teacher
-    _check(config)
-    env = AutoReset(GraspEnv(training_world(config)))
-    test_env = GraspEnv(config.world)
-    iterate = jax.jit(partial(learner.iteration, teacher, env), donate_argnums=0)
-    total = learner.iterations(teacher)
+    mesh = devices.make_mesh()
+    learner.check_divisible(config.teacher, mesh.size)
     options = ocp.CheckpointManagerOptions(max_to_keep=_KEPT, enable_async_checkpointing=False)
-    with ocp.CheckpointManager((directory / CHECKPOINTS).absolute(), options=options) as manager:
-        state = _start(config, env, manager, progress)
-        good_evaluations = 0
-        best = _Best(directory)
-        if int(state.iteration) == 0:
-            best.offer(_evaluate(test_env, state, config, 0, progress), state)
-        with progress.task("PPO", total) as task:
-            task.start_at(int(state.iteration))
-            for i in range(int(state.iteration) + 1, total + 1):
-                state, metrics = iterate(state)
-                if i % LOG_EVERY == 0 or i == total:
-                    _log(i, metrics, progress, task)
-                task.advance()
-                if i % teacher.eval_every == 0:
-                    rate = _evaluate(test_env, state, config, i, progress)
-                    best.offer(rate, state)
-                    good_evaluations = good_evaluations + 1 if rate >= teacher.stop_at else 0
-                if i % teacher.checkpoint_every == 0 or i == total:
-                    manager.save(i, args=ocp.args.StandardSave(state), force=True)
-                    manager.wait_until_finished()
-                if good_evaluations >= 2:
-                    progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
-                    break
-        best.offer(0.0, state)
+    path = (directory / CHECKPOINTS).absolute()
+    with memory.explained(config), ocp.CheckpointManager(path, options=options) as manager:
+        return _train(config, directory, AutoReset(GraspEnv(training_world(config)), mesh), manager, progress)
+
+
+def _train(
+    config: Config, directory: Path, env: AutoReset, manager: ocp.CheckpointManager, progress: Progress
+) -> learner.LearnerState:
+    teacher = config.teacher
+    test_env = GraspEnv(config.world)
+    total = learner.iterations(teacher)
+    iterate = compile_iteration(config, env)
+    state = _start(config, env, manager, progress)
+    good_evaluations = 0
+    best = _Best(directory)
+    if int(state.iteration) == 0:
+        best.offer(_evaluate(test_env, state, config, 0, progress), state)
+    with progress.task("PPO", total) as task:
+        task.start_at(int(state.iteration))
+        for i in range(int(state.iteration) + 1, total + 1):
+            state, metrics, watched = iterate(state)
+            health.check(i, watched, manager.latest_step(), directory)
+            if i % LOG_EVERY == 0 or i == total:
+                _log(i, metrics, progress, task)
+            task.advance()
+            if i % teacher.eval_every == 0:
+                rate = _evaluate(test_env, state, config, i, progress)
+                best.offer(rate, state)
+                good_evaluations = good_evaluations + 1 if rate >= teacher.stop_at else 0
+            if i % teacher.checkpoint_every == 0 or i == total:
+                _save(manager, i, state)
+            if good_evaluations >= 2:
+                progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
+                break
+    best.offer(0.0, state)
     return state
 
 
+def initial(config: Config, env: AutoReset) -> Callable[[], learner.LearnerState]:
+    """A function without arguments that makes a fresh learner on the mesh of `env`."""
+    key = jax.device_get(jax.random.PRNGKey(config.seed))
+    places = learner.shardings(env.mesh)
+    return partial(jax.jit(partial(learner.init, config.teacher, env), out_shardings=places), key)
+
+
+def compile_iteration(config: Config, env: AutoReset) -> jax.stages.Compiled:
+    """`learner.iteration` on the mesh of `env`; UserError if what it needs is more than the memory there is.
+
+    Compiled before anything else is done, so that a batch that does not fit is refused at once.
+    """
+    places = learner.shardings(env.mesh)
+    everywhere = devices.replicated(env.mesh)
+    jitted = jax.jit(
+        partial(learner.iteration, config.teacher, env),
+        in_shardings=(places,),
+        out_shardings=(places, everywhere, everywhere),
+        donate_argnums=0,
+    )
+    compiled = jitted.lower(jax.eval_shape(initial(config, env))).compile()
+    memory.check_compiled(config, env, compiled)
+    return compiled
+
+
 class _Best:
-    """Keeps the policy of the best evaluation on disk; the later one of equals."""
+    """Keeps the policy of the best evaluation on disk, in the leading process; the later one of equals."""
 
     def __init__(self, directory: Path):
         self._directory = directory
@@ -75,7 +108,7 @@ class _Best:
             self._rate = float(artifacts.read_json(directory / BEST_RATE))
 
     def offer(self, rate: float, state: learner.LearnerState) -> None:
-        if rate >= self._rate:
+        if rate >= self._rate and hosts.leads():
             self._rate = rate
             save(self._directory / PARAMS_FILE, state.normalizer, state.params.policy)
             artifacts.atomic_write_json(self._directory / BEST_RATE, rate)
@@ -92,36 +125,38 @@ def policy_of(state: learner.LearnerState) -> TeacherPolicy:
     return from_learner(state.normalizer, state.params.policy)
 
 
-def _check(config: Config) -> None:
-    if config.teacher.num_envs % config.teacher.minibatches:
-        raise UserError(
-            f"teacher.num_envs {config.teacher.num_envs} is no multiple of teacher.minibatches "
-            f"{config.teacher.minibatches}: change one of them."
-        )
-
-
 def _start(
     config: Config, env: AutoReset, manager: ocp.CheckpointManager, progress: Progress
 ) -> learner.LearnerState:
-    state = jax.jit(partial(learner.init, config.teacher, env))(jax.random.PRNGKey(config.seed))
-    if manager.latest_step() is None:
-        if config.teacher.init_from:
-            return learner.warm_start(state, load_state(config.teacher.init_from))
-        if config.teacher.clone_rounds:
-            state = clone_guide(config.teacher, GraspEnv(config.world), state, config.seed, progress)
-            manager.save(0, args=ocp.args.StandardSave(state), force=True)
-            manager.wait_until_finished()
-        return state
-    restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore(state))
-    assert isinstance(restored, learner.LearnerState)
-    return restored
+    """The newest checkpoint, whatever number of devices made it; else a fresh learner."""
+    fresh, places = initial(config, env), learner.shardings(env.mesh)
+    if (step := manager.latest_step()) is not None:
+        shapes = jax.eval_shape(fresh)
+        target = jax.tree.map(
+            lambda x, place: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place),
+            shapes,
+            jax.tree.broadcast(places, shapes),
+        )
+        restored = manager.restore(step, args=ocp.args.StandardRestore(target))
+        assert isinstance(restored, learner.LearnerState)
+        return restored
+    state = fresh()
+    if config.teacher.init_from:
+        return jax.device_put(learner.warm_start(state, load_state(config.teacher.init_from)), places)
+    if config.teacher.clone_rounds:
+        cloned = clone_guide(config.teacher, GraspEnv(config.world), state, config.seed, progress)
+        state = jax.device_put(learner.with_policy(state, *hosts.from_leader(cloned)), places)
+        _save(manager, 0, state)
+    return state
+
+
+def _save(manager: ocp.CheckpointManager, i: int, state: learner.LearnerState) -> None:
+    manager.save(i, args=ocp.args.StandardSave(state), force=True)
+    manager.wait_until_finished()
 
 
 def _log(i: int, metrics, progress: Progress, task) -> None:
     values = {name: float(value) for name, value in metrics.items()}
-    for name, value in values.items():
-        if not np.isfinite(value):
-            raise UserError(f"PPO diverged at iteration {i}: {name} is {value}. Lower teacher.learning_rate.")
     progress.scalars(i, **values)
     task.advance(0, success=values["success"])
 

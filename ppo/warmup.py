@@ -1,6 +1,7 @@
 """Clones the guide into the policy network by DAgger (Ross et al. 2011), before PPO starts."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jp
@@ -24,9 +25,14 @@ _SEED = 60_000
 
 def clone_guide(
     config: TeacherConfig, env: GraspEnv, state: learner.LearnerState, seed: int, progress: Progress
-) -> learner.LearnerState:
-    """`state` with the guide's policy and its observations' statistics; critic and environments stay."""
-    policy, normalizer = state.params.policy, state.normalizer
+) -> tuple[Any, running_statistics.RunningStatisticsState]:
+    """The guide's policy in the networks of `state`, and its observations' statistics.
+
+    On one device of this process: the batches are small.
+    """
+    policy, normalizer = jax.tree.map(
+        lambda x: jp.asarray(np.asarray(x)), (state.params.policy, state.normalizer)
+    )
     optimizer = optax.adam(
         optax.cosine_decay_schedule(LEARNING_RATE, config.clone_rounds * config.clone_steps)
     )
@@ -50,7 +56,7 @@ def clone_guide(
             policy, opt_state, loss = fit(normalizer, policy, opt_state, everything[index], wanted[index])
             progress.scalars(i, clone_loss=float(loss))
             task.advance(loss=float(loss))
-    return learner.with_policy(state, policy, normalizer)
+    return policy, normalizer
 
 
 class _Collector:
