@@ -14,6 +14,7 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jp
+import numpy as np
 import optax
 from brax.training import acting, distribution
 from brax.training.acme import running_statistics, specs
@@ -47,6 +48,8 @@ class LearnerState:
     key: jax.Array
     iteration: jax.Array
     """() iterations done."""
+    good_evaluations: jax.Array
+    """() evaluations in a row, up to the last, that reached `stop_at`."""
 
 
 def check_divisible(config: TeacherConfig, device_count: int) -> None:
@@ -65,7 +68,7 @@ def shardings(mesh: Mesh) -> LearnerState:
     everywhere: Any = devices.replicated(mesh)
     return LearnerState(
         params=everywhere, normalizer=everywhere, opt_state=everywhere,
-        env_state=devices.over_envs(mesh), key=everywhere, iteration=everywhere,
+        env_state=devices.over_envs(mesh), key=everywhere, iteration=everywhere, good_evaluations=everywhere,
     )  # fmt: skip
 
 
@@ -130,6 +133,7 @@ def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
         env_state=env.reset(jax.random.split(k_env, config.num_envs)),
         key=k_next,
         iteration=jp.zeros((), jp.int32),
+        good_evaluations=jp.zeros((), jp.int32),
     )
 
 
@@ -149,6 +153,13 @@ def with_policy(
 ) -> LearnerState:
     """`state` with another policy and its normaliser; value network, optimiser and environments stay."""
     return replace(state, params=network_params(policy, state.params.value), normalizer=normalizer)
+
+
+def with_evaluation(state: LearnerState, good: bool) -> LearnerState:
+    """`state` after an evaluation that reached `stop_at`, or did not."""
+    count = int(state.good_evaluations) + 1 if good else 0
+    count = jax.device_put(np.int32(count), state.good_evaluations.sharding)
+    return replace(state, good_evaluations=count)
 
 
 def iteration(
@@ -173,7 +184,10 @@ def iteration(
             normalizer, data.observation, std_min_value=OBSERVATION_STD_MIN
         )
     (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state, env.mesh)
-    new = LearnerState(params, normalizer, opt_state, env_state, state.key, state.iteration + 1)
+    new = replace(
+        state, params=params, normalizer=normalizer, opt_state=opt_state, env_state=env_state,
+        iteration=state.iteration + 1,
+    )  # fmt: skip
     metrics = losses | outcome
     return new, metrics, health.watch(data.next_observation, data.action, metrics, new)
 

@@ -48,7 +48,6 @@ def _train(
     total = learner.iterations(teacher)
     iterate = compile_iteration(config, env)
     state = _start(config, env, manager, progress)
-    good_evaluations = 0
     best = _Best(directory)
     if int(state.iteration) == 0:
         best.offer(_evaluate(test_env, state, config, 0, progress), state)
@@ -63,10 +62,10 @@ def _train(
             if i % teacher.eval_every == 0:
                 rate = _evaluate(test_env, state, config, i, progress)
                 best.offer(rate, state)
-                good_evaluations = good_evaluations + 1 if rate >= teacher.stop_at else 0
+                state = learner.with_evaluation(state, rate >= teacher.stop_at)
             if i % teacher.checkpoint_every == 0 or i == total:
                 _save(manager, i, state)
-            if good_evaluations >= 2:
+            if int(state.good_evaluations) >= 2:
                 progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
                 break
     best.offer(0.0, state)
@@ -96,6 +95,19 @@ def compile_iteration(config: Config, env: AutoReset) -> jax.stages.Compiled:
     compiled = jitted.lower(jax.eval_shape(initial(config, env))).compile()
     memory.check_compiled(config, env, compiled)
     return compiled
+
+
+def restore(config: Config, env: AutoReset, manager: ocp.CheckpointManager) -> learner.LearnerState:
+    """The newest checkpoint, laid on the mesh of `env`; it may have been made on another."""
+    shapes = jax.eval_shape(initial(config, env))
+    target = jax.tree.map(
+        lambda x, place: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place),
+        shapes,
+        jax.tree.broadcast(learner.shardings(env.mesh), shapes),
+    )
+    restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore(target))
+    assert isinstance(restored, learner.LearnerState)
+    return restored
 
 
 class _Best:
@@ -128,19 +140,10 @@ def policy_of(state: learner.LearnerState) -> TeacherPolicy:
 def _start(
     config: Config, env: AutoReset, manager: ocp.CheckpointManager, progress: Progress
 ) -> learner.LearnerState:
-    """The newest checkpoint, whatever number of devices made it; else a fresh learner."""
-    fresh, places = initial(config, env), learner.shardings(env.mesh)
-    if (step := manager.latest_step()) is not None:
-        shapes = jax.eval_shape(fresh)
-        target = jax.tree.map(
-            lambda x, place: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place),
-            shapes,
-            jax.tree.broadcast(places, shapes),
-        )
-        restored = manager.restore(step, args=ocp.args.StandardRestore(target))
-        assert isinstance(restored, learner.LearnerState)
-        return restored
-    state = fresh()
+    """The newest checkpoint; else a fresh learner, with the guide cloned if asked for."""
+    if manager.latest_step() is not None:
+        return restore(config, env, manager)
+    state, places = initial(config, env)(), learner.shardings(env.mesh)
     if config.teacher.init_from:
         return jax.device_put(learner.warm_start(state, load_state(config.teacher.init_from)), places)
     if config.teacher.clone_rounds:

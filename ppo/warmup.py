@@ -10,6 +10,7 @@ import optax
 from brax.training.acme import running_statistics
 
 from ddgrasp.config import TeacherConfig
+from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import GraspEnv
 from ppo import learner
@@ -54,6 +55,11 @@ def clone_guide(
             everything, wanted = np.concatenate(observations), np.concatenate(labels)
             index = rng.integers(0, len(everything), (config.clone_steps, BATCH))
             policy, opt_state, loss = fit(normalizer, policy, opt_state, everything[index], wanted[index])
+            if not np.isfinite(loss):
+                raise UserError(
+                    f"Cloning the guide diverged in round {i}: clone_loss is {float(loss)}. Check "
+                    "world.random and world.sim_dt_s."
+                )
             progress.scalars(i, clone_loss=float(loss))
             task.advance(loss=float(loss))
     return policy, normalizer

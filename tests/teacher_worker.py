@@ -1,9 +1,7 @@
-"""Trains a tiny teacher in a process of its own, on the devices that its environment gives it.
+"""A tiny teacher trained in a process of its own, and how tests read what processes left behind.
 
-    python teacher_worker.py DIRECTORY
-
-Leaves the whole learner by name in DIRECTORY/state.npz, and in DIRECTORY/report.json how it lay on the
-devices and what was measured.
+`python teacher_worker.py DIRECTORY` trains TINY on the devices that its environment gives it. It leaves the
+whole learner by name in DIRECTORY/state.npz, and in DIRECTORY/report.json how it lay on the devices.
 """
 
 import json
@@ -12,23 +10,32 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import orbax.checkpoint as ocp
 
-from ddgrasp.config import Config, TeacherConfig, WorldConfig
+from ddgrasp import commands
+from ddgrasp.config import Config
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import learner
 from ppo import train as ppo_train
 from ppo.evaluate import evaluate
 
-TEACHER = TeacherConfig(
-    total_steps=4 * 16 * 4, num_envs=16, unroll_steps=4, minibatches=2, epochs=2, hidden=(16,),
-    eval_every=100, checkpoint_every=2, pregrasp_share=0.0, clone_rounds=0, critic_warmup=0, learning_rate=1e-3,
+ITERATIONS = 12
+TINY = (
+    "--preset", "debug", "--teacher.init-from", "", "--teacher.clone-rounds", "0",
+    "--teacher.total-steps", str(16 * 4 * ITERATIONS), "--teacher.num-envs", "16",
+    "--teacher.unroll-steps", "4", "--teacher.hidden", "16", "--teacher.learning-rate", "1e-3",
+    "--teacher.pregrasp-share", "0", "--teacher.eval-every", "100", "--world.episode-steps", "6",
+    "--evaluation.teacher-trials", "12",
 )  # fmt: skip
-CONFIG = Config("test", world=WorldConfig(episode_steps=6), teacher=TEACHER)
-TRIALS = 12
-"""No multiple of eight."""
+"""Options of `ddgrasp teacher train`: 16 environments in 2 minibatches; 12 trials are no multiple of 8."""
 
 
-def leaves(state) -> dict[str, np.ndarray]:
+def config() -> Config:
+    """What TINY says."""
+    return getattr(commands.parse("teacher train", TINY), "config")  # noqa: B009
+
+
+def leaves(state: learner.LearnerState) -> dict[str, np.ndarray]:
     """Every array of a learner by name."""
     return {
         jax.tree_util.keystr(path): np.asarray(leaf)
@@ -36,20 +43,28 @@ def leaves(state) -> dict[str, np.ndarray]:
     }
 
 
+def saved(run_dir: Path) -> dict[str, np.ndarray]:
+    """The newest checkpoint of a run of TINY, whatever devices made it."""
+    env = AutoReset(GraspEnv(ppo_train.training_world(config())))
+    with ocp.CheckpointManager((run_dir / "teacher" / ppo_train.CHECKPOINTS).absolute()) as manager:
+        return leaves(ppo_train.restore(config(), env, manager))
+
+
 def main(directory: Path) -> None:
-    """Trains, evaluates, saves, prints."""
-    env = AutoReset(GraspEnv(ppo_train.training_world(CONFIG)))
-    iterate = ppo_train.compile_iteration(CONFIG, env)
-    state = ppo_train.initial(CONFIG, env)()
-    for _ in range(learner.iterations(TEACHER)):
-        state, metrics, _ = iterate(state)
-    result = evaluate(GraspEnv(CONFIG.world), ppo_train.policy_of(state), TRIALS, seed=5)
-    np.savez(directory / "state.npz", **leaves(state))
+    """Trains, evaluates, saves."""
+    env = AutoReset(GraspEnv(ppo_train.training_world(config())))
+    iterate = ppo_train.compile_iteration(config(), env)
+    state = ppo_train.initial(config(), env)()
+    for _ in range(ITERATIONS):
+        state, _, _ = iterate(state)
+    np.savez(directory / "state.npz", **leaves(state))  # pyright: ignore[reportArgumentType]
     shares = {leaf.sharding.shard_shape(leaf.shape)[0] for leaf in jax.tree.leaves(state.env_state)}
     report = {
-        "devices": jax.device_count(), "shares": sorted(shares), "batches": sorted(env.env.physics._batches),
-        "metrics": {name: float(value) for name, value in metrics.items()}, "evaluation": result,
-    }  # fmt: skip
+        "devices": jax.device_count(),
+        "shares": sorted(shares),
+        "batches": sorted(env.env.physics._batches),  # pyright: ignore[reportAttributeAccessIssue]
+        "evaluation": evaluate(GraspEnv(config().world), ppo_train.policy_of(state), 12, seed=20_000),
+    }
     (directory / "report.json").write_text(json.dumps(report))
 
 

@@ -1,0 +1,146 @@
+"""One teacher on one device, on eight, on two processes, killed and resumed: the same learner each time."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import teacher_worker as worker
+from ddgrasp.config import HostsConfig
+from ddgrasp.errors import UserError
+from ppo import learner
+
+ROOT = Path(__file__).parents[1]
+TIMEOUT_S = 600.0
+RELATIVE, ABSOLUTE = 1e-3, 1e-4
+"""Between numbers of devices: sums are taken in another order, and contacts amplify the last digit."""
+
+
+def _start(*command: str, devices: int = 1) -> subprocess.Popen:
+    """`command` on so many CPU devices; compiled with few optimisations, since compiling is what costs."""
+    env = os.environ | {
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "JAX_PLATFORMS": "cpu",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+        "PYTHONPATH": str(ROOT),
+    }
+    return subprocess.Popen(
+        [sys.executable, *command],
+        cwd=ROOT,
+        env=env,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+def _train(out: Path, *options: str, devices: int = 1) -> subprocess.Popen:
+    options = (*worker.TINY, "--out", str(out), *options)
+    return _start("-m", "ddgrasp.cli", "teacher", "train", *options, devices=devices)
+
+
+def _succeed(*processes: subprocess.Popen) -> None:
+    for process in processes:
+        _, errors = process.communicate(timeout=TIMEOUT_S)
+        assert process.returncode == 0, errors[-3000:]
+
+
+def _close(here: dict[str, np.ndarray], there: dict[str, np.ndarray]) -> None:
+    assert here.keys() == there.keys()
+    for name, value in here.items():
+        np.testing.assert_allclose(value, there[name], rtol=RELATIVE, atol=ABSOLUTE, err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory):
+    """Run directory of an uninterrupted run on one device."""
+    out = tmp_path_factory.mktemp("one") / "run"
+    _succeed(_train(out))
+    return out
+
+
+def test_eight_devices_train_what_one_trains(one, tmp_path):
+    _succeed(_start(str(Path(worker.__file__)), str(tmp_path), devices=8))
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["devices"] == 8
+    assert report["shares"] == [2]  # of 16 environments: nothing is gathered between iterations
+    assert report["batches"] == [[device, 2] for device in range(8)]  # each device stepped its own two
+    _close(dict(np.load(tmp_path / "state.npz")), worker.saved(one))
+    manifest = json.loads((one / "teacher" / "manifest.json").read_text())
+    assert report["evaluation"]["objects"] == manifest["metrics"]["objects"]
+
+
+def test_two_processes_train_what_one_trains(one, tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    hosts = ("--hosts.coordinator", address, "--hosts.processes", "2", "--hosts.process")
+    out = tmp_path / "run"
+    _succeed(*[_train(out, *hosts, str(process)) for process in range(2)])
+    _close(worker.saved(out), worker.saved(one))
+    curves = (out / "teacher" / "curves.jsonl").read_text().splitlines()
+    assert len(curves) == len((one / "teacher" / "curves.jsonl").read_text().splitlines())
+
+
+def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(one, tmp_path):
+    out = tmp_path / "run"
+    killed = _train(out)
+    deadline = time.monotonic() + TIMEOUT_S
+    while not _steps(out) and killed.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    assert killed.returncode == -signal.SIGKILL
+    assert 0 < max(_steps(out)) < worker.ITERATIONS
+    _succeed(_train(out, "--resume"))
+    whole, resumed = worker.saved(one), worker.saved(out)
+    assert whole["." + "iteration"] == worker.ITERATIONS
+    assert whole.keys() == resumed.keys()
+    for name, value in whole.items():
+        np.testing.assert_array_equal(value, resumed[name], err_msg=name)
+
+
+def _steps(out: Path) -> list[int]:
+    folder = out / "teacher" / "checkpoints"
+    return [int(path.name) for path in folder.glob("*") if path.name.isdigit()]
+
+
+def test_a_batch_that_devices_cannot_share_is_refused_in_one_line(tmp_path):
+    process = _train(tmp_path / "run", devices=5)
+    _, errors = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 2
+    assert errors.count("\n") == 1
+    assert (
+        "teacher.num_envs 16 in 2 minibatches cannot be shared by 5 devices: make it a multiple of 10"
+        in errors
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_minibatches_must_be_whole_on_every_device():
+    config = worker.config().teacher
+    learner.check_divisible(config, 8)
+    with pytest.raises(UserError, match="by 16 devices: make it a multiple of 32"):
+        learner.check_divisible(config, 16)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"coordinator": "host"}, "hosts.coordinator is 'host'; expected host:port, or auto"),
+        ({"processes": 2}, "hosts.processes is 2, hosts.process 0, hosts.coordinator '': give the address"),
+        ({"coordinator": "a:1", "processes": 0}, "hosts.processes is 0; expected at least 1"),
+        ({"coordinator": "a:1", "processes": 2, "process": 2}, "hosts.process is 2; expected 0 to 1"),
+    ],
+)
+def test_mistaken_hosts_are_named(values, expected):
+    with pytest.raises(UserError, match=expected):
+        HostsConfig(**values)

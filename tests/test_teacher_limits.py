@@ -1,0 +1,110 @@
+"""What stops a teacher: numbers that are not finite, named by term, and batches larger than the memory."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jp
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+
+from ddgrasp.config import Config, EvalConfig, RewardConfig, TeacherConfig, WorldConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from mjx_envs.grasp_env import AutoReset, GraspEnv
+from ppo import health, memory, stage
+from ppo import train as ppo_train
+
+TEACHER = TeacherConfig(
+    total_steps=6 * 8 * 2, num_envs=8, unroll_steps=2, minibatches=2, epochs=1, hidden=(16,), eval_every=100,
+    checkpoint_every=1, pregrasp_share=0.0, clone_rounds=0, critic_warmup=0,
+)  # fmt: skip
+CONFIG = Config(
+    "test", world=WorldConfig(episode_steps=3), teacher=TEACHER, evaluation=EvalConfig(teacher_trials=2)
+)
+
+
+@pytest.fixture(autouse=True)
+def compiles_quickly():
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def _checkpoints(directory) -> ocp.CheckpointManager:
+    return ocp.CheckpointManager((directory / ppo_train.CHECKPOINTS).absolute())
+
+
+def test_an_absurd_learning_rate_stops_before_the_broken_state_is_saved(tmp_path):
+    teacher = dataclasses.replace(
+        TEACHER, learning_rate=1e30, critic_warmup=2
+    )  # the policy learns from the third
+    config = dataclasses.replace(CONFIG, teacher=teacher)
+    with pytest.raises(UserError, match="iteration 3: (loss|gradient|action)") as error:
+        ppo_train.train(config, tmp_path, Progress(quiet=True))
+    message = str(error.value)
+    assert "\n" not in message
+    assert "The checkpoint of iteration 2 is sound: --resume" in message
+    assert "lower teacher.learning_rate" in message
+    env = AutoReset(GraspEnv(ppo_train.training_world(config)))
+    with _checkpoints(tmp_path) as manager:
+        assert manager.latest_step() == 2
+        kept = ppo_train.restore(config, env, manager)
+    for leaf in jax.tree.leaves(kept):
+        assert np.all(np.isfinite(np.asarray(leaf)))
+
+
+def test_a_reward_beyond_all_numbers_is_named_and_nothing_is_saved(tmp_path):
+    world = dataclasses.replace(CONFIG.world, reward=RewardConfig(accel=3e38))
+    with pytest.raises(
+        UserError, match=r"iteration 1: reward/accel is -inf\. Nothing was saved yet"
+    ) as error:
+        ppo_train.train(dataclasses.replace(CONFIG, world=world), tmp_path, Progress(quiet=True))
+    assert "lower the weight of that term under world.reward" in str(error.value)
+    with _checkpoints(tmp_path) as manager:
+        assert manager.latest_step() is None
+
+
+def test_the_cause_is_named_before_what_it_spoils():
+    spoilt = {name: jp.float32(np.nan) for name in ("state/params", "gradient/policy", "loss/v_loss")}
+    with pytest.raises(UserError, match="iteration 7: loss/v_loss is nan"):
+        health.check(7, spoilt | {"reward/lift": jp.float32(1.0)}, 5, "runs/x")
+    with pytest.raises(UserError, match="reward/lift is inf"):
+        health.check(7, spoilt | {"reward/lift": jp.float32(np.inf)}, 5, "runs/x")
+
+
+def test_every_part_of_the_observation_is_watched():
+    for index, part in ((0, "joint_position"), (17, "joint_velocity"), (24, "hand_pose"), (39, "category")):
+        observation = jp.zeros((3, 40)).at[1, index].set(jp.nan)
+        watched = health.watch(observation, jp.zeros((3, 8)), {}, SimpleNamespace())
+        assert [name for name, x in watched.items() if not np.isfinite(x)] == [f"observation/{part}"]
+
+
+def test_more_environments_than_memory_are_refused_with_the_size():
+    teacher = dataclasses.replace(TEACHER, num_envs=2**30)
+    with pytest.raises(
+        UserError, match=r"num_envs 1073741824 needs about \d+\.\d GB .* lower teacher.num_envs"
+    ):
+        stage.check(dataclasses.replace(CONFIG, teacher=teacher))
+
+
+def test_a_program_larger_than_memory_is_refused_before_it_runs():
+    env = AutoReset(GraspEnv(CONFIG.world))
+    small, large = (jax.jit(lambda n=n: jp.zeros((n, 2**20))).lower().compile() for n in (1, 2**25))
+    memory.check_compiled(CONFIG, env, small)
+    with pytest.raises(UserError, match=r"needs about 1407\d\d\.\d GB"):  # 2^45 floats
+        memory.check_compiled(CONFIG, env, large)
+
+
+@pytest.mark.parametrize("library", [np, jp])
+def test_memory_that_ran_out_is_told_in_one_line(library):
+    with pytest.raises(UserError, match="num_envs 8 does not fit in memory") as error:
+        with memory.explained(CONFIG):
+            np.asarray(library.ones(2**47))
+    assert "\n" not in str(error.value)
+
+
+def test_other_errors_pass():
+    with pytest.raises(ValueError, match="something else"), memory.explained(CONFIG):
+        raise ValueError("something else")
