@@ -1,5 +1,8 @@
 """Several processes that train as one, through JAX's own runtime. One process is the case of one."""
 
+import socket
+import sys
+import time
 from typing import Any
 
 import jax
@@ -10,26 +13,27 @@ from ddgrasp.config import HostsConfig
 from ddgrasp.errors import UserError
 
 CONNECT_TIMEOUT_S = 120
+_RETRY_S = 0.2
 
 
 def connect(hosts: HostsConfig) -> None:
     """Joins the other processes, before anything asks JAX for its devices; UserError if they do not come."""
-    if not hosts.coordinator:
-        return
-    named = {
-        "coordinator_address": hosts.coordinator,
-        "num_processes": hosts.processes,
-        "process_id": hosts.process,
-    }
-    arguments: dict[str, Any] = {} if hosts.coordinator == "auto" else named
-    try:
-        jax.distributed.initialize(**arguments, initialization_timeout=CONNECT_TIMEOUT_S)
-    except (RuntimeError, ValueError) as error:
-        raise UserError(
-            f"hosts.coordinator {hosts.coordinator!r}: no connection as process {hosts.process} of "
-            f"{hosts.processes} within {CONNECT_TIMEOUT_S} s ({str(error).splitlines()[0]}). Start all of "
-            "them, with the same address."
-        ) from None
+    if hosts.coordinator == "auto":
+        _initialize("no cluster answers for it: give host:port, hosts.processes and hosts.process")
+    elif hosts.coordinator:
+        who = f"process {hosts.process} of {hosts.processes}"
+        print(
+            f"{who}: waiting for the others at {hosts.coordinator}, {CONNECT_TIMEOUT_S} s at most",
+            file=sys.stderr,
+        )
+        if hosts.process > 0:  # JAX aborts the whole process when nobody answers
+            _wait_until_it_listens(hosts.coordinator)
+        _initialize(
+            f"{who} cannot use it: start every process with the address of process 0",
+            coordinator_address=hosts.coordinator,
+            num_processes=hosts.processes,
+            process_id=hosts.process,
+        )
 
 
 def leads() -> bool:
@@ -47,3 +51,30 @@ def from_leader(tree: Any) -> Any:
     """The leading process's `tree` of arrays, as NumPy arrays, in every process."""
     tree = jax.tree.map(np.asarray, tree)
     return multihost_utils.broadcast_one_to_all(tree) if jax.process_count() > 1 else tree
+
+
+def _initialize(trouble: str, **arguments: Any) -> None:
+    """`jax.distributed.initialize`; `trouble` explains a failure."""
+    try:
+        jax.distributed.initialize(**arguments, initialization_timeout=CONNECT_TIMEOUT_S)
+    except (RuntimeError, ValueError) as error:
+        address = arguments.get("coordinator_address", "auto")
+        reason = str(error).splitlines()[0]
+        raise UserError(f"hosts.coordinator is {address!r}, and {trouble} ({reason}).") from None
+
+
+def _wait_until_it_listens(address: str) -> None:
+    """UserError unless something accepts connections at host:port within CONNECT_TIMEOUT_S."""
+    host, _, port = address.rpartition(":")
+    deadline = time.monotonic() + CONNECT_TIMEOUT_S
+    while True:
+        try:
+            socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
+            return
+        except OSError as error:
+            if time.monotonic() > deadline:
+                raise UserError(
+                    f"hosts.coordinator is {address!r}, and nothing answered there for {CONNECT_TIMEOUT_S} s "
+                    f"({error}): start process 0 as well, and check the address."
+                ) from None
+            time.sleep(_RETRY_S)

@@ -41,7 +41,7 @@ def explained(config: Config) -> Iterator[None]:
     """Turns what JAX, the engine or the host say when memory runs out into a UserError."""
     try:
         yield
-    except (RuntimeError, MemoryError, ValueError) as error:
+    except (RuntimeError, MemoryError) as error:
         text = f"{type(error).__name__}: {error}"
         if not any(sign in text for sign in _SIGNS):
             raise

@@ -15,7 +15,7 @@ import pytest
 import teacher_worker as worker
 from ddgrasp.config import HostsConfig
 from ddgrasp.errors import UserError
-from ppo import learner
+from ppo import hosts, learner
 
 ROOT = Path(__file__).parents[1]
 TIMEOUT_S = 600.0
@@ -81,9 +81,9 @@ def test_two_processes_train_what_one_trains(one, tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
-    hosts = ("--hosts.coordinator", address, "--hosts.processes", "2", "--hosts.process")
+    options = ("--hosts.coordinator", address, "--hosts.processes", "2", "--hosts.process")
     out = tmp_path / "run"
-    _succeed(*[_train(out, *hosts, str(process)) for process in range(2)])
+    _succeed(*[_train(out, *options, str(process)) for process in range(2)])
     _close(worker.saved(out), worker.saved(one))
     curves = (out / "teacher" / "curves.jsonl").read_text().splitlines()
     assert len(curves) == len((one / "teacher" / "curves.jsonl").read_text().splitlines())
@@ -102,7 +102,7 @@ def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(one, tmp_path):
     assert 0 < max(_steps(out)) < worker.ITERATIONS
     _succeed(_train(out, "--resume"))
     whole, resumed = worker.saved(one), worker.saved(out)
-    assert whole["." + "iteration"] == worker.ITERATIONS
+    assert whole[".iteration"] == worker.ITERATIONS
     assert whole.keys() == resumed.keys()
     for name, value in whole.items():
         np.testing.assert_array_equal(value, resumed[name], err_msg=name)
@@ -144,3 +144,17 @@ def test_minibatches_must_be_whole_on_every_device():
 def test_mistaken_hosts_are_named(values, expected):
     with pytest.raises(UserError, match=expected):
         HostsConfig(**values)
+
+
+def test_a_coordinator_that_is_not_there_is_named(monkeypatch):
+    monkeypatch.setattr(hosts, "CONNECT_TIMEOUT_S", 1)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # bound, not listening
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(UserError, match=f"'{address}', and nothing answered there for 1 s"):
+            hosts.connect(HostsConfig(address, processes=2, process=1))
+
+
+def test_auto_without_a_cluster_says_what_to_give():
+    with pytest.raises(UserError, match="'auto', and no cluster answers for it: give host:port"):
+        hosts.connect(HostsConfig("auto"))
