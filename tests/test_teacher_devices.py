@@ -19,8 +19,11 @@ from ppo import hosts, learner
 
 ROOT = Path(__file__).parents[1]
 TIMEOUT_S = 600.0
-RELATIVE, ABSOLUTE = 1e-3, 1e-4
-"""Between numbers of devices: sums are taken in another order, and contacts amplify the last digit."""
+RELATIVE, ABSOLUTE = 1e-3, 3e-4
+"""Between numbers of devices, after 48 control steps: sums are taken in another order, and motion amplifies
+the last digit. Measured on a CPU: 7e-5 in actions, 3e-5 in parameters and optimiser."""
+ABSOLUTE_WARMSTART = 0.05
+"""The same for the constraint solver's accelerations, up to hundreds of rad/s^2 in contact; measured 5e-3."""
 
 
 def _start(*command: str, devices: int = 1) -> subprocess.Popen:
@@ -55,7 +58,8 @@ def _succeed(*processes: subprocess.Popen) -> None:
 def _close(here: dict[str, np.ndarray], there: dict[str, np.ndarray]) -> None:
     assert here.keys() == there.keys()
     for name, value in here.items():
-        np.testing.assert_allclose(value, there[name], rtol=RELATIVE, atol=ABSOLUTE, err_msg=name)
+        absolute = ABSOLUTE_WARMSTART if name.endswith(".warmstart") else ABSOLUTE
+        np.testing.assert_allclose(value, there[name], rtol=RELATIVE, atol=absolute, err_msg=name)
 
 
 @pytest.fixture(scope="module")
