@@ -23,7 +23,7 @@ RELATIVE, ABSOLUTE = 1e-3, 3e-4
 """Between numbers of devices, after 48 control steps: sums are taken in another order, and motion amplifies
 the last digit. Measured on a CPU: 7e-5 in actions, 3e-5 in parameters and optimiser."""
 ABSOLUTE_WARMSTART = 0.05
-"""The same for the constraint solver's accelerations, up to hundreds of rad/s^2 in contact; measured 5e-3."""
+"""The same for the constraint solver's accelerations, tens of rad/s^2 in contact; measured 5e-3."""
 
 
 def _start(*command: str, devices: int = 1) -> subprocess.Popen:
