@@ -7,6 +7,7 @@ callbacks or foreign kernels included; what learns from all of them is left to X
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
@@ -39,6 +40,6 @@ def each(mesh: Mesh, function: Callable) -> Callable:
 
 
 def shard_index() -> jax.Array:
-    """() int32 which share the traced code works on; 0 outside of `each`."""
+    """() int32 which share the traced code works on; -1 outside of `each`, where it works on the whole."""
     axes = jax.sharding.get_abstract_mesh().manual_axes
-    return jax.lax.axis_index(axes) if axes else jax.numpy.zeros((), jax.numpy.int32)
+    return jax.lax.axis_index(axes) if axes else jp.int32(-1)

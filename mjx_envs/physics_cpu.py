@@ -34,14 +34,14 @@ class CpuPhysics:
         # Devices call at the same time, and a batch remembers whose parameters it holds: one batch for each.
         key = (int(np.ravel(shard)[0]), ctrl.shape[0])
         if key not in self._batches:
-            self._batches[key] = _HostBatch(self._model, self._index, ctrl.shape[0], _threads())
+            self._batches[key] = _HostBatch(self._model, self._index, ctrl.shape[0], _threads(key[0]))
         new = self._batches[key].step(params, state, ctrl, self._substeps)
         return jax.tree.map(lambda x: x.reshape(lead + x.shape[1:]), new)
 
 
-def _threads() -> int:
-    """Threads of one batch, so that the devices of this host share its cores."""
-    return max(1, (os.cpu_count() or 1) // jax.local_device_count())
+def _threads(shard: int) -> int:
+    """Threads of the batch of a share, so that this host's devices divide its cores; 0 (all) for the whole."""
+    return 0 if shard < 0 else max(1, (os.cpu_count() or 1) // jax.local_device_count())
 
 
 class _HostBatch:
