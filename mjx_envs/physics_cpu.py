@@ -40,7 +40,7 @@ class CpuPhysics:
 
 
 def _threads(shard: int) -> int:
-    """Threads of the batch of a share, so that this host's devices divide its cores; 0 (all) for the whole."""
+    """Threads of a share's batch: this host's devices divide its cores; 0 (all) for the whole."""
     return 0 if shard < 0 else max(1, (os.cpu_count() or 1) // jax.local_device_count())
 
 
