@@ -15,6 +15,7 @@ import numpy as np
 
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import unknown_name
+from sensors.holes import fill_from_background
 
 C_LIMIT = 2.5
 """|c| never exceeds this."""
@@ -104,36 +105,6 @@ def normalise(inverse: np.ndarray) -> np.ndarray:
     shift = np.median(sample)
     scale = 2 * np.mean(np.abs(sample - shift)) + 1e-6
     return np.clip((inverse - shift) / scale, -C_LIMIT, C_LIMIT).astype(np.float32)
-
-
-def fill_from_background(inverse: np.ndarray) -> np.ndarray:
-    """Fills holes (0) of an inverse depth map (H, W) with the farther of the row's nearest valid pixels.
-
-    A stereo camera loses pixels mostly beside near objects, where one imager sees the background and the
-    other does not: the farther neighbour is the surface that was lost. Rows without a valid pixel take the
-    nearest row's values. A median over the filled pixels removes the streaks.
-    """
-    valid = inverse > 0
-    rows = np.flatnonzero(valid.any(axis=1))
-    if len(rows) == 0:
-        return inverse.copy()
-    left, right = (
-        _nearest_valid_in_row(inverse, valid),
-        _nearest_valid_in_row(inverse[:, ::-1], valid[:, ::-1]),
-    )
-    right = right[:, ::-1]
-    background = np.where((left > 0) & (right > 0), np.minimum(left, right), np.maximum(left, right))
-    filled = np.where(valid, inverse, background)
-    row_of = rows[np.abs(np.arange(len(inverse))[:, None] - rows).argmin(axis=1)]
-    filled = filled[row_of].astype(np.float32)
-    return np.where(valid, inverse, cv2.medianBlur(filled, 5))
-
-
-def _nearest_valid_in_row(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """(H, W): the last valid value at or before each column, 0 where there is none."""
-    columns = np.maximum.accumulate(np.where(valid, np.arange(values.shape[1]), -1), axis=1)
-    found = np.take_along_axis(values, np.maximum(columns, 0), axis=1)
-    return np.where(columns >= 0, found, 0)
 
 
 def decoy_holes(holes: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ddg_jax import data, normalise
 from ddg_jax.graft import artefact_mask, graft_mask
-from ddg_jax.prior import fill_from_background, invert, make_prior
+from ddg_jax.prior import invert, make_prior
 from ddg_jax.sample import Generator, predict
 from ddg_jax.train import fit
 from ddgrasp import artifacts
@@ -19,6 +19,7 @@ from ddgrasp.config import Config, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from sensors import stats
+from sensors.holes import fill_from_background
 
 STAGE = "ddg"
 SCORED_FRAMES = 64

@@ -222,20 +222,23 @@ class StereoConfig:
     # --- projector ---
     projector_position: float = 0.6
     """Where the projector sits between the left (0) and the right (1) imager."""
-    dots: int = 7000
+    dots: int = 4000
     """Dots of the pattern in the imager's field of view."""
     dot_radius_mrad: float = 3.3
     """Gaussian radius of a dot as the imagers see it."""
-    projector_power: float = 1.8
+    projector_power: float = 5.0
     """Irradiance of a dot's centre at one metre, relative to the ambient light's."""
+    speckle_contrast: float = 0.27
+    """Standard deviation of laser speckle relative to the dot's light, fresh in every frame and imager.
+    Unlike shot noise it does not fade with range."""
     pattern_seed: int = 455
     """The pattern belongs to the device: the same in every frame."""
     # --- imagers ---
-    exposure_target: float = 0.35
+    exposure_target: float = 0.5
     """Mean grey level the automatic exposure aims at, as a fraction of full scale."""
-    full_well_electrons: float = 8000.0
+    full_well_electrons: float = 10000.0
     """Electrons at full scale: shot noise."""
-    read_noise: float = 0.005
+    read_noise: float = 0.002
     """Standard deviation of read noise as a fraction of full scale."""
     lens_blur_px: float = 0.45
     """Gaussian blur of the lens, pixels."""
@@ -248,15 +251,20 @@ class StereoConfig:
     """Matching window of the semi-global matcher."""
     smoothness: float = 1.0
     """Scales the semi-global matcher's two penalties (8 and 32 per pixel of the window)."""
-    uniqueness_percent: int = 8
+    uniqueness_percent: int = 15
     """The best match must beat the second by this margin."""
     left_right_px: int = 1
     """Largest disagreement of the left-right check, pixels."""
     speckle_px: int = 16
     """Smaller islands of disparity are removed."""
-    residual_limit: float = 0.83
+    residual_limit: float = 1.1
     """Largest matching residual relative to the local contrast of both images; 1.4 is pure noise."""
-    refine_window_px: int = 5
+    contrast_limit: float = 8.0
+    """Smallest local contrast of the left picture, grey levels of 255 (a D4xx's texture threshold): darker
+    surfaces have no depth."""
+    residual_window_px: int = 3
+    """Window of that residual."""
+    refine_window_px: int = 9
     """Window of the sub-pixel step."""
     subpixel_steps: int = 32
     """Disparity is reported in 1/32 of a pixel, as D4xx cameras do."""

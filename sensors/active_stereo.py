@@ -33,7 +33,7 @@ SHADOW_BIAS_M = 0.012
 """A point this much behind the projector's own depth map lies in shadow."""
 PROJECTOR_MARGIN = 1.1
 """The projector lights a field this much wider than the imagers'."""
-PROJECTOR_FALLOFF = 1.5
+PROJECTOR_FALLOFF = 0.5
 """Exponent of the cosine by which the projector dims towards its edges."""
 VIGNETTING = 2.5
 """Exponent of the cosine by which a lens dims towards its edges (4 for a simple one)."""
@@ -44,6 +44,8 @@ TEXTURE_PX, TEXTURE_PX_PER_M = 512, 400.0
 NEAR_INFRARED_RGB = (0.7, 0.2, 0.1)
 """Weights by which a guess of the near-infrared reflectance follows the visible colour."""
 CONTRAST_WINDOW_PX = 9
+OTHER_SURFACE_PX = 0.5
+"""Neighbouring disparities further apart than this belong to two surfaces."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +129,11 @@ class ActiveStereo:
         images = []
         for imager_m in (0.0, baseline):
             buffers = render(_camera(self.profile, T_world_cam, imager_m))
+            speckle = self._speckle(rng)
             images.append(
-                self._radiance(buffers, T_world_cam, imager_m, projector_m - imager_m, lit_m, materials)
+                self._radiance(
+                    buffers, T_world_cam, imager_m, projector_m - imager_m, lit_m, materials, speckle
+                )
             )
         exposure = self.config.exposure_target / max(float(images[0].mean()), 1e-6)
         left, right = (self._expose(image, exposure, rng) for image in images)
@@ -142,10 +147,10 @@ class ActiveStereo:
         columns = np.arange(self.profile.width_px, dtype=np.float32)[None, :]
         # The left band has no counterpart in the right picture.
         valid = (coarse > 0) & (columns - coarse >= 0)
-        fine, residual = _refine(
-            left.astype(np.float32), right.astype(np.float32), coarse, self.config.refine_window_px
-        )
-        valid &= residual < self.config.residual_limit
+        left, right = _without_mean(left), _without_mean(right)
+        contrast = np.sqrt(cv2.blur(left * left, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX)))
+        fine, residual = _refine(left, right, coarse, self.config)
+        valid &= (residual < self.config.residual_limit) & (contrast > self.config.contrast_limit)
         steps = self.config.subpixel_steps
         return np.where(valid, np.rint(fine * steps) / steps, 0).astype(np.float32)
 
@@ -165,10 +170,11 @@ class ActiveStereo:
         projector_m: float,
         lit_m: np.ndarray,
         materials: Mapping[int, Material] | None,
+        speckle: np.ndarray,
     ) -> np.ndarray:
         """(H, W) radiance of one imager, arbitrary units. Points and normals in that imager's frame.
 
-        `projector_m` is the projector's x in the imager's frame.
+        `projector_m` is the projector's x in the imager's frame; `speckle` (H, W) multiplies its light.
         """
         z = buffers.depth_m
         x_z, y_z = self._x * z, self._y * z
@@ -185,7 +191,7 @@ class ActiveStereo:
         dots = self._dots(x_z - projector_m, y_z, z, lit_m)
         dots *= self.config.projector_power / np.maximum(range_m, 0.1) ** 2
         diffuse, highlight = _reflect(normal, to_projector, view)
-        radiance = dots * (albedo * diffuse + specular * highlight)
+        radiance = dots * speckle * (albedo * diffuse + specular * highlight)
 
         to_lamp, _ = _unit(lamp[0] - x_z, lamp[1] - y_z, lamp[2] - z)
         diffuse, highlight = _reflect(normal, to_lamp, view)
@@ -225,6 +231,12 @@ class ActiveStereo:
         shift = np.float32((TEXELS_PER_PX - 1) / 2)
         dots = cv2.remap(self._pattern, u * t + shift, v * t + shift, cv2.INTER_LINEAR)
         return np.where(z_m > nearest_m + SHADOW_BIAS_M, np.float32(0), dots)
+
+    def _speckle(self, rng: np.random.Generator) -> np.ndarray:
+        """(H, W) factor of mean about 1 on laser light; each imager, at another place, sees its own."""
+        shape = (self.profile.height_px, self.profile.width_px)
+        noise = rng.standard_normal(shape, dtype=np.float32)
+        return np.maximum(1.0 + np.float32(self.config.speckle_contrast) * noise, 0.0)
 
     def _expose(self, radiance: np.ndarray, exposure: float, rng: np.random.Generator) -> np.ndarray:
         """(H, W) uint8: blur of the lens, shot and read noise, saturation, quantisation."""
@@ -325,29 +337,42 @@ def _reflect(normal, to_light, to_view) -> tuple[np.ndarray, np.ndarray]:
     return diffuse, squared * (diffuse > 0)
 
 
+def _without_mean(picture: np.ndarray) -> np.ndarray:
+    """(H, W) float32: the picture less its local mean."""
+    picture = picture.astype(np.float32)
+    return picture - cv2.blur(picture, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX))
+
+
 def _refine(
-    left: np.ndarray, right: np.ndarray, coarse_px: np.ndarray, window_px: int
+    left: np.ndarray, right: np.ndarray, coarse_px: np.ndarray, config: StereoConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """One Gauss-Newton step on the windowed squared difference (Lucas and Kanade 1981).
 
-    The semi-global matcher interpolates its cost by a parabola in 1/16 px, which pulls towards
-    whole pixels; this step measures the remainder on the pictures themselves.
+    The semi-global matcher interpolates its cost by a parabola in 1/16 px, which pulls towards whole
+    pixels and differs from pixel to pixel. With i the pixels of a window, c_i their coarse disparity, e_i
+    the difference of the pictures there and s_i the slope, the disparity d that all of them share minimises
+    sum (e_i + s_i (d - c_i))^2. Pixels whose c_i is more than OTHER_SURFACE_PX from their neighbourhood's
+    median do not take part.
 
     Returns:
         (H, W) disparity in pixels, moved by at most half a pixel; (H, W) residual relative to the
         local contrast: near 0 for a perfect match, 1.4 for unrelated pictures.
     """
-    left = left - cv2.blur(left, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX))
-    right = right - cv2.blur(right, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX))
     gradient = cv2.Sobel(right, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
     grid = np.indices(left.shape, dtype=np.float32)
     rows, at = grid[0], grid[1] - coarse_px
     matched = cv2.remap(right, at, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     slope = cv2.remap(gradient, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    window = (window_px, window_px)
+    window = (config.refine_window_px, config.refine_window_px)
     difference = left - matched
-    # d(matched)/d(disparity) = -slope, hence the sign.
-    step = -cv2.blur(slope * difference, window) / (cv2.blur(slope * slope, window) + 1e-3)
+    middle = cv2.medianBlur(coarse_px, 5)
+    smooth = cv2.blur(middle, window)
+    smooth = np.where(np.abs(smooth - middle) < OTHER_SURFACE_PX, smooth, middle)
+    weight = slope * slope * (np.abs(coarse_px - middle) < OTHER_SURFACE_PX)
+    towards = weight * (coarse_px - smooth) - np.where(weight > 0, slope * difference, 0)
+    total = cv2.blur(weight, window)
+    fine = smooth + cv2.blur(towards, window) / np.maximum(total, 1e-3)
+    window = (config.residual_window_px, config.residual_window_px)
     energy = 0.5 * cv2.blur(left * left + matched * matched, window) + 1e-3
     residual = np.sqrt(cv2.blur(difference * difference, window) / energy)
-    return coarse_px + np.clip(step, -0.5, 0.5), residual
+    return np.clip(fine, coarse_px - 0.5, coarse_px + 0.5), residual

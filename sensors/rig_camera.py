@@ -11,7 +11,7 @@ from sensors.active_stereo import ActiveStereo, Material
 
 FAR_M = 10.0
 """Beyond the matcher's range, so that range limits come from the camera alone."""
-TABLE_TEXTURE = 0.12
+TABLE_TEXTURE = 0.35
 ROBOT_SPECULAR = 0.3
 OBJECT_SPECULAR = {"cube": 0.05, "apple": 0.6, "banana": 0.15}
 """Objects fail differently: a waxed apple glares, raw wood does not."""
