@@ -11,7 +11,7 @@ from typing import Annotated, Any, Protocol
 import tyro
 
 from ddgrasp import artifacts, contract, pipeline
-from ddgrasp.config import Config, HostsConfig, WorldConfig
+from ddgrasp.config import Config, HostsConfig, RecordConfig, StereoConfig, WorldConfig
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.presets import get_preset
 
@@ -340,6 +340,47 @@ class ObjectsSheet:
         print(self.out)
 
 
+@dataclass(frozen=True)
+class SensorsCompare:
+    """Set the rig's stereo camera beside real D4xx cameras: holes, noise, flicker, as table, JSON and PNG."""
+
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    """The rig's camera."""
+    camera_scale: float = 0.25
+    """Size of its picture relative to 1280 x 720."""
+    real: Path | None = None
+    """A recording of a real camera, or a folder of them; none takes the figures measured before."""
+    out: Path = Path()
+    """Where sensors.json and sensors.png go."""
+    scenes: int = 1
+    """Standing scenes per object."""
+    frames: int = 6
+    """Frames per scene."""
+    seed: int = 0
+    """Of the scenes."""
+
+    def run(self) -> None:
+        from ddgrasp.progress import Progress
+        from sensors import compare
+
+        if not 0.1 <= self.camera_scale <= 1.0:
+            raise UserError(f"--camera-scale is {self.camera_scale}; expected 0.1 to 1.")
+        _check_count("--scenes", self.scenes)
+        if self.frames < 2:
+            raise UserError(f"--frames is {self.frames}; expected at least 2, for noise over time.")
+        result = compare.compare(
+            RecordConfig(stereo=self.stereo),
+            contract.D455.scaled(self.camera_scale),
+            self.real,
+            per_object=self.scenes,
+            frames=self.frames,
+            seed=self.seed,
+            progress=Progress(name="sensors compare"),
+        )
+        compare.print_tables(result)
+        print(*compare.write(result, self.out), sep="\n")
+
+
 COMMANDS: dict[str, type] = {
     "run": Run,
     "teacher train": TeacherTrain,
@@ -356,6 +397,7 @@ COMMANDS: dict[str, type] = {
     "weights list": WeightsList,
     "report": Report,
     "objects list": ObjectsList,
+    "sensors compare": SensorsCompare,
     "objects sheet": ObjectsSheet,
 }
 
@@ -384,7 +426,7 @@ def parse(name: str, args: Sequence[str]) -> Command:
 def describe_commands(group: str = "") -> str:
     """The list that `ddgrasp --help` (or `ddgrasp teacher`) prints."""
     names = [name for name in COMMANDS if not group or name.split()[0] == group]
-    lines = [f"  {name:<15} {(COMMANDS[name].__doc__ or '').splitlines()[0]}" for name in names]
+    lines = [f"  {name:<16} {(COMMANDS[name].__doc__ or '').splitlines()[0]}" for name in names]
     return "\n".join(
         ["usage: ddgrasp COMMAND [options]   (each command has --help)", "", *lines, "", *_PRESET_HELP]
     )

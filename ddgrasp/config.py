@@ -271,6 +271,57 @@ class StereoConfig:
 
 
 @dataclass(frozen=True)
+class DextrahConfig:
+    """Depth noise as DextrAH-G trains with (sensors/procedural.py); pixels are those of its 160 x 120 pictures."""
+
+    shift_px: float = 0.5
+    """Standard deviation of the field by which pixels look up their depth beside themselves (sigma_s)."""
+    disparity_px: float = 1 / 48
+    """Standard deviation of disparity noise (sigma_d, a sixth of a step of 1/8 px)."""
+    correlation_px: float = 2.0
+    """Distance over which both fields vary."""
+    dropout: float = 0.0125 / 4
+    """Probability that a pixel becomes invalid."""
+    random_value: float = 0.0125 / 4
+    """Probability that a pixel takes a random depth."""
+    random_near_m: float = 0.3
+    """Nearest random depth."""
+    random_far_m: float = 2.0
+    """Farthest random depth."""
+    stick: float = 0.001 / 4
+    """Probability that a stick starts at a pixel."""
+    stick_length_px: float = 18.0
+    """Longest stick."""
+    stick_width_px: float = 3.0
+    """Widest stick."""
+
+
+@dataclass(frozen=True)
+class KinectConfig:
+    """Depth noise of a structured-light camera of the first Kinect's kind (sensors/procedural.py)."""
+
+    shift_px: float = 0.5
+    """Standard deviation of each pixel's shift, independent per pixel (Handa et al. 2014)."""
+    axial_per_m: float = 1.425e-3
+    """Standard deviation of depth at one metre; it grows with the square (Khoshelham and Elberink 2012)."""
+    steps_per_px: float = 8.0
+    """Disparity is reported in 1/8 of a pixel."""
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """A model of a depth camera: clean depth to what the camera would report."""
+
+    name: str = "stereo"
+    """ideal, dextrah, kinect, stereo (the rig's camera) or learned (a fitted generator)."""
+    dextrah: DextrahConfig = field(default_factory=DextrahConfig)
+    kinect: KinectConfig = field(default_factory=KinectConfig)
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    learned_from: str = ""
+    """Stage directory of a fitted generator (`ddgrasp ddg fit`), for learned."""
+
+
+@dataclass(frozen=True)
 class RecordConfig:
     """RGB-D recordings from the pseudo-real rig, and the rig's stereo camera."""
 

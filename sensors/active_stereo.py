@@ -11,7 +11,7 @@ beside it along +x with parallel axes. Depth is planar.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from ddgrasp.config import StereoConfig
 from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
 from mjx_envs.camera import Buffers, Camera
+from sensors.materials import NEAR_INFRARED_RGB, Material
 
 Render = Callable[[Camera], Buffers]
 RenderDepth = Callable[[Camera], np.ndarray]
@@ -41,30 +42,9 @@ TEXELS_PER_PX = 3
 """Resolution of the stored pattern."""
 TEXTURE_PX, TEXTURE_PX_PER_M = 512, 400.0
 """Size and scale of the albedo texture that `Material.texture` weighs (a 1.3 m tile)."""
-NEAR_INFRARED_RGB = (0.7, 0.2, 0.1)
-"""Weights by which a guess of the near-infrared reflectance follows the visible colour."""
 CONTRAST_WINDOW_PX = 9
 OTHER_SURFACE_PX = 0.5
 """Neighbouring disparities further apart than this belong to two surfaces."""
-
-
-@dataclass(frozen=True)
-class Material:
-    """How a surface looks in the near infrared."""
-
-    albedo: float
-    """Diffuse reflectance, 0 to 1."""
-    specular: float = 0.05
-    """Strength of the highlight relative to a white diffuse surface."""
-    texture: float = 0.0
-    """Relative contrast of its albedo texture (for geoms that do not move)."""
-
-    @classmethod
-    def from_rgb(cls, rgb, specular: float = 0.05, texture: float = 0.0) -> "Material":
-        """A guess: near-infrared reflectance follows red more than green and blue."""
-        red, green, blue = (float(c) for c in rgb[:3])
-        r, g, b = NEAR_INFRARED_RGB
-        return cls(0.05 + 0.9 * (r * red + g * green + b * blue), specular, texture)
 
 
 class ActiveStereo:

@@ -21,6 +21,8 @@ EDGE_BINS_PX = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0, 20.0, 40.0)
 ANGLE_BINS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)
 SIZE_BINS_PX = (1, 2, 4, 8, 16, 32, 64, 128, 256, 1 << 30)
 
+RATE_BINS = {"depth_m": DEPTH_BINS_M, "edge_px": EDGE_BINS_PX, "angle_deg": ANGLE_BINS_DEG}
+
 EDGE_RATIO = 1.08
 """Neighbouring depths further apart than this are two surfaces."""
 NORMAL_WINDOW_PX = 9
@@ -35,6 +37,7 @@ FEWEST = 200
 STATIC_RATIO = 1.1
 """Frames stand still if they change at most this much more than the quietest tenth of the pairs."""
 STATIC_FRAMES = 4
+FB_TOLERANCE = 5e-4
 
 
 @dataclass(frozen=True)
@@ -135,35 +138,49 @@ def _slopes(picture: np.ndarray, window_px: int) -> tuple[tuple[np.ndarray, np.n
 # --- invalid pixels --------------------------------------------------------------------------------
 
 
-def invalid_rates(stream: Stream) -> dict[str, Curve]:
-    """Share of invalid pixels by depth, by distance to an edge, by incidence angle.
+def by_surface(stream: Stream) -> tuple[dict[str, Curve], float]:
+    """Curves that need the estimated surface, and the share of invalid pixels in occlusion shadows.
 
-    Pixels that one imager cannot see (left band, shadow of a nearer surface) are left out: they follow from
-    the baseline. Depth and angle count pixels away from edges alone.
+    "depth_m", "edge_px", "angle_deg": share of invalid pixels. Pixels that one imager cannot see (left band,
+    shadow of a nearer surface) are left out: they follow from the baseline. Depth and angle count pixels away
+    from edges alone. "spatial_px": median over windows of the disparity's deviation from a local plane.
     """
-    bins = {"depth_m": DEPTH_BINS_M, "edge_px": EDGE_BINS_PX, "angle_deg": ANGLE_BINS_DEG}
-    lost, count = ({name: np.zeros(len(b) - 1) for name, b in bins.items()} for _ in range(2))
-    for frame in stream.depth_mm:
-        s = surface(frame, stream.fx_px, stream.fb_px_m)
-        inside = s.seen & (s.depth_m >= DEPTH_BINS_M[0]) & (s.depth_m < DEPTH_BINS_M[-1])
-        smooth = inside & np.isfinite(s.angle_deg)
-        for name, values, where in (
-            ("depth_m", s.depth_m, smooth),
-            ("edge_px", s.edge_px, inside),
-            ("angle_deg", s.angle_deg, smooth),
-        ):
-            count[name] += np.histogram(values[where], bins[name])[0]
-            lost[name] += np.histogram(values[where & (frame == 0)], bins[name])[0]
-    return {name: _curve(bins[name], lost[name] / np.maximum(count[name], 1), count[name]) for name in bins}
+    tallies = [_tally(frame, stream) for frame in stream.depth_mm]
+    made = {}
+    for name, bins in RATE_BINS.items():
+        lost, count = (np.sum([t.rates[name][i] for t in tallies], axis=0) for i in (0, 1))
+        made[name] = _curve(bins, lost / np.maximum(count, 1), count)
+    ranges, deviations = (np.concatenate([t.spatial[i] for t in tallies]) for i in (0, 1))
+    made["spatial_px"] = _medians(DEPTH_BINS_M, ranges, deviations)
+    lost, count = (sum(t.shadow[i] for t in tallies) for i in (0, 1))
+    return made, lost / count if count else float("nan")
 
 
-def shadow_invalid(stream: Stream) -> float:
-    """Share of invalid pixels where a nearer surface hides the point from the right imager."""
-    lost = count = 0
-    for frame in stream.depth_mm:
-        shadow = surface(frame, stream.fx_px, stream.fb_px_m).shadow
-        lost, count = lost + np.count_nonzero(shadow & (frame == 0)), count + np.count_nonzero(shadow)
-    return lost / count if count else float("nan")
+@dataclass(frozen=True)
+class _Tally:
+    """What one frame adds to the curves."""
+
+    rates: dict[str, tuple[np.ndarray, np.ndarray]]
+    """Per curve: invalid pixels and pixels in each bin."""
+    shadow: tuple[int, int]
+    spatial: tuple[np.ndarray, np.ndarray]
+    """Range and deviation of windows without a hole."""
+
+
+def _tally(frame: np.ndarray, stream: Stream) -> _Tally:
+    s, lost = surface(frame, stream.fx_px, stream.fb_px_m), frame == 0
+    inside = s.seen & (s.depth_m >= DEPTH_BINS_M[0]) & (s.depth_m < DEPTH_BINS_M[-1])
+    smooth = inside & np.isfinite(s.angle_deg)
+    counted = {"depth_m": (s.depth_m, smooth), "edge_px": (s.edge_px, inside), "angle_deg": (s.angle_deg, smooth)}
+    rates = {
+        name: tuple(np.histogram(values[mask], RATE_BINS[name])[0] for mask in (where & lost, where))
+        for name, (values, where) in counted.items()
+    }
+    kernel = np.ones((PLANE_WINDOW_PX, PLANE_WINDOW_PX), np.uint8)
+    whole = (cv2.erode((~lost).astype(np.uint8), kernel) > 0) & s.seen & (s.edge_px > PLANE_WINDOW_PX)
+    deviation = _plane_deviation(_disparity(frame, stream.fb_px_m))
+    shadow = int(np.count_nonzero(s.shadow & lost)), int(np.count_nonzero(s.shadow))
+    return _Tally(rates, shadow, (s.depth_m[whole], deviation[whole]))
 
 
 def hole_spectrum(stream: Stream) -> Curve:
@@ -188,19 +205,6 @@ def temporal_deviation_px(stream: Stream) -> Curve:
         disparity = _disparity(frames[:, steady], stream.fb_px_m)
         ranges.append(stream.fb_px_m / np.nanmedian(disparity, axis=0))
         deviations.append(np.nanstd(disparity, axis=0, ddof=1))
-    return _medians(DEPTH_BINS_M, np.concatenate(ranges), np.concatenate(deviations))
-
-
-def spatial_deviation_px(stream: Stream) -> Curve:
-    """Median over windows of the disparity's deviation from a local plane, by range; needs no static scene."""
-    ranges, deviations = [], []
-    for frame in stream.depth_mm:
-        s = surface(frame, stream.fx_px, stream.fb_px_m)
-        kernel = np.ones((PLANE_WINDOW_PX, PLANE_WINDOW_PX), np.uint8)
-        whole = cv2.erode((frame > 0).astype(np.uint8), kernel) > 0
-        where = whole & s.seen & (s.edge_px > PLANE_WINDOW_PX)
-        ranges.append(s.depth_m[where])
-        deviations.append(_plane_deviation(_disparity(frame, stream.fb_px_m))[where])
     return _medians(DEPTH_BINS_M, np.concatenate(ranges), np.concatenate(deviations))
 
 
@@ -252,14 +256,17 @@ def static_runs(depth_mm: np.ndarray, fb_px_m: float) -> tuple[slice, ...]:
 def grid_share(depth_mm: np.ndarray, fb_px_m: float, steps_per_px: float) -> float:
     """Share of depths that lie on the grid of disparities k / steps_per_px, where the grid is visible.
 
-    Visible: neighbouring grid depths at least 4 mm apart, so that by chance a quarter would lie on it.
-    nan if no depth is that far.
+    Visible: neighbouring grid depths at least 4 mm apart, so that by chance a quarter would lie on it. f B is
+    known to about a thousandth, the grid is finer: the best f B within FB_TOLERANCE counts. nan if no depth
+    is that far.
     """
     fb = 1000.0 * fb_px_m * steps_per_px
-    values = depth_mm[depth_mm.astype(np.float64) ** 2 > 4.0 * fb].astype(np.float64)
+    values, count = np.unique(depth_mm[depth_mm.astype(np.float64) ** 2 > 4.0 * fb], return_counts=True)
     if not len(values):
         return float("nan")
-    return float(np.mean(np.rint(fb / np.rint(fb / values)) == values))
+    candidates = fb * np.linspace(1 - FB_TOLERANCE, 1 + FB_TOLERANCE, 41)[:, None]
+    away_mm = np.abs(candidates / np.rint(candidates / values) - values)
+    return float(np.max((away_mm <= 0.51) @ count) / count.sum())
 
 
 def _disparity(depth_mm: np.ndarray, fb_px_m: float) -> np.ndarray:

@@ -62,6 +62,7 @@ CURVES = {
 def measure(camera: str, stream: Stream, steps_per_px: float) -> Figures:
     """All figures of a stream; `steps_per_px` is the camera's disparity grid at this picture size."""
     depth = stream.depth_mm
+    conditional, shadow_invalid = curves.by_surface(stream)
     sizes = [stats.hole_sizes_px(frame) for frame in depth]
     count = float(np.mean([len(s) for s in sizes]))
     height, width = depth.shape[1:]
@@ -74,7 +75,7 @@ def measure(camera: str, stream: Stream, steps_per_px: float) -> Figures:
         "hole_median_px": float(np.median(np.concatenate(sizes))) if count else 0.0,
         "left_band_px": band,
         "left_band_excess_px": band - _left_disparity_px(stream, round(band)),
-        "shadow_invalid": curves.shadow_invalid(stream),
+        "shadow_invalid": shadow_invalid,
         "temporal_deviation_mm": _mean(deviations),
         "flicker_fraction": curves.flicker(stream),
         "grid_share": curves.grid_share(depth, stream.fb_px_m, steps_per_px),
@@ -86,10 +87,9 @@ def measure(camera: str, stream: Stream, steps_per_px: float) -> Figures:
         len(depth),
         scalars,
         {
-            **curves.invalid_rates(stream),
+            **conditional,
             "spectrum": curves.hole_spectrum(stream),
             "temporal_px": curves.temporal_deviation_px(stream),
-            "spatial_px": curves.spatial_deviation_px(stream),
         },
     )
 

@@ -1,95 +1,130 @@
-"""Procedural depth noise: the baseline that draws errors from formulas. NumPy and OpenCV.
+"""Procedural depth noise: baselines that draw errors from formulas. JAX.
 
-The model family of DextrAH-G (Lum et al. 2024, appendix) and its ancestor (Handa et al. 2014, after
-Barron and Malik 2013): jittered lookup and disparity noise, per-pixel dropout, random values, sticks.
+`dextrah`: the model that DextrAH-G trains with (Lum et al. 2024, "DextrAH-G: Pixels-to-Action Dexterous
+Arm-Hand Grasping with Geometric Fabrics"; strengths from its published code): correlated noise in disparity,
+pixel dropout, random values, sticks.
+`kinect`: the model of Handa et al. 2014 ("A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM",
+after Barron and Malik 2013) with the axial noise that Khoshelham and Elberink 2012 measured.
 """
 
-from dataclasses import dataclass
+import math
+from functools import partial
 
-import cv2
-import numpy as np
+import jax
+import jax.numpy as jnp
+from jax import Array
 
-from ddgrasp import contract
+from ddgrasp.config import DextrahConfig, KinectConfig
+from ddgrasp.contract import CameraProfile
+from sensors.sense import Sense, batched
 
-
-@dataclass(frozen=True)
-class ProceduralConfig:
-    """Strengths of the procedural noise, at the scale of a quarter-size D455."""
-
-    shift_px: float = 0.5
-    """Standard deviation of the smooth field by which pixels are displaced."""
-    shift_scale_px: int = 4
-    """Correlation length of that field."""
-    disparity_px: float = 0.06
-    """Standard deviation of correlated disparity noise."""
-    disparity_scale_px: int = 2
-    """Correlation length of disparity noise."""
-    dropout: float = 0.003
-    """Probability that a pixel becomes invalid."""
-    random_value: float = 0.003
-    """Probability that a pixel takes a random depth."""
-    random_range_m: tuple[float, float] = (0.3, 2.0)
-    """Range of these random depths."""
-    sticks: int = 4
-    """Thin occluding segments per frame, at most."""
-    stick_length_px: int = 18
-    """Longest stick."""
-    stick_width_px: int = 3
-    """Widest stick."""
+NEAREST_M = 0.05
+"""Noise never brings a surface nearer than this."""
+MOST_STICKS = 4.0
+"""Room for this many deviations more sticks than are expected in a picture."""
 
 
-def corrupt(
-    depth_m: np.ndarray,
-    rng: np.random.Generator,
-    profile: contract.CameraProfile,
-    config: ProceduralConfig = ProceduralConfig(),
-) -> np.ndarray:
-    """Noisy copy of clean depth.
+def dextrah(config: DextrahConfig, profile: CameraProfile) -> Sense:
+    """DextrAH-G's depth noise. `profile` gives focal length times baseline."""
+    return batched(partial(_dextrah_frame, config, profile.fx_px * profile.baseline_m))
 
-    Args:
-        depth_m: (B, H, W) or (H, W) planar metres, 0 = invalid.
-        profile: gives focal length times baseline, which turns disparity noise into depth noise.
 
-    Returns:
-        Array of the same shape, float32, 0 = invalid.
+def kinect(config: KinectConfig, profile: CameraProfile) -> Sense:
+    """Kinect-style depth noise. `profile` gives focal length times baseline."""
+    return batched(partial(_kinect_frame, config, profile.fx_px * profile.baseline_m))
+
+
+def _dextrah_frame(
+    config: DextrahConfig, fb_px_m: float, key: Array, depth_m: Array, rgb: Array | None
+) -> Array:
+    shift_key, noise_key, replace_key, value_key, drop_key, stick_key = jax.random.split(key, 6)
+    shape = (depth_m.shape[0], depth_m.shape[1])
+    shift = config.shift_px * smooth_field(shift_key, (2, *shape), config.correlation_px)
+    noise = config.disparity_px * smooth_field(noise_key, shape, config.correlation_px)
+    noisy = add_disparity(shifted(depth_m, shift), noise, fb_px_m)
+    near, far = config.random_near_m, config.random_far_m
+    values = jax.random.uniform(value_key, shape, minval=near, maxval=far)
+    noisy = jnp.where(jax.random.bernoulli(replace_key, config.random_value, shape), values, noisy)
+    noisy = jnp.where(jax.random.bernoulli(drop_key, config.dropout, shape), 0.0, noisy)
+    return draw_sticks(stick_key, noisy, config)
+
+
+def _kinect_frame(
+    config: KinectConfig, fb_px_m: float, key: Array, depth_m: Array, rgb: Array | None
+) -> Array:
+    shift_key, noise_key = jax.random.split(key)
+    shift = config.shift_px * jax.random.normal(shift_key, (2, *depth_m.shape))
+    seen = shifted(depth_m, shift)
+    noisy = seen + axial_deviation_m(seen, config.axial_per_m) * jax.random.normal(noise_key, depth_m.shape)
+    return jnp.where(seen > 0, quantised(jnp.maximum(noisy, NEAREST_M), fb_px_m, config.steps_per_px), 0.0)
+
+
+# --- the equations ---------------------------------------------------------------------------------
+
+
+def axial_deviation_m(depth_m: Array, per_m: float) -> Array:
+    """sigma_z = per_m z^2 (Khoshelham and Elberink 2012, eq. 11)."""
+    return per_m * depth_m**2
+
+
+def quantised(depth_m: Array, fb_px_m: float, steps_per_px: float) -> Array:
+    """z = n f B / round(n f B / z), n steps per pixel (Barron and Malik 2013; n f B is their 35130 cm).
+
+    They round x + 1/2, which moves every depth by half a step; here the nearest step is taken.
     """
-    if depth_m.ndim == 2:
-        return corrupt(depth_m[None], rng, profile, config)[0]
-    fb_px_m = profile.fx_px * profile.baseline_m
-    noisy = np.stack([_shifted(frame.astype(np.float32), rng, config) for frame in depth_m])
-    fields = [_smooth(noisy.shape[1:], config.disparity_scale_px, rng) for _ in noisy]
-    disparity = fb_px_m / np.maximum(noisy, 1e-3) + config.disparity_px * np.stack(fields)
-    noisy = np.where(noisy > 0, fb_px_m / np.maximum(disparity, 1e-3), 0)
-    replaced = rng.random(noisy.shape) < config.random_value
-    noisy = np.where(replaced, rng.uniform(*config.random_range_m, noisy.shape), noisy)
-    noisy = np.where(rng.random(noisy.shape) < config.dropout, 0, noisy).astype(np.float32)
-    for frame in noisy:
-        _draw_sticks(frame, rng, config)
-    return noisy
+    scaled = fb_px_m * steps_per_px
+    return scaled / jnp.maximum(jnp.round(scaled / jnp.maximum(depth_m, NEAREST_M)), 1.0)
 
 
-def _smooth(shape: tuple[int, ...], scale_px: int, rng: np.random.Generator) -> np.ndarray:
-    """(H, W) float32 field of about unit variance, correlated over `scale_px`."""
-    height, width = shape
-    coarse = rng.standard_normal((height // scale_px + 2, width // scale_px + 2), dtype=np.float32)
-    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+def add_disparity(depth_m: Array, noise_px: Array, fb_px_m: float) -> Array:
+    """z' = f B / (f B / z + noise); 0 stays 0."""
+    disparity = fb_px_m / jnp.maximum(depth_m, NEAREST_M) + noise_px
+    return jnp.where(depth_m > 0, fb_px_m / jnp.clip(disparity, 1e-3, fb_px_m / NEAREST_M), 0.0)
 
 
-def _shifted(depth_m: np.ndarray, rng: np.random.Generator, config: ProceduralConfig) -> np.ndarray:
-    """Each pixel looks up its depth a little beside itself: edges become ragged."""
-    grid = np.indices(depth_m.shape, dtype=np.float32)
-    for axis in grid:
-        axis += config.shift_px * _smooth(depth_m.shape, config.shift_scale_px, rng)
-    return cv2.remap(depth_m, grid[1], grid[0], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+def shifted(depth_m: Array, shift_px: Array) -> Array:
+    """z'(v, u) = z(v + s_0, u + s_1) at the nearest pixel: edges become ragged, depths are not mixed.
 
-
-def _draw_sticks(depth_m: np.ndarray, rng: np.random.Generator, config: ProceduralConfig) -> None:
-    """Draw random segments of constant depth into the frame, in place."""
+    depth_m (H, W), shift_px (2, H, W); places outside take the nearest pixel inside.
+    """
     height, width = depth_m.shape
-    for _ in range(rng.integers(config.sticks + 1)):
-        start = np.array([rng.integers(width), rng.integers(height)])
-        angle = rng.uniform(0, 2 * np.pi)
-        end = start + rng.uniform(1, config.stick_length_px) * np.array([np.cos(angle), np.sin(angle)])
-        thickness = int(rng.integers(1, config.stick_width_px + 1))
-        points = [tuple(int(v) for v in point) for point in (start, end)]
-        cv2.line(depth_m, *points, color=float(rng.uniform(*config.random_range_m)), thickness=thickness)
+    rows = jnp.arange(height)[:, None] + jnp.round(shift_px[0]).astype(int)
+    columns = jnp.arange(width)[None, :] + jnp.round(shift_px[1]).astype(int)
+    return depth_m[jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)]
+
+
+def smooth_field(key: Array, shape: tuple[int, ...], correlation_px: float) -> Array:
+    """(..., H, W) Gaussian noise of unit variance at every pixel, correlated over `correlation_px`."""
+    *lead, height, width = shape
+    up, across = (_interpolation(size, correlation_px) for size in (height, width))
+    coarse = jax.random.normal(key, (*lead, up.shape[1], across.shape[1]))
+    return jnp.einsum("ij,...jk,lk->...il", up, coarse, across)
+
+
+def _interpolation(size: int, spacing_px: float) -> Array:
+    """(size, n) linear interpolation from n knots, rows of unit norm, so that the variance stays one."""
+    knots = math.ceil((size - 1) / max(spacing_px, 1.0)) + 1
+    place = jnp.arange(size)[:, None] * (knots - 1) / max(size - 1, 1)
+    weights = jnp.maximum(1.0 - jnp.abs(place - jnp.arange(knots)[None, :]), 0.0)
+    return weights / jnp.linalg.norm(weights, axis=1, keepdims=True)
+
+
+def draw_sticks(key: Array, depth_m: Array, config: DextrahConfig) -> Array:
+    """Thin segments of one random depth each over (H, W): every pixel starts one with probability `stick`."""
+    height, width = depth_m.shape
+    expected = config.stick * height * width
+    most = math.ceil(expected + MOST_STICKS * math.sqrt(expected))
+    share = expected / max(most, 1)
+    rows, columns = jnp.arange(height)[:, None] + 0.5, jnp.arange(width)[None, :] + 0.5
+
+    def draw(i: Array, picture: Array) -> Array:
+        row, column, angle, length, thick, value, there = jax.random.uniform(jax.random.fold_in(key, i), (7,))
+        v, u = rows - row * height, columns - column * width
+        sine, cosine = jnp.sin(2 * jnp.pi * angle), jnp.cos(2 * jnp.pi * angle)
+        along, across = u * cosine + v * sine, v * cosine - u * sine
+        half_width = (1.0 + thick * (config.stick_width_px - 1.0)) / 2
+        on = (along >= 0) & (along <= length * config.stick_length_px) & (jnp.abs(across) <= half_width)
+        depth = config.random_near_m + value * (config.random_far_m - config.random_near_m)
+        return jnp.where(on & (there < share), depth, picture)
+
+    return jax.lax.fori_loop(0, most, draw, depth_m)

@@ -7,15 +7,11 @@ from ddgrasp import contract
 from ddgrasp.config import RecordConfig, StereoConfig
 from mjx_envs.camera import Buffers, Camera, look_at
 from mjx_envs.raycast_numpy import render, render_depth
-from sensors.active_stereo import ActiveStereo, Material
+from sensors.active_stereo import ActiveStereo
+from sensors.materials import rig_materials
 
 FAR_M = 10.0
 """Beyond the matcher's range, so that range limits come from the camera alone."""
-TABLE_TEXTURE = 0.35
-ROBOT_SPECULAR = 0.3
-OBJECT_SPECULAR = {"cube": 0.05, "apple": 0.6, "banana": 0.15}
-"""Objects fail differently: a waxed apple glares, raw wood does not."""
-DEFAULT_OBJECT_SPECULAR = 0.2
 
 
 class RigCamera:
@@ -46,22 +42,6 @@ class RigCamera:
         """(H, W, 3) uint8 colour, aligned to depth."""
         buffers = render(self.model, data, self.stereo.camera(T_world_cam), far_m=FAR_M)
         return np.rint(np.clip(buffers.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
-
-
-def rig_materials(model: mujoco.MjModel, object_name: str = "") -> dict[int, Material]:
-    """Near-infrared materials of every geom from its colour and from what it belongs to."""
-    object_body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "object")
-    shine = OBJECT_SPECULAR.get(object_name, DEFAULT_OBJECT_SPECULAR)
-    materials = {}
-    for geom in range(model.ngeom):
-        rgb = model.geom_rgba[geom]
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
-            materials[geom] = Material.from_rgb(rgb, texture=TABLE_TEXTURE)
-        elif model.geom_bodyid[geom] == object_body:
-            materials[geom] = Material.from_rgb(rgb, specular=shine)
-        else:
-            materials[geom] = Material.from_rgb(rgb, specular=ROBOT_SPECULAR)
-    return materials
 
 
 def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> np.ndarray:

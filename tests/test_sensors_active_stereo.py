@@ -12,7 +12,8 @@ import pytest
 from ddgrasp.config import RecordConfig, StereoConfig, WorldConfig
 from mjx_envs.camera import Buffers, Camera, nominal_camera
 from sensors import stats
-from sensors.active_stereo import ActiveStereo, Material
+from sensors.active_stereo import ActiveStereo
+from sensors.materials import Material
 from sensors.rig_camera import RigCamera, jittered_pose
 
 PROFILE = WorldConfig().profile

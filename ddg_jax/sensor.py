@@ -1,0 +1,96 @@
+"""Camera models by name: the families of sensors/ and the learned one, behind one call (sensors/sense.py)."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ddg_jax import normalise
+from ddg_jax.graft import artefact_mask, graft_mask
+from ddg_jax.prior import C_LIMIT
+from ddg_jax.sample import Generator, sample
+from ddgrasp.config import SensorConfig
+from ddgrasp.contract import CameraProfile
+from ddgrasp.errors import UserError, unknown_name
+from sensors import procedural
+from sensors.sense import Sense, batched, ideal
+from sensors.stereo_sensor import stereo
+
+SENSORS: dict[str, Callable[[SensorConfig, CameraProfile], Sense]] = {
+    "ideal": lambda config, profile: ideal(),
+    "dextrah": lambda config, profile: procedural.dextrah(config.dextrah, profile),
+    "kinect": lambda config, profile: procedural.kinect(config.kinect, profile),
+    "stereo": lambda config, profile: stereo(config.stereo, profile),
+    "learned": lambda config, profile: learned(_fitted(config.learned_from)),
+}
+"""Every camera model that a configuration can name."""
+
+
+def make_sensor(config: SensorConfig, profile: CameraProfile) -> Sense:
+    """The camera model that `config` names, for pictures of `profile`.
+
+    Raises:
+        UserError: unknown name, or no fitted generator where `learned` looks for one.
+    """
+    if config.name not in SENSORS:
+        raise unknown_name("sensor", config.name, SENSORS)
+    return SENSORS[config.name](config, profile)
+
+
+def learned(generator: Generator) -> Sense:
+    """Sampling and grafting by a fitted generator; every picture is an episode of one frame.
+
+    Sampling is traced with the rest; the prior, a function of NumPy arrays, runs on the host. For whole
+    data sets `ddg_jax.sample.generate` is quicker: it batches.
+
+    Raises:
+        UserError: the generator's prior needs a network on colour pictures, which cannot run in a callback.
+    """
+    config = generator.config
+    if generator.prior.needs_sim_rgb:
+        raise UserError(
+            f"A learned sensor with the prior {config.prior!r} on rgb cannot be jitted: fit with "
+            "--ddg.prior-in-sim depth, or use ddg_jax.sample.generate."
+        )
+    size = (config.height_px, config.width_px)
+
+    def prior_on_host(depth_m) -> np.ndarray:
+        depth = np.asarray(depth_m)
+        frames = [generator.prior.from_sim(frame[None], None) for frame in depth.reshape(-1, *size)]
+        return np.concatenate(frames).astype(np.float32).reshape(depth.shape)
+
+    def sense_frame(key: Array, depth_m: Array, rgb: Array | None) -> Array:
+        _check_aspect(depth_m.shape, size)
+        clean = jax.image.resize(depth_m, size, "nearest")
+        shape = jax.ShapeDtypeStruct(size, jnp.float32)
+        c = jax.pure_callback(prior_on_host, shape, clean, vmap_method="broadcast_all")
+        c = jnp.clip(c, -C_LIMIT, C_LIMIT)[None]
+        first = jnp.zeros(1, jnp.int32)
+        x = sample(config, key, generator.params, c, first[0], first, steps=config.sample_steps)[0]
+        threshold = config.noise_threshold
+        predicted = normalise.to_depth(x, config.near_m, config.far_m, threshold)
+        mask, predicted = (
+            jax.image.resize(a, depth_m.shape, "nearest") for a in (artefact_mask(x, threshold), predicted)
+        )
+        return graft_mask(depth_m, predicted, mask)
+
+    return batched(sense_frame)
+
+
+def _fitted(directory: str) -> Generator:
+    if not directory:
+        raise UserError(
+            "sensor.learned_from is empty; expected the stage directory of a fitted generator, for example "
+            "runs/demo/ddg (`ddgrasp ddg fit` makes one)."
+        )
+    return Generator.load(directory)
+
+
+def _check_aspect(shape: tuple[int, ...], size: tuple[int, int]) -> None:
+    if abs(shape[1] * size[0] / (shape[0] * size[1]) - 1) > 0.02:
+        raise UserError(
+            f"Depth is {shape[1]}x{shape[0]}; the generator was fitted at {size[1]}x{size[0]}: render with "
+            "that aspect ratio."
+        )
