@@ -163,6 +163,38 @@ class Record(_OneStage):
 
 
 @dataclass(frozen=True)
+class RecordImport:
+    """Turn RealSense .bag files or folders of colour and depth pictures into recordings."""
+
+    source: tyro.conf.Positional[Path]
+    """A .bag, a folder of them, a folder with depth/ and color/ (or rgb/), or a folder of such folders."""
+    out: Path = Path("recordings")
+    """Each source becomes a folder in it."""
+    depth_unit_m: float = 0.0
+    """Metres per unit of depth; 0 takes a .bag's own, 0.001 for integer pictures, 1 for floats."""
+    sensor: str = ""
+    """Camera model, for example D455; a .bag names its own."""
+    fx_px: float = 0.0
+    """Focal length of the depth pictures in pixels; 0 if unknown."""
+    baseline_m: float = 0.0
+    """Distance between the imagers; 0 if unknown."""
+    consecutive: bool = False
+    """The pictures follow each other in time (a .bag's do)."""
+
+    def run(self) -> None:
+        from sensors import importers
+
+        if not 0 <= self.depth_unit_m <= 1:
+            raise UserError(f"--depth-unit-m is {self.depth_unit_m}; expected 0 (known) or up to 1 (metres).")
+        known = {"sensor": self.sensor, "fx_px": self.fx_px, "baseline_m": self.baseline_m}
+        meta = {name: value for name, value in known.items() if value}
+        if self.consecutive:
+            meta["consecutive_frames"] = True
+        sources = importers.find_sources(self.source, self.depth_unit_m, meta)
+        print(importers.summary(*importers.import_all(sources, self.out)))
+
+
+@dataclass(frozen=True)
 class DDGFit(_OneStage):
     """Fit the depth noise model on recordings: the run's own, or any in --data."""
 
@@ -387,6 +419,7 @@ COMMANDS: dict[str, type] = {
     "teacher eval": TeacherEval,
     "demos collect": DemosCollect,
     "record": Record,
+    "record import": RecordImport,
     "ddg fit": DDGFit,
     "ddg sample": DDGSample,
     "student train": StudentTrain,

@@ -226,7 +226,7 @@ class StereoConfig:
     """Dots of the pattern in the imager's field of view."""
     dot_radius_mrad: float = 3.3
     """Gaussian radius of a dot as the imagers see it."""
-    projector_power: float = 5.0
+    projector_power: float = 1.8
     """Irradiance of a dot's centre at one metre, relative to the ambient light's."""
     speckle_contrast: float = 0.27
     """Standard deviation of laser speckle relative to the dot's light, fresh in every frame and imager.
@@ -257,7 +257,7 @@ class StereoConfig:
     """Largest disagreement of the left-right check, pixels."""
     speckle_px: int = 16
     """Smaller islands of disparity are removed."""
-    residual_limit: float = 1.1
+    residual_limit: float = 1.15
     """Largest matching residual relative to the local contrast of both images; 1.4 is pure noise."""
     contrast_limit: float = 8.0
     """Smallest local contrast of the left picture, grey levels of 255 (a D4xx's texture threshold): darker

@@ -43,6 +43,9 @@ TEXELS_PER_PX = 3
 TEXTURE_PX, TEXTURE_PX_PER_M = 512, 400.0
 """Size and scale of the albedo texture that `Material.texture` weighs (a 1.3 m tile)."""
 CONTRAST_WINDOW_PX = 9
+"""The pictures are compared less their mean over this window."""
+TEXTURE_WINDOW_PX = 7
+"""Contrast is measured over this window: small enough for a dark object on a bright table."""
 OTHER_SURFACE_PX = 0.5
 """Neighbouring disparities further apart than this belong to two surfaces."""
 
@@ -63,7 +66,7 @@ class ActiveStereo:
         self._vignetting = (1.0 + self._x**2 + self._y**2) ** np.float32(-VIGNETTING / 2)
         self._projector = _projector_profile(profile)
         self._pattern = _dot_pattern(config, profile, self._projector)
-        self._texture = _albedo_texture(config.pattern_seed)
+        self._texture = albedo_texture(config.pattern_seed, TEXTURE_PX, TEXTURE_PX)
         self._fb_px_m = p.fx_px * p.baseline_m
         self._disparities = 16 * math.ceil(self._fb_px_m / config.min_range_m / 16)
         self._matcher = _matcher(config, self._disparities)
@@ -127,8 +130,8 @@ class ActiveStereo:
         columns = np.arange(self.profile.width_px, dtype=np.float32)[None, :]
         # The left band has no counterpart in the right picture.
         valid = (coarse > 0) & (columns - coarse >= 0)
+        contrast = _contrast(left)
         left, right = _without_mean(left), _without_mean(right)
-        contrast = np.sqrt(cv2.blur(left * left, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX)))
         fine, residual = _refine(left, right, coarse, self.config)
         valid &= (residual < self.config.residual_limit) & (contrast > self.config.contrast_limit)
         steps = self.config.subpixel_steps
@@ -269,13 +272,12 @@ def _dot_pattern(config: StereoConfig, profile: CameraProfile, projector: Camera
     return (np.minimum(texture, 2.0) * cosine**PROJECTOR_FALLOFF).astype(np.float32)
 
 
-def _albedo_texture(seed: int) -> np.ndarray:
-    """(T, T) float32 noise of unit variance over several octaves, seamless."""
+def albedo_texture(seed: int, height_px: int, width_px: int) -> np.ndarray:
+    """(height, width) float32 noise of unit variance over several octaves, seamless."""
     rng = np.random.default_rng(seed)
-    frequency = np.hypot(*np.meshgrid(*[np.fft.fftfreq(TEXTURE_PX)] * 2))
+    frequency = np.hypot(np.fft.fftfreq(height_px)[:, None], np.fft.fftfreq(width_px)[None, :])
     frequency[0, 0] = np.inf
-    spectrum = np.fft.fft2(rng.standard_normal((TEXTURE_PX, TEXTURE_PX))) / frequency
-    noise = np.fft.ifft2(spectrum).real
+    noise = np.fft.ifft2(np.fft.fft2(rng.standard_normal((height_px, width_px))) / frequency).real
     return (noise / noise.std()).astype(np.float32)
 
 
@@ -315,6 +317,13 @@ def _reflect(normal, to_light, to_view) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(SHININESS_DOUBLINGS - 1):
         squared = squared * squared
     return diffuse, squared * (diffuse > 0)
+
+
+def _contrast(picture: np.ndarray) -> np.ndarray:
+    """(H, W) float32: standard deviation of the grey levels around each pixel."""
+    window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)
+    mean, square = cv2.blur(picture.astype(np.float32), window), cv2.sqrBoxFilter(picture, cv2.CV_32F, window)
+    return np.sqrt(np.maximum(square - mean * mean, 0.0))
 
 
 def _without_mean(picture: np.ndarray) -> np.ndarray:

@@ -65,7 +65,7 @@ OBJECT_MATERIALS: dict[str, ObjectMaterial] = {
         {"slot_cylinder1": Material(0.06, 4.0)},
     ),
     "wheel": ObjectMaterial(
-        Material(0.02, 0.05),
+        Material(0.03, 0.05),
         "tyre of rubber filled with carbon black, which absorbs the near infrared as well; " + _ESTIMATE,
         {"slot_cylinder0": Material(0.60, 0.30)},
     ),

@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ddgrasp.contract import DEPTH_UNIT_M
+from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
 
 META_FILE = "meta.json"
@@ -249,6 +249,7 @@ class RecordingWriter:
             "height": self._size[0],
             "depth_unit_m": DEPTH_UNIT_M,
             "invalid_value": 0,
+            "contract_version": CONTRACT_VERSION,
             "invalid_fraction_mean": round(self._invalid / self._frames, 4),
         }
         text = json.dumps({**self._meta, **meta}, indent=1) + "\n"
@@ -295,6 +296,12 @@ def _read_meta(path: Path) -> dict[str, Any]:
         raise UserError(
             f"{file}: depth_unit_m is {unit!r}; expected metres per count of a 16-bit depth picture, "
             "0.001 for millimetres."
+        )
+    version = meta.get("contract_version", CONTRACT_VERSION)  # other people's recordings name none
+    if version != CONTRACT_VERSION:
+        raise UserError(
+            f"{file}: written with contract version {version!r}, this code has {CONTRACT_VERSION}: record or "
+            "import it again, or use the release that made it."
         )
     return meta
 

@@ -1,8 +1,9 @@
 """The active-stereo camera as a camera model: it looks at the surfaces of a clean depth picture.
 
 It runs on the host (OpenCV's matcher), behind `jax.pure_callback`: jittable, not accelerated. What the
-picture does not show is guessed (sensors/reprojection.py), materials come from its colour; the rig's own
-camera (sensors/rig_camera.py) renders the scene instead.
+picture does not show is guessed (sensors/reprojection.py), materials come from its colour, and every surface
+has the rig's table texture, fixed to the picture. The rig's own camera (sensors/rig_camera.py) renders the
+scene instead.
 """
 
 import threading
@@ -16,7 +17,8 @@ from ddgrasp.config import StereoConfig
 from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
 from ddgrasp.errors import UserError
 from mjx_envs.camera import nominal_camera
-from sensors.active_stereo import ActiveStereo
+from sensors.active_stereo import ActiveStereo, albedo_texture
+from sensors.materials import TABLE_TEXTURE
 from sensors.reprojection import from_beside
 from sensors.sense import Sense, batched
 
@@ -28,6 +30,8 @@ def stereo(config: StereoConfig, profile: CameraProfile) -> Sense:
     """The rig's camera on clean depth of `profile`'s size; the light is that of the nominal extrinsics."""
     camera = ActiveStereo(config, profile)
     T_world_cam = nominal_camera(profile).T_world_cam
+    texture = albedo_texture(config.pattern_seed, profile.height_px, profile.width_px)
+    wear = 1.0 + TABLE_TEXTURE * texture[..., None]
     one_at_a_time = threading.Lock()  # OpenCV's matcher keeps buffers of its own
 
     def on_host(seed, depth_m, rgb) -> np.ndarray:
@@ -35,7 +39,8 @@ def stereo(config: StereoConfig, profile: CameraProfile) -> Sense:
         out = np.empty(depth_m.shape, np.float32)
         with one_at_a_time:
             for index in np.ndindex(depth_m.shape[:-2]):
-                render = from_beside(depth_m[index], rgb[index], profile, T_world_cam)
+                worn = np.clip(rgb[index] * wear, 0, 1)
+                render = from_beside(depth_m[index], worn, profile, T_world_cam)
                 rng = np.random.default_rng(seed[index])
                 out[index] = camera.sense(render, T_world_cam, rng) * np.float32(DEPTH_UNIT_M)
         return out

@@ -1,0 +1,238 @@
+"""Recordings from elsewhere into the format of `recordings.py`: folders of pictures, RealSense `.bag` files.
+
+Only pictures and what the camera is are kept: no pose, no CAD, no pairing. A frame that cannot be used is
+named and left out; a source none of whose frames can be used, or whose depth is in another unit, is refused.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ddgrasp.contract import DEPTH_UNIT_M
+from ddgrasp.errors import UserError
+from sensors.recordings import FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M, RecordingWriter
+
+COLOR_FOLDERS = ("color", "colour", "rgb", "image")
+DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
+_ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
+_UINT16_MAX = np.iinfo(np.uint16).max
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """One frame as its source has it."""
+
+    name: str
+    depth: np.ndarray | None
+    """(H, W) counts or floating-point lengths; None if it cannot be read."""
+    rgb: np.ndarray | None
+    """(h, w, 3) uint8; None if there is none."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Frames in time order and what is known about their camera."""
+
+    path: Path
+    frames: Callable[[], Iterator[RawFrame]]
+    depth_unit_m: float
+    """Metres per count of integer depth; for floating-point depth, metres per unit."""
+    meta: dict[str, Any]
+    """Fields of meta.json."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What became of one source."""
+
+    path: Path
+    frames: int
+    skipped: tuple[str, ...]
+    """Frames left out: name and reason."""
+
+
+def import_recording(source: Source, path: Path) -> Imported:
+    """Writes the usable frames of `source` to a recording at `path`, which appears only when complete.
+
+    Raises:
+        UserError: no usable frame, or depth whose median cannot be a D4xx's in that unit.
+    """
+    skipped, medians_m, size, frames = [], [], None, 0
+    with RecordingWriter(path, source.meta) as writer:
+        for frame in source.frames():
+            depth_mm, reason = _usable(frame, source.depth_unit_m, size)
+            if reason:
+                skipped.append(f"{frame.name}: {reason}")
+                continue
+            assert depth_mm is not None and frame.rgb is not None
+            size = depth_mm.shape
+            frames += 1
+            medians_m.append(float(np.median(depth_mm[depth_mm > 0])) * DEPTH_UNIT_M)
+            writer.add(frame.rgb, depth_mm)
+        if not frames:
+            raise UserError(
+                f"{source.path}: none of its {len(skipped)} frames can be used "
+                f"({skipped[0] if skipped else 'it is empty'})."
+            )
+        _check_unit(source, float(np.median(medians_m)))
+    return Imported(path, frames, tuple(skipped))
+
+
+def import_all(sources: list[Source], out: Path) -> tuple[list[Imported], list[str]]:
+    """Imports each source to `out`/<its name>; (what was imported, why others were refused).
+
+    Raises:
+        UserError: every one was refused.
+    """
+    done, refused = [], []
+    for source in sources:
+        try:
+            done.append(import_recording(source, out / source.path.stem))
+        except UserError as error:
+            refused.append(str(error))
+    if not done:
+        raise UserError(refused[0])
+    return done, refused
+
+
+def summary(done: list[Imported], refused: list[str]) -> str:
+    """What was imported and left out, counts last."""
+    lines = [f"refused: {why}" for why in refused]
+    lines += [f"{one.path}: left out {what}" for one in done for what in one.skipped]
+    lines += [f"{one.path}: {one.frames} frames" for one in done]
+    frames, skipped = sum(one.frames for one in done), sum(len(one.skipped) for one in done)
+    return "\n".join(
+        [
+            *lines,
+            f"{len(done)} recordings with {frames} frames imported; "
+            f"left out: {skipped} frames, {len(refused)} recordings",
+        ]
+    )
+
+
+def _usable(
+    frame: RawFrame, unit_m: float, size: tuple[int, ...] | None
+) -> tuple[np.ndarray | None, str]:
+    """((H, W) uint16 millimetres, "") or (None, why the frame is left out)."""
+    depth = frame.depth
+    if depth is None:
+        return None, "depth cannot be read"
+    if depth.ndim != 2 or depth.dtype == np.uint8:
+        return None, f"depth is {depth.dtype} {depth.shape}, expected one channel of 16 bits or floats"
+    if frame.rgb is None:
+        return None, "colour is missing or cannot be read"
+    if size is not None and depth.shape != size:
+        return None, f"depth is {depth.shape[1]}x{depth.shape[0]}, the frames before it {size[1]}x{size[0]}"
+    millimetres = np.nan_to_num(depth.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    millimetres = np.rint(millimetres * (unit_m / DEPTH_UNIT_M))
+    # What does not fit 16 bits is out of a D4xx's range: no reading.
+    millimetres[(millimetres < 0) | (millimetres > _UINT16_MAX)] = 0
+    if not millimetres.any():
+        return None, "no valid depth pixel"
+    return millimetres.astype(np.uint16), ""
+
+
+def _check_unit(source: Source, median_m: float) -> None:
+    if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
+        return
+    factor = DEPTH_UNIT_M if median_m > FARTHEST_MEDIAN_M else 1.0 / DEPTH_UNIT_M
+    raise UserError(
+        f"{source.path}: median depth {median_m:.4g} m with {source.depth_unit_m:g} m per unit; expected "
+        f"{NEAREST_MEDIAN_M:g} to {FARTHEST_MEDIAN_M:g} m: give its unit, perhaps "
+        f"--depth-unit-m {source.depth_unit_m * factor:g}."
+    )
+
+
+# --- folders of pictures ---------------------------------------------------------------------------
+
+
+def folder_sources(root: Path, depth_unit_m: float, meta: dict[str, Any]) -> list[Source]:
+    """`root` if it has depth/ and a colour folder, else every folder in it that does.
+
+    Raises:
+        UserError: neither.
+    """
+    folders = [root] if _is_pair(root) else sorted(p for p in root.iterdir() if _is_pair(p))
+    if not folders:
+        raise UserError(
+            f"{root}: no depth/ beside one of {', '.join(f'{n}/' for n in COLOR_FOLDERS)} in it or in its "
+            "folders; put the pictures there, named alike."
+        )
+    return [folder_source(folder, depth_unit_m, meta) for folder in folders]
+
+
+def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> Source:
+    """Pictures depth/*.png (16 bits), .npy or .tif, matched by name with those of the colour folder.
+
+    `depth_unit_m` 0 takes millimetres for integers, metres for floats.
+    """
+    files = sorted(p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
+    if not files:
+        raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
+    if not depth_unit_m:
+        first = next((d for d in map(_read_depth, files) if d is not None), None)
+        floats = first is not None and np.issubdtype(first.dtype, np.floating)
+        depth_unit_m = 1.0 if floats else DEPTH_UNIT_M
+    colors = {_key(p): p for p in _color_folder(folder).iterdir() if p.suffix.lower() in COLOR_SUFFIXES}
+
+    def frames() -> Iterator[RawFrame]:
+        for file in files:
+            color = colors.get(_key(file))
+            yield RawFrame(file.name, _read_depth(file), None if color is None else _read_rgb(color))
+
+    return Source(folder, frames, depth_unit_m, meta)
+
+
+def _is_pair(folder: Path) -> bool:
+    return (folder / "depth").is_dir() and any((folder / name).is_dir() for name in COLOR_FOLDERS)
+
+
+def _color_folder(folder: Path) -> Path:
+    return next(folder / name for name in COLOR_FOLDERS if (folder / name).is_dir())
+
+
+def _key(file: Path) -> str:
+    """The file's name without what says whether it is depth or colour: 0007_depth and 0007_rgb are a pair."""
+    words = file.stem.lower().replace("-", "_").split("_")
+    return "_".join(word for word in words if word not in _ROLE_WORDS)
+
+
+def _read_depth(file: Path) -> np.ndarray | None:
+    if file.suffix.lower() == ".npy":
+        try:
+            return np.load(file, allow_pickle=False)
+        except (ValueError, EOFError, OSError):
+            return None
+    return cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED) if file.stat().st_size else None
+
+
+def _read_rgb(file: Path) -> np.ndarray | None:
+    bgr = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR) if file.stat().st_size else None
+    return None if bgr is None else cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+# --- anything --------------------------------------------------------------------------------------
+
+
+def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> list[Source]:
+    """A `.bag` file, a folder of them, or folders of pictures.
+
+    Raises:
+        UserError: nothing there that can be imported.
+    """
+    if not path.exists():
+        raise UserError(f"{path}: no such file or folder; expected a .bag, or a folder of pictures or bags.")
+    bags = [path] if path.is_file() else sorted(path.glob("*.bag"))
+    if not bags:
+        return folder_sources(path, depth_unit_m, meta)
+    if wrong := [bag for bag in bags if bag.suffix != ".bag"]:
+        raise UserError(f"{wrong[0]}: a file of type {wrong[0].suffix!r}; expected a RealSense .bag.")
+    from sensors.bag import bag_source
+
+    sources = [bag_source(bag) for bag in bags]
+    return [replace(s, depth_unit_m=depth_unit_m or s.depth_unit_m, meta={**s.meta, **meta}) for s in sources]
