@@ -272,7 +272,7 @@ class StereoConfig:
 
 @dataclass(frozen=True)
 class DextrahConfig:
-    """Depth noise as DextrAH-G trains with (sensors/procedural.py); pixels are those of its 160 x 120 pictures."""
+    """Depth noise as DextrAH-G trains with (sensors/procedural.py), in pixels of its 160 x 120 pictures."""
 
     shift_px: float = 0.5
     """Standard deviation of the field by which pixels look up their depth beside themselves (sigma_s)."""

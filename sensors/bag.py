@@ -1,4 +1,4 @@
-"""Frames of a RealSense `.bag` through pyrealsense2 (`pip install -e '.[realsense]'`), the native depth stream.
+"""Frames of a RealSense `.bag` through pyrealsense2 (`pip install -e '.[realsense]'`), depth unaligned.
 
 Written against the documented API of pyrealsense2 2.56; no `.bag` was at hand to run it on.
 """

@@ -62,9 +62,7 @@ def compare(
     return Comparison(known, rig, object_losses(scenes), skipped)
 
 
-def measure_real(
-    folder: Path, profile: CameraProfile, progress: Progress
-) -> tuple[list[Figures], list[str]]:
+def measure_real(folder: Path, profile: CameraProfile, progress: Progress) -> tuple[list[Figures], list[str]]:
     """Figures of every recording at its own size and decimated to about the rig's; why others were left out.
 
     Raises:
@@ -98,9 +96,7 @@ def _losses(scenes: list[StandingScene]) -> dict[str, float]:
     return {
         "pixels": float(np.mean([valid.shape[1] for valid in pixels])),
         "invalid_fraction": 1.0 - float(np.mean(np.concatenate([v.mean(axis=0) for v in pixels]))),
-        "flicker_fraction": float(
-            np.mean(np.concatenate([(v[1:] != v[:-1]).mean(axis=0) for v in pixels]))
-        ),
+        "flicker_fraction": float(np.mean(np.concatenate([(v[1:] != v[:-1]).mean(axis=0) for v in pixels]))),
     }
 
 
@@ -149,7 +145,9 @@ def _table(title: str, cameras: list[Figures], rows: list[tuple[str, list[str]]]
     from rich import box
     from rich.table import Table
 
-    table = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    table = Table(
+        title=title or None, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False
+    )
     table.add_column("")
     for camera in cameras:
         table.add_column(camera.camera, justify="right")

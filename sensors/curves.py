@@ -171,7 +171,11 @@ def _tally(frame: np.ndarray, stream: Stream) -> _Tally:
     s, lost = surface(frame, stream.fx_px, stream.fb_px_m), frame == 0
     inside = s.seen & (s.depth_m >= DEPTH_BINS_M[0]) & (s.depth_m < DEPTH_BINS_M[-1])
     smooth = inside & np.isfinite(s.angle_deg)
-    counted = {"depth_m": (s.depth_m, smooth), "edge_px": (s.edge_px, inside), "angle_deg": (s.angle_deg, smooth)}
+    counted = {
+        "depth_m": (s.depth_m, smooth),
+        "edge_px": (s.edge_px, inside),
+        "angle_deg": (s.angle_deg, smooth),
+    }
     rates = {
         name: tuple(np.histogram(values[mask], RATE_BINS[name])[0] for mask in (where & lost, where))
         for name, (values, where) in counted.items()

@@ -153,9 +153,7 @@ def from_json(values: dict[str, Any]) -> Figures:
         for name, c in values.get("curves", {}).items()
     }
     scalars = {k: float("nan") if v is None else v for k, v in values["scalars"].items()}
-    return Figures(
-        values["camera"], values["width_px"], values["height_px"], values["frames"], scalars, made
-    )
+    return Figures(values["camera"], values["width_px"], values["height_px"], values["frames"], scalars, made)
 
 
 def published() -> list[Figures]:

@@ -65,21 +65,20 @@ def import_recording(source: Source, path: Path) -> Imported:
     skipped, medians_m, size, frames = [], [], None, 0
     with RecordingWriter(path, source.meta) as writer:
         for frame in source.frames():
+            medians_m += _median_m(frame, source.depth_unit_m)
             depth_mm, reason = _usable(frame, source.depth_unit_m, size)
-            if reason:
+            if depth_mm is None or frame.rgb is None:
                 skipped.append(f"{frame.name}: {reason}")
                 continue
-            assert depth_mm is not None and frame.rgb is not None
             size = depth_mm.shape
             frames += 1
-            medians_m.append(float(np.median(depth_mm[depth_mm > 0])) * DEPTH_UNIT_M)
             writer.add(frame.rgb, depth_mm)
+        _check_unit(source, medians_m)
         if not frames:
             raise UserError(
                 f"{source.path}: none of its {len(skipped)} frames can be used "
                 f"({skipped[0] if skipped else 'it is empty'})."
             )
-        _check_unit(source, float(np.median(medians_m)))
     return Imported(path, frames, tuple(skipped))
 
 
@@ -115,9 +114,7 @@ def summary(done: list[Imported], refused: list[str]) -> str:
     )
 
 
-def _usable(
-    frame: RawFrame, unit_m: float, size: tuple[int, ...] | None
-) -> tuple[np.ndarray | None, str]:
+def _usable(frame: RawFrame, unit_m: float, size: tuple[int, ...] | None) -> tuple[np.ndarray | None, str]:
     """((H, W) uint16 millimetres, "") or (None, why the frame is left out)."""
     depth = frame.depth
     if depth is None:
@@ -137,7 +134,16 @@ def _usable(
     return millimetres.astype(np.uint16), ""
 
 
-def _check_unit(source: Source, median_m: float) -> None:
+def _median_m(frame: RawFrame, unit_m: float) -> list[float]:
+    """The median of a frame's positive depths in metres; nothing if it has none."""
+    if frame.depth is None or frame.depth.dtype == np.uint8:
+        return []
+    positive = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
+    return [float(np.median(positive)) * unit_m] if positive.size else []
+
+
+def _check_unit(source: Source, medians_m: list[float]) -> None:
+    median_m = float(np.median(medians_m)) if medians_m else NEAREST_MEDIAN_M
     if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
         return
     factor = DEPTH_UNIT_M if median_m > FARTHEST_MEDIAN_M else 1.0 / DEPTH_UNIT_M

@@ -44,7 +44,9 @@ class ObjectMaterial:
 
 
 _ESTIMATE = "our estimate"
-_FRUIT = "half of the light above 800 nm, whatever the colour (Merzlyak et al. 2003, apples); gloss: " + _ESTIMATE
+_FRUIT = (
+    "half of the light above 800 nm, whatever the colour (Merzlyak et al. 2003, apples); gloss: " + _ESTIMATE
+)
 _STALK = Material(0.45, 0.02)
 
 OBJECT_MATERIALS: dict[str, ObjectMaterial] = {

@@ -94,7 +94,9 @@ def _points(place: np.ndarray, inverse: np.ndarray) -> Iterator[tuple[np.ndarray
         origin = columns[:, :-1] + (t > 0.5)
         yield rows[:, :-1][on], at[on].astype(int), (a + t * (b - a))[on], origin[on]
     # A pixel at its surface's end covers half a pixel more.
-    yield rows.ravel(), np.rint(place).astype(int).ravel(), inverse.ravel() * (1 - 1e-4), columns.ravel()
+    end = np.ones(place.shape, bool)
+    end[:, 1:-1] = ~(joined[:, :-1] & joined[:, 1:])
+    yield rows[end], np.rint(place[end]).astype(int), inverse[end], columns[end]
 
 
 def _filled(near: np.ndarray, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

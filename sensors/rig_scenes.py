@@ -25,7 +25,12 @@ class StandingScene:
 
 
 def standing_scenes(
-    config: RecordConfig, profile: CameraProfile, objects: Sequence[str], per_object: int, frames: int, seed: int
+    config: RecordConfig,
+    profile: CameraProfile,
+    objects: Sequence[str],
+    per_object: int,
+    frames: int,
+    seed: int,
 ) -> Iterator[StandingScene]:
     """`per_object` scenes of every object: the robot at home, the object and the camera somewhere else each.
 

@@ -34,7 +34,9 @@ def batched(sense_frame: SenseFrame) -> Sense:
         depth = check_depth(depth_m)
         colour = None if rgb is None else to_unit_rgb(rgb)
         if colour is not None and colour.shape != (*depth.shape, 3):
-            raise UserError(f"rgb is {colour.shape}; expected {(*depth.shape, 3)}, as depth is {depth.shape}.")
+            raise UserError(
+                f"rgb is {colour.shape}; expected {(*depth.shape, 3)}, as depth is {depth.shape}."
+            )
         if depth.ndim == 2:
             return _keep_invalid(depth, sense_frame(key, depth, colour))
         lead, picture = depth.shape[:-2], depth.shape[-2:]

@@ -7,6 +7,7 @@ from ddg_jax import data, prior
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from sensors.holes import fill_from_background
 from sensors.recordings import RecordingWriter
 
 
@@ -17,16 +18,16 @@ def test_holes_take_the_farther_neighbour_of_their_row():
     truth = inverse.copy()
     inverse[:, 4:6] = 0  # the shadow left of the near surface
     inverse[:, 0] = 0  # left band
-    np.testing.assert_array_equal(prior.fill_from_background(inverse), truth)
+    np.testing.assert_array_equal(fill_from_background(inverse), truth)
 
 
 def test_rows_without_a_reading_take_the_nearest_row():
     inverse = np.ones((12, 10), np.float32)
     inverse[8:] = 3.0
     inverse[:3] = 0
-    filled = prior.fill_from_background(inverse)
+    filled = fill_from_background(inverse)
     assert (filled[:3] == 1).all() and (filled[8:] == 3).all()
-    assert (prior.fill_from_background(np.zeros((4, 4), np.float32)) == 0).all()
+    assert (fill_from_background(np.zeros((4, 4), np.float32)) == 0).all()
 
 
 def test_prior_ignores_affine_changes_of_inverse_depth():

@@ -121,13 +121,16 @@ def test_frames_are_reproducible_and_differ_by_seed():
     assert np.mean(first != other) > 0.2
 
 
-def test_rig_is_near_the_measured_d455(rig_frames):
-    """A D455 at 640x360: 10.7 % invalid, 188 holes (half at 320x180), 2.0 mm at .75 m, 2.7 % flicker."""
+def test_rig_is_near_measured_cameras(rig_frames):
+    """A D435 decimated to this size: 8.0 % invalid, 12.8 holes per 10,000 px; a D455 2.0 mm at 0.75 m.
+
+    More: `ddgrasp sensors compare`, docs/sensors.md.
+    """
     measured = stats.measure(rig_frames)
-    assert 0.08 < measured.invalid_fraction < 0.16
-    assert 60 < measured.hole_components < 170
-    assert 1.3 < measured.temporal_deviation_mm < 2.8
-    assert 0.015 < measured.flicker_fraction < 0.045
+    assert 0.07 < measured.invalid_fraction < 0.11
+    assert 40 < measured.hole_components < 120
+    assert 1.5 < measured.temporal_deviation_mm < 2.4
+    assert 0.004 < measured.flicker_fraction < 0.03
     assert 15 <= measured.left_band_px <= 32
 
 
@@ -175,7 +178,7 @@ def test_jittered_pose_stays_near_the_nominal_one():
 
 def test_sensors_need_no_jax():
     code = (
-        "import sys, sensors.rig_camera, sensors.stage, sensors.procedural, sensors.recordings; "
+        "import sys, sensors.rig_camera, sensors.stage, sensors.compare, sensors.importers; "
         "assert 'jax' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])

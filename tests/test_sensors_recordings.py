@@ -189,3 +189,10 @@ def test_truncated_copy_of_a_real_recording_stays_readable(tmp_path):
         path.write_bytes(path.read_bytes()[:5000])
     recording = Recording.open(tmp_path / "boxes")
     assert len(recording) == 8 and len(recording.skipped) == 2
+
+
+def test_recording_of_another_contract_version_is_refused(tmp_path):
+    path = _write(tmp_path / "a")
+    _set_meta(path, contract_version=99)
+    with pytest.raises(UserError, match="contract version 99, this code has"):
+        Recording.open(path)

@@ -32,11 +32,11 @@ def scene() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def sensors() -> dict[str, Sense]:
-    config = DDGConfig(height_px=72, width_px=128, widths=(8, 16), blocks=(0, 1), attention_heads=0, sample_steps=2)
+    config = DDGConfig(
+        height_px=72, width_px=128, widths=(8, 16), blocks=(0, 1), attention_heads=0, sample_steps=2, noise_threshold=0.2
+    )
     params = init_params(config, jax.random.key(0))
-    made = {
-        name: make_sensor(SensorConfig(name=name), PROFILE) for name in SENSORS if name != "learned"
-    }
+    made = {name: make_sensor(SensorConfig(name=name), PROFILE) for name in SENSORS if name != "learned"}
     return {**made, "learned": learned(Generator(config, params, make_prior(config)))}
 
 
@@ -106,7 +106,9 @@ def test_disparity_noise_by_hand():
 def test_shift_looks_up_whole_pixels():
     depth = jnp.arange(12.0).reshape(3, 4) + 1
     shift = jnp.stack([jnp.full((3, 4), 0.9), jnp.full((3, 4), -1.2)])
-    np.testing.assert_array_equal(procedural.shifted(depth, shift), [[5, 5, 6, 7], [9, 9, 10, 11], [9, 9, 10, 11]])
+    np.testing.assert_array_equal(
+        procedural.shifted(depth, shift), [[5, 5, 6, 7], [9, 9, 10, 11], [9, 9, 10, 11]]
+    )
 
 
 def test_smooth_field_has_unit_variance_everywhere_and_is_correlated():
@@ -130,17 +132,25 @@ def test_dextrah_rates():
 
 def test_sticks_have_the_expected_number_and_one_depth_each():
     config = DextrahConfig(stick=0.001, random_near_m=3.0, random_far_m=4.0)
-    pictures = [np.asarray(procedural.draw_sticks(jax.random.key(i), jnp.ones(SIZE), config)) for i in range(40)]
+    pictures = [
+        np.asarray(procedural.draw_sticks(jax.random.key(i), jnp.ones(SIZE), config)) for i in range(40)
+    ]
     numbers = [len(np.unique(p)) - 1 for p in pictures]
     expected = 0.001 * SIZE[0] * SIZE[1]
     assert np.mean(numbers) == pytest.approx(expected, rel=0.15)
     assert all(p[p != 1.0].min(initial=3.0) >= 3.0 for p in pictures)
-    np.testing.assert_array_equal(procedural.draw_sticks(jax.random.key(0), jnp.ones(SIZE), DextrahConfig(stick=0.0)), 1.0)
+    np.testing.assert_array_equal(
+        procedural.draw_sticks(jax.random.key(0), jnp.ones(SIZE), DextrahConfig(stick=0.0)), 1.0
+    )
 
 
 def test_without_noise_the_procedural_models_change_nothing():
     depth, _ = scene()
     off = DextrahConfig(shift_px=0, disparity_px=0, dropout=0.0, random_value=0.0, stick=0.0)
-    np.testing.assert_allclose(procedural.dextrah(off, PROFILE)(jax.random.key(0), depth, None), depth, rtol=1e-5)
+    np.testing.assert_allclose(
+        procedural.dextrah(off, PROFILE)(jax.random.key(0), depth, None), depth, rtol=1e-5
+    )
     off = KinectConfig(shift_px=0, axial_per_m=0, steps_per_px=1e4)
-    np.testing.assert_allclose(procedural.kinect(off, PROFILE)(jax.random.key(0), depth, None), depth, rtol=1e-5)
+    np.testing.assert_allclose(
+        procedural.kinect(off, PROFILE)(jax.random.key(0), depth, None), depth, rtol=1e-5
+    )

@@ -1,11 +1,9 @@
-"""Hole and noise statistics on hand-made frames; procedural noise by its rates."""
+"""Hole and noise statistics on hand-made frames."""
 
 import numpy as np
 import pytest
 
-from ddgrasp.config import WorldConfig
 from sensors import stats
-from sensors.procedural import ProceduralConfig, corrupt
 
 
 def test_holes_are_counted_with_diagonal_neighbours():
@@ -34,26 +32,3 @@ def test_measure_by_hand():
 def test_decimation_is_the_median_of_valid_pixels():
     frame = np.array([[0, 10, 0, 0], [30, 20, 0, 0], [1, 2, 7, 0], [3, 4, 0, 9]], np.uint16)
     np.testing.assert_array_equal(stats.decimated(frame, 2), [[20, 0], [2, 7]])
-
-
-def test_procedural_rates_and_disparity_noise():
-    profile = WorldConfig().profile
-    clean = np.full((8, 180, 320), 0.8, np.float32)
-    clean[:, :, :40] = 0
-    config = ProceduralConfig(dropout=0.02, random_value=0.01, sticks=0)
-    noisy = corrupt(clean, np.random.default_rng(0), profile, config)
-    assert noisy.shape == clean.shape and noisy.dtype == np.float32
-    body = noisy[:, :, 60:]
-    assert np.mean(body == 0) == pytest.approx(0.02, abs=0.001)
-    near = body[np.abs(body - 0.8) < 0.03]
-    expected_m = config.disparity_px * 0.8**2 / (profile.fx_px * profile.baseline_m)
-    # Cubic interpolation of unit noise has a variance somewhat below one.
-    assert 0.6 * expected_m < near.std() < 1.1 * expected_m
-    np.testing.assert_array_equal(noisy, corrupt(clean, np.random.default_rng(0), profile, config))
-
-
-def test_procedural_without_noise_is_the_identity():
-    profile = WorldConfig().profile
-    clean = np.random.default_rng(0).uniform(0.4, 1.5, (2, 90, 160)).astype(np.float32)
-    off = ProceduralConfig(shift_px=0, disparity_px=0, dropout=0, random_value=0, sticks=0)
-    np.testing.assert_allclose(corrupt(clean, np.random.default_rng(0), profile, off), clean, rtol=1e-5)

@@ -1,0 +1,126 @@
+"""Recordings from elsewhere: what is kept, what is named and left out, what is refused."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ddgrasp.commands import parse
+from ddgrasp.errors import UserError
+from sensors import importers
+from sensors.recordings import Recording
+
+SIZE = (24, 32)
+
+
+def depth_mm(frame: int, size=SIZE) -> np.ndarray:
+    depth = np.random.default_rng(frame).integers(500, 1500, size).astype(np.uint16)
+    depth[:2] = 0
+    return depth
+
+
+def make_folder(root: Path, frames: int = 4, color: str = "rgb") -> Path:
+    (root / "depth").mkdir(parents=True)
+    (root / color).mkdir()
+    for i in range(frames):
+        assert cv2.imwrite(str(root / "depth" / f"{i:04d}_depth.png"), depth_mm(i))
+        assert cv2.imwrite(str(root / color / f"{i:04d}_rgb.png"), np.full((*SIZE, 3), 10 * i, np.uint8))
+    return root
+
+
+def run(*args) -> None:
+    parse("record import", [str(a) for a in args]).run()
+
+
+def test_folder_becomes_a_recording(tmp_path, capsys):
+    make_folder(tmp_path / "desk")
+    run(tmp_path / "desk", "--out", tmp_path / "out", "--sensor", "D435", "--fx-px", "380", "--consecutive")
+    recording = Recording.open(tmp_path / "out" / "desk")
+    assert len(recording) == 4 and recording.consecutive and recording.fx_px == 380.0
+    np.testing.assert_array_equal(recording.depth_mm(2), depth_mm(2))
+    assert recording.rgb(3)[0, 0, 0] == 30
+    assert not any("pose" in key or "serial" in key for key in recording.meta)
+    assert (
+        capsys.readouterr()
+        .out.splitlines()[-1]
+        .startswith("1 recordings with 4 frames imported; left out: 0 frames")
+    )
+
+
+def test_bad_frames_are_named_and_counted(tmp_path, capsys):
+    root = make_folder(tmp_path / "desk", frames=6)
+    cv2.imwrite(str(root / "depth" / "0001_depth.png"), depth_mm(1, (30, 40)))
+    cv2.imwrite(str(root / "depth" / "0002_depth.png"), np.zeros(SIZE, np.uint16))
+    (root / "rgb" / "0003_rgb.png").unlink()
+    (root / "depth" / "0004_depth.png").write_bytes(b"\x89PNG damaged")
+    cv2.imwrite(str(root / "depth" / "0005_depth.png"), np.zeros(SIZE, np.uint8))
+    run(root, "--out", tmp_path / "out")
+    shown = capsys.readouterr().out
+    for name, reason in (
+        ("0001", "depth is 40x30, the frames before it 32x24"),
+        ("0002", "no valid depth pixel"),
+        ("0003", "colour is missing"),
+        ("0004", "depth cannot be read"),
+        ("0005", "depth is uint8"),
+    ):
+        assert any(name in line and reason in line for line in shown.splitlines()), name
+    assert shown.splitlines()[-1] == "1 recordings with 1 frames imported; left out: 5 frames, 0 recordings"
+
+
+def test_float_depth_is_metres_unless_its_size_says_otherwise(tmp_path):
+    root = make_folder(tmp_path / "desk")
+    for i, file in enumerate(sorted((root / "depth").iterdir())):
+        np.save(file.with_suffix(".npy"), depth_mm(i).astype(np.float32) / 1000)
+        file.unlink()
+    run(root, "--out", tmp_path / "out")
+    np.testing.assert_array_equal(Recording.open(tmp_path / "out" / "desk").depth_mm(1), depth_mm(1))
+    for i, file in enumerate(sorted((root / "depth").iterdir())):
+        np.save(file, depth_mm(i).astype(np.float32))
+    with pytest.raises(UserError, match="perhaps --depth-unit-m 0.001"):
+        run(root, "--out", tmp_path / "wrong")
+    assert not (tmp_path / "wrong" / "desk").exists()
+    run(root, "--out", tmp_path / "right", "--depth-unit-m", "0.001")
+    np.testing.assert_array_equal(Recording.open(tmp_path / "right" / "desk").depth_mm(1), depth_mm(1))
+
+
+def test_what_is_not_a_number_is_a_hole(tmp_path):
+    root = make_folder(tmp_path / "desk", frames=1)
+    metres = depth_mm(0).astype(np.float32) / 1000
+    metres[5, 5], metres[6, 6], metres[7, 7] = np.nan, np.inf, -1.0
+    np.save(root / "depth" / "0000_depth.npy", metres)
+    (root / "depth" / "0000_depth.png").unlink()
+    source = importers.folder_source(root, 0.0, {})
+    importers.import_recording(source, tmp_path / "out")
+    read = Recording.open(tmp_path / "out").depth_mm(0)
+    assert read[5, 5] == read[6, 6] == read[7, 7] == 0 and read[8, 8] == depth_mm(0)[8, 8]
+
+
+def test_one_refused_recording_does_not_stop_the_others(tmp_path, capsys):
+    make_folder(tmp_path / "all" / "a")
+    empty = make_folder(tmp_path / "all" / "b", frames=1, color="color")
+    cv2.imwrite(str(empty / "depth" / "0000_depth.png"), np.zeros(SIZE, np.uint16))
+    run(tmp_path / "all", "--out", tmp_path / "out")
+    shown = capsys.readouterr().out
+    assert "refused:" in shown and "none of its 1 frames can be used" in shown
+    assert shown.splitlines()[-1].endswith("left out: 0 frames, 1 recordings")
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["a"]
+
+
+def test_nothing_to_import_is_one_line(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "film.mp4").write_bytes(b"")
+    for path, message in (
+        (tmp_path / "none", "no such file or folder"),
+        (tmp_path / "empty", "no depth/ beside one of color/"),
+        (tmp_path / "film.mp4", "expected a RealSense .bag"),
+    ):
+        with pytest.raises(UserError, match=message):
+            run(path, "--out", tmp_path / "out")
+
+
+def test_bag_needs_pyrealsense2(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyrealsense2", None)
+    (tmp_path / "a.bag").write_bytes(b"")
+    with pytest.raises(UserError, match="needs pyrealsense2"):
+        run(tmp_path / "a.bag", "--out", tmp_path / "out")
