@@ -192,8 +192,9 @@ def plot(result: Comparison) -> bytes:
     """PNG: one panel per curve, one line per camera."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 7), layout="constrained")
-    for axes, (name, title) in zip(figure.subplots(2, 3).flat, CURVES.items(), strict=True):
+    figure = Figure(figsize=(15, 7), layout="constrained")
+    for place, (name, title) in enumerate(CURVES.items(), start=1):
+        axes = figure.add_subplot(2, (len(CURVES) + 1) // 2, place)
         for camera in [*result.real, result.rig]:
             if name in camera.curves:
                 _line(axes, camera.curves[name], camera.camera, bold=camera is result.rig)

@@ -233,6 +233,31 @@ def flicker(stream: Stream) -> float:
     return float(np.mean(changes)) if changes else float("nan")
 
 
+def flicker_by_edge(stream: Stream) -> Curve:
+    """Share of pixels that change validity from frame to frame, by distance to an edge, in the static runs.
+
+    Over the pixels that both imagers see, within the range of the other curves.
+    """
+    changed, count = (np.zeros(len(EDGE_BINS_PX) - 1) for _ in range(2))
+    for run in stream.static:
+        frames = stream.depth_mm[run]
+        s = surface(_typical_mm(frames), stream.fx_px, stream.fb_px_m)
+        rate = np.mean((frames[1:] > 0) != (frames[:-1] > 0), axis=0)
+        inside = s.seen & (s.depth_m >= DEPTH_BINS_M[0]) & (s.depth_m < DEPTH_BINS_M[-1])
+        count += np.histogram(s.edge_px[inside], EDGE_BINS_PX)[0]
+        changed += np.histogram(s.edge_px[inside], EDGE_BINS_PX, weights=rate[inside])[0]
+    return _curve(EDGE_BINS_PX, changed / np.maximum(count, 1), count)
+
+
+def _typical_mm(frames_mm: np.ndarray) -> np.ndarray:
+    """(H, W) uint16: the lower median over time of pixels valid in most frames, others 0."""
+    ordered = np.sort(frames_mm, axis=0)
+    valid = np.count_nonzero(frames_mm, axis=0)
+    middle = np.minimum(len(frames_mm) - valid + (valid - 1) // 2, len(frames_mm) - 1)
+    typical = np.take_along_axis(ordered, middle[None], axis=0)[0]
+    return np.where(valid > len(frames_mm) / 2, typical, 0).astype(np.uint16)
+
+
 def static_runs(depth_mm: np.ndarray, fb_px_m: float) -> tuple[slice, ...]:
     """Runs of at least STATIC_FRAMES consecutive frames of a (T, H, W) recording that stand still.
 

@@ -50,6 +50,7 @@ SCALARS = {
 """Scalars and how they are printed."""
 CURVES = {
     "edge_px": "invalid by distance to a depth edge, px",
+    "flicker_edge": "validity flicker by distance to a depth edge, px",
     "angle_deg": "invalid by incidence angle, degrees",
     "depth_m": "invalid by depth, m",
     "spectrum": "holes per 10,000 px by size, px",
@@ -88,6 +89,7 @@ def measure(camera: str, stream: Stream, steps_per_px: float) -> Figures:
         scalars,
         {
             **conditional,
+            "flicker_edge": curves.flicker_by_edge(stream),
             "spectrum": curves.hole_spectrum(stream),
             "temporal_px": curves.temporal_deviation_px(stream),
         },
