@@ -255,7 +255,7 @@ class StereoConfig:
     """The best match must beat the second by this margin."""
     left_right_px: int = 1
     """Largest disagreement of the left-right check, pixels."""
-    speckle_px: int = 16
+    speckle_px: int = 48
     """Smaller islands of disparity are removed."""
     residual_limit: float = 1.15
     """Largest matching residual relative to the local contrast of both images; 1.4 is pure noise."""
@@ -539,7 +539,7 @@ class StudentConfig:
     """Random shift of the crop window in training, pixels of the scaled picture, each way."""
     disparity_noise_px: float = 0.25
     """Largest standard deviation of the noise on valid pixels in training, pixels of disparity at the
-    picture's scale (the rig: 0.13 on near surfaces, 0.25 at 1.4 m); 0 keeps them exact."""
+    picture's scale (the rig: about 0.07); 0 keeps them exact."""
     # --- DAgger (student_jax/dagger.py) ---
     dagger_rounds: int = 4
     """Rounds of acting with the student and labelling by the teacher."""

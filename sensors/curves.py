@@ -160,7 +160,7 @@ def by_surface(stream: Stream) -> tuple[dict[str, Curve], float]:
 class _Tally:
     """What one frame adds to the curves."""
 
-    rates: dict[str, tuple[np.ndarray, np.ndarray]]
+    rates: dict[str, list[np.ndarray]]
     """Per curve: invalid pixels and pixels in each bin."""
     shadow: tuple[int, int]
     spatial: tuple[np.ndarray, np.ndarray]
@@ -177,7 +177,7 @@ def _tally(frame: np.ndarray, stream: Stream) -> _Tally:
         "angle_deg": (s.angle_deg, smooth),
     }
     rates = {
-        name: tuple(np.histogram(values[mask], RATE_BINS[name])[0] for mask in (where & lost, where))
+        name: [np.histogram(values[mask], RATE_BINS[name])[0] for mask in (where & lost, where)]
         for name, (values, where) in counted.items()
     }
     kernel = np.ones((PLANE_WINDOW_PX, PLANE_WINDOW_PX), np.uint8)

@@ -83,7 +83,8 @@ def _warped(place: np.ndarray, inverse: np.ndarray, width_px: int) -> tuple[np.n
 
 def _points(place: np.ndarray, inverse: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
     """(row, column, inverse depth, source column) of the whole columns between neighbours of one surface."""
-    rows, columns = np.indices(place.shape)
+    grid = np.indices(place.shape)
+    rows, columns = grid[0], grid[1]
     a, b = inverse[:, :-1], inverse[:, 1:]
     joined = np.maximum(a, b) < SAME_SURFACE * np.minimum(a, b)
     left, right = place[:, :-1], place[:, 1:]

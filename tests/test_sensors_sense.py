@@ -33,9 +33,14 @@ def scene() -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def sensors() -> dict[str, Sense]:
     config = DDGConfig(
-        height_px=72, width_px=128, widths=(8, 16), blocks=(0, 1), attention_heads=0, sample_steps=2, noise_threshold=0.2
-    )
-    params = init_params(config, jax.random.key(0))
+        height_px=72, width_px=128, widths=(8, 16), blocks=(0, 1), attention_heads=0, sample_steps=2,
+        noise_threshold=0.0,
+    )  # fmt: skip
+    # A network at its start predicts zero everywhere; shaken weights give pictures with and without holes.
+    leaves, tree = jax.tree.flatten(init_params(config, jax.random.key(0)))
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    shaken = [p + 0.2 * jax.random.normal(k, p.shape) for p, k in zip(leaves, keys, strict=True)]
+    params = jax.tree.unflatten(tree, shaken)
     made = {name: make_sensor(SensorConfig(name=name), PROFILE) for name in SENSORS if name != "learned"}
     return {**made, "learned": learned(Generator(config, params, make_prior(config)))}
 
@@ -51,8 +56,9 @@ def test_one_api(sensors, name):
     # Invalid stays invalid; what is valid is in metres, and mostly near the truth.
     assert not noisy[depth == 0].any()
     valid = (noisy > 0) & (depth > 0)
-    if name == "learned":  # not fitted: its holes mean nothing, grafting must still leave the rest alone
-        assert np.all(noisy[1, :20, :30] == 0)
+    if name == "learned":  # not fitted: its holes mean nothing; grafting must leave the rest as it was
+        assert 0.02 < valid.mean() < 0.96
+        np.testing.assert_array_equal(noisy[valid], depth[valid])
     else:
         assert valid.mean() > 0.6
         assert np.median(np.abs(noisy - depth)[valid]) < 0.02
