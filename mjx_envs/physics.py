@@ -88,6 +88,7 @@ class ModelIndex:
         self.links = np.array([model.body(link.name).id for link in scene.ARM_LINKS])
         self.arm_dofs = np.array([model.joint(n).dofadr[0] for n in contract.ARM_JOINTS])
         self.arm_actuators = np.arange(scene.N_ARM)
+        self._in_subtree = _subtrees(model)
 
     def fields(self, model, params, xp=np) -> dict:
         """Model fields with `params` written in; works batched for NumPy (leading dimensions)."""
@@ -122,6 +123,30 @@ class ModelIndex:
             ),
             "actuator_biasprm": put(bias, (arm, slice(1, 3)), bias[..., arm, 1:3] * gain[..., None]),
         }
+
+
+    def derived(self, model, fields: dict) -> dict:
+        """Fields of one environment that MuJoCo precomputes from `fields` and MJX takes as they are (JAX).
+
+        Without the first MJX-Warp takes each body's frame of reference for its centre of mass and free
+        bodies accelerate in the air; the second sets how soft the object's contacts are. The arm's
+        own weights stay the nominal ones.
+        """
+        obj = self.object_body
+        mass, inertia = fields["body_mass"][obj], fields["body_inertia"][obj]
+        inverse = jp.stack([1 / mass, jp.mean(1 / inertia)])
+        return {
+            "body_subtreemass": jp.asarray(self._in_subtree, jp.float32) @ fields["body_mass"],
+            "body_invweight0": jp.asarray(model.body_invweight0).at[obj].set(inverse),
+        }
+
+
+def _subtrees(model: mujoco.MjModel) -> np.ndarray:
+    """(bodies, bodies) 1 where the column's body is the row's or a descendant of it."""
+    inside = np.eye(model.nbody)
+    for body in range(model.nbody - 1, 0, -1):  # children come after their parents
+        inside[model.body_parentid[body]] += inside[body]
+    return inside
 
 
 def _put_numpy(array, index, value):

@@ -20,7 +20,8 @@ class JaxPhysics:
 
     def step(self, params: ModelParams, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         """See `Physics.step`."""
-        mx = self._mx.replace(**self._index.fields(self._mx, params, jp))
+        fields = self._index.fields(self._mx, params, jp)
+        mx = self._mx.replace(**fields, **self._index.derived(self._mx, fields))
         data = mjx.make_data(self._model).replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl
         )
