@@ -1,8 +1,9 @@
 """The physics interface that the environment is written against.
 
 A backend advances one environment by one control step and keeps nothing between calls: all that
-matters is in `PhysicsState` and `ModelParams`. Backends: `physics_cpu` (MuJoCo's C engine) and
-`physics_jax` (MJX). All functions are for one environment; use `jax.vmap` for many.
+matters is in `PhysicsState` and `ModelParams`. Backends: `physics_cpu` (MuJoCo's C engine),
+`physics_jax` (MJX) and `physics_warp` (MJX-Warp); `conformance` says how closely they agree. All
+functions are for one environment; use `jax.vmap` for many.
 """
 
 from typing import Protocol
@@ -124,7 +125,6 @@ class ModelIndex:
             "actuator_biasprm": put(bias, (arm, slice(1, 3)), bias[..., arm, 1:3] * gain[..., None]),
         }
 
-
     def derived(self, model, fields: dict) -> dict:
         """Fields of one environment that MuJoCo precomputes from `fields` and MJX takes as they are (JAX).
 
@@ -159,8 +159,11 @@ def _put_jax(array, index, value):
     return array.at[(..., *index)].set(value)
 
 
+BACKENDS = ("cpu", "jax", "warp")
+
+
 def make_physics(backend: str, sim_dt_s: float, layout: SlotLayout = DEFAULT_SLOTS) -> Physics:
-    """The named backend at `sim_dt_s` seconds a substep; UserError for an unknown name."""
+    """The named backend at `sim_dt_s` seconds a substep; UserError if it is unknown or cannot run here."""
     substeps = round(contract.CONTROL_DT_S / sim_dt_s)
     if backend == "cpu":
         from mjx_envs.physics_cpu import CpuPhysics
@@ -170,4 +173,9 @@ def make_physics(backend: str, sim_dt_s: float, layout: SlotLayout = DEFAULT_SLO
         from mjx_envs.physics_jax import JaxPhysics
 
         return JaxPhysics(sim_dt_s, substeps, layout)
-    raise unknown_name("physics backend", backend, ("cpu", "jax"))
+    if backend == "warp":
+        from mjx_envs.physics_warp import WarpPhysics, require_gpu
+
+        require_gpu()
+        return WarpPhysics(sim_dt_s, substeps, layout)
+    raise unknown_name("physics backend", backend, BACKENDS)

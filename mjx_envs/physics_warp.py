@@ -72,9 +72,7 @@ class WarpPhysics:
         def one(params, state, ctrl):
             fields = self._index.fields(self._mx, params, jp)
             mx = self._mx.replace(**fields, **self._index.derived(self._mx, fields))
-            data = empty.replace(
-                qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl
-            )
+            data = empty.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
             data, _ = jax.lax.scan(lambda d, _: (mjx.step(mx, d), None), data, None, self._substeps)
             return data.qpos, data.qvel, data.qacc_warmstart, data.sensordata
 
