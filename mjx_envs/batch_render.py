@@ -99,9 +99,7 @@ def warp_renderer(
             geom_xpos=geoms.pos_w,
             geom_xmat=geoms.rot_w,
             cam_xpos=T_world_cam[None, :3, 3],
-            cam_xmat=(T_world_cam[:3, :3] * jp.array([1.0, -1.0, -1.0]))[
-                None
-            ],  # MuJoCo: y up, looks along -z
+            cam_xmat=(T_world_cam[:3, :3] * to_mujoco)[None],
         ).tree_replace({"_impl.light_xdir": light})
         data = mjx.refit_bvh(scene, data, handle)
         if depth_only:

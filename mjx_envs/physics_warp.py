@@ -23,12 +23,12 @@ def require_gpu() -> None:
 
     if not mjx_warp.WARP_INSTALLED:
         raise UserError(
-            "backend 'warp' needs warp-lang, which is not installed: pip install 'ddgrasp[warp,cuda]'."
+            "backend 'warp' needs warp-lang, which is not installed: pip install -e '.[cuda,warp]'."
         )
     if not any(device.platform == "gpu" for device in jax.devices()):
         raise UserError(
             f"backend 'warp' needs an NVIDIA GPU and JAX sees only {jax.devices()[0].platform}: choose cpu "
-            "or jax, or on a machine with a GPU pip install 'ddgrasp[warp,cuda]'."
+            "or jax, or on a machine with a GPU pip install -e '.[cuda,warp]'."
         )
 
 
