@@ -7,7 +7,7 @@ OpenGL renderer by the tests and by `benchmarks/gpu_check.py`.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jp
@@ -25,13 +25,13 @@ RENDERERS = ("jax", "warp")
 
 
 class Pictures(NamedTuple):
-    """Of B scenes."""
+    """Of B scenes; NumPy or JAX arrays."""
 
-    depth_m: jax.Array
+    depth_m: Any
     """(B, H, W) float32 planar depth, metres; 0 where nothing is hit within the far limit."""
-    rgb: jax.Array | None
+    rgb: Any
     """(B, H, W, 3) float32 in [0, 1], shaded; None of a renderer for depth alone."""
-    segmentation: jax.Array | None
+    segmentation: Any
     """(B, H, W) int32 geom id of the model, -1 where nothing is hit; None of a renderer for depth alone."""
 
 
@@ -39,30 +39,21 @@ Renderer = Callable[[Geoms, jax.Array], Pictures]
 """(geoms whose arrays have a leading B, T_world_cam (B, 4, 4)) -> pictures. May be jitted."""
 
 
-def make_renderer(
-    name: str,
-    camera: Camera,
-    types: tuple[str, ...],
-    count: int,
-    *,
-    depth_only: bool = False,
-    far_m: float = 2.0,
-) -> Renderer:
-    """The named renderer ("jax", or "warp" on an NVIDIA GPU) of `count` scenes at a time.
+def make_renderer(name: str, camera: Camera, *, depth_only: bool = False, far_m: float = 2.0) -> Renderer:
+    """The named renderer: "jax" anywhere, "warp" on an NVIDIA GPU. Of `camera` the pose is not read.
 
-    `types` are those of the geoms (`Geoms.types`); of `camera` the pose is not read. UserError for an
-    unknown name, or for "warp" without a GPU.
+    UserError for an unknown name, or for "warp" without a GPU.
     """
     if name == "jax":
         return jax_renderer(camera, depth_only=depth_only, far_m=far_m)
     if name == "warp":
         require_gpu()
-        return warp_renderer(camera, types, count, depth_only=depth_only, far_m=far_m)
+        return warp_renderer(camera, depth_only=depth_only, far_m=far_m)
     raise unknown_name("renderer", name, RENDERERS)
 
 
 def jax_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0) -> Renderer:
-    """The JAX ray caster, one scene after another: mapped, XLA on processors repeats work."""
+    """The JAX ray caster: on a GPU all scenes at once, on processors one after another, which is faster."""
 
     def draw(scene):
         geoms, T_world_cam = scene
@@ -72,25 +63,38 @@ def jax_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0
         seen = raycast.render(geoms, seen_from, far_m=far_m)
         return Pictures(seen.depth_m, seen.rgb, seen.segmentation)
 
-    on_gpu = any(device.platform == "gpu" for device in jax.devices())
-    if on_gpu:
+    if any(device.platform == "gpu" for device in jax.devices()):
         return lambda geoms, T_world_cam: jax.vmap(draw)((geoms, T_world_cam))
     return lambda geoms, T_world_cam: jax.lax.map(draw, (geoms, T_world_cam))
 
 
-def warp_renderer(
-    camera: Camera, types: tuple[str, ...], count: int, *, depth_only: bool = False, far_m: float = 2.0
-) -> Renderer:
-    """MJX-Warp's renderer; its buffers are for `count` scenes. Also runs on Warp's CPU device, for tests.
+def warp_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0) -> Renderer:
+    """MJX-Warp's renderer; makes buffers for each number of scenes. Runs on Warp's CPU device too, for tests.
 
     Warp's depth is planar from MuJoCo 3.17 on, 0 where nothing is hit: nothing to convert.
     """
-    model, context = _stage(types, replace(camera, T_world_cam=None), count, depth_only)
-    handle = context.pytree()
+    shape = (camera.height_px, camera.width_px)
+
+    def render(geoms: Geoms, T_world_cam) -> Pictures:
+        model, context = _stage(geoms.types, replace(camera, T_world_cam=None), len(geoms.pos_w), depth_only)
+        draw = _warp_draw(model, context.pytree(), depth_only)
+        depth, rgb, index = jax.vmap(draw)(geoms, jp.asarray(T_world_cam, jp.float32))
+        depth = depth.reshape(-1, *shape)
+        depth = jp.where(depth <= far_m, depth, 0)
+        if rgb is None or index is None:
+            return Pictures(depth, None, None)
+        ids = jp.array((*(geoms.ids or range(len(geoms.types))), -1), jp.int32)
+        colours = mjx.get_rgb(context.pytree(), 0, rgb)
+        return Pictures(depth, colours, ids[index].reshape(-1, *shape))
+
+    return render
+
+
+def _warp_draw(model: mujoco.MjModel, handle, depth_only: bool):
+    """(geoms, T_world_cam) of one scene -> packed (depth, colours, geom indices); to be mapped."""
     mx, empty = mjx.put_model(model, impl="warp"), mjx.make_data(model, impl="warp", naconmax=1, njmax=1)
     light = jp.asarray([[-c for c in LIGHT_DIRECTION_W]], jp.float32)
     to_mujoco = jp.array([1.0, -1.0, -1.0])  # its cameras have y up and look along -z
-    shape = (camera.height_px, camera.width_px)
 
     def draw(geoms: Geoms, T_world_cam):
         rgba = jp.concatenate([geoms.rgb, jp.ones_like(geoms.rgb[:, :1])], axis=1)
@@ -108,16 +112,7 @@ def warp_renderer(
         rgb, depth, seg, _ = mjx.render_with_segmentation(scene, data, handle)
         return depth, rgb, seg[:, 0]
 
-    def render(geoms: Geoms, T_world_cam) -> Pictures:
-        depth, rgb, index = jax.vmap(draw)(geoms, jp.asarray(T_world_cam, jp.float32))
-        depth = depth.reshape(-1, *shape)
-        depth = jp.where(depth <= far_m, depth, 0)
-        if rgb is None or index is None:
-            return Pictures(depth, None, None)
-        ids = jp.array((*(geoms.ids or range(len(types))), -1), jp.int32)
-        return Pictures(depth, mjx.get_rgb(handle, 0, rgb), ids[index].reshape(-1, *shape))
-
-    return render
+    return draw
 
 
 @cache

@@ -6,7 +6,7 @@ close each backend must come. Run by the tests on two cores and by `benchmarks/g
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import jax
@@ -134,8 +134,8 @@ def sliding() -> Scenario:
     params, rest = _params(names)
     friction = jp.repeat(jp.asarray(SLIDE_FRICTION), 2)
     start = _start([(0.6, 0.2, height) for height in rest])
-    start = start.replace(qvel=start.qvel.at[:, 9].set(SLIDE_SPEED_M_S))
-    return Scenario(params.replace(object_friction=friction), start, _hold(5))
+    start = replace(start, qvel=start.qvel.at[:, 9].set(SLIDE_SPEED_M_S))
+    return Scenario(replace(params, object_friction=friction), start, _hold(5))
 
 
 def judge_sliding(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict[str, float]:
@@ -201,7 +201,7 @@ def grasp_and_lift() -> Scenario:
     share = np.clip((time - _GRASP_STEPS + 1) / _LIFT_STEPS, 0, 1)[:, None, None]
     controls = np.zeros((len(time), len(specs), scene.NU), np.float32)
     controls[..., :7] = np.asarray(at) + share * np.asarray(lifted - at)
-    return Scenario(params, start.replace(qpos=start.qpos.at[:, :7].set(at)), controls)
+    return Scenario(params, replace(start, qpos=start.qpos.at[:, :7].set(at)), controls)
 
 
 def judge_lift(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict[str, float]:
@@ -255,7 +255,7 @@ _OPEN = (contract.GRIPPER_MAX_WIDTH_M / 2,) * 2
 
 def _hold(steps: int) -> np.ndarray:
     """(steps, B, 9) commands that hold the arm home."""
-    return np.tile(np.float32([*scene.HOME_RAD, *_OPEN]), (steps, len(OBJECTS_TRIED), 1))
+    return np.tile(np.array([*scene.HOME_RAD, *_OPEN], np.float32), (steps, len(OBJECTS_TRIED), 1))
 
 
 def _substeps(scenario: Scenario) -> int:

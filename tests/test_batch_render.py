@@ -18,8 +18,8 @@ def scenes():
 def make_renderer(name, scenes, **options):
     """Warp on its CPU device where there is no GPU."""
     if name == "warp":
-        return batch_render.warp_renderer(scenes.camera, scenes.geoms.types, len(scenes.index), **options)
-    return batch_render.make_renderer(name, scenes.camera, scenes.geoms.types, len(scenes.index), **options)
+        return batch_render.warp_renderer(scenes.camera, **options)
+    return batch_render.make_renderer(name, scenes.camera, **options)
 
 
 @pytest.mark.parametrize("name", batch_render.RENDERERS)
@@ -62,8 +62,8 @@ def _beyond(ours, expected):
 
 def test_unknown_renderers_and_warp_without_a_gpu_are_refused(scenes):
     with pytest.raises(UserError, match="'wrap'.*Did you mean 'warp'"):
-        batch_render.make_renderer("wrap", scenes.camera, scenes.geoms.types, COUNT)
+        batch_render.make_renderer("wrap", scenes.camera)
     if any(device.platform == "gpu" for device in jax.devices()):
         pytest.skip("this machine has a GPU")
     with pytest.raises(UserError, match="needs an NVIDIA GPU"):
-        batch_render.make_renderer("warp", scenes.camera, scenes.geoms.types, COUNT)
+        batch_render.make_renderer("warp", scenes.camera)
