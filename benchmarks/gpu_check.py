@@ -21,13 +21,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts
+from ddgrasp import artifacts, contract
 from ddgrasp.progress import Progress
 
 TOTAL_S = 530.0
 NO_GPU = 3
 """Exit status of section `machine` without a GPU."""
-SEEN_OBJECTS = ("apple", "pear", "peach", "banana", "cube", "block")
 SUCCESS_AIM = 0.95
 
 Save = Callable[..., None]
@@ -169,11 +168,10 @@ def env_steps(sizes: Sizes, save: Save) -> Iterator[str]:
     """Control steps/s of the whole environment, episodes restarting, random actions."""
     import jax
 
-    from ddgrasp import contract
     from ddgrasp.config import WorldConfig
     from mjx_envs.grasp_env import AutoReset, GraspEnv
 
-    config = WorldConfig(objects=SEEN_OBJECTS, backend=sizes.physics)
+    config = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics)
     env = AutoReset(GraspEnv(config))
 
     def roll(state, key):
@@ -201,7 +199,7 @@ def teacher(sizes: Sizes, save: Save) -> Iterator[str]:
     from ddgrasp.presets import LAPTOP
     from ppo.train import train
 
-    world = WorldConfig(objects=SEEN_OBJECTS, backend=sizes.physics)
+    world = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics)
     config = replace(LAPTOP, world=world, teacher=replace(LAPTOP.teacher, **sizes.teacher))
     evaluations: list[dict[str, float]] = []
     start = time.monotonic()

@@ -240,7 +240,7 @@ def _params(names: tuple[str, ...] = OBJECTS_TRIED) -> tuple[ModelParams, np.nda
     keys = jax.random.split(jax.random.PRNGKey(0), len(names))
     sample = jax.vmap(lambda key, i: randomize.sample_params(key, RandomConfig(), table, i))
     params, size = sample(keys, jp.arange(len(names)))
-    return params, table.rest_height * np.asarray(size)
+    return params, table.rest_height[: len(names)] * np.asarray(size)
 
 
 def _start(places) -> PhysicsState:
