@@ -141,8 +141,8 @@ class TeacherCompare:
         directory, results = self.run_dir / "teacher", {}
         policy = load_policy(directory)
         for name, result in evaluate_backends(config.world, policy, self.backends, self.trials, self.seed):
-            counts = result["success"]
-            print(f"{name:<6} {wilson.describe(wilson.success(counts['successes'], counts['n']))}", flush=True)
+            success = wilson.success(result["success"]["successes"], result["success"]["n"])
+            print(f"{name:<6} {wilson.describe(success)}", flush=True)
             results[name] = result
             measured.save(directory, results, self.seed)
         print(f"{directory / measured.BACKENDS_FILE}: `ddgrasp report {self.run_dir}` shows it.")

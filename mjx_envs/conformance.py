@@ -29,13 +29,16 @@ LIMITS: Mapping[str, Mapping[str, float]] = {
     "fall_relative": {"cpu": 1e-3, "jax": 1e-3, "warp": 1e-3},
     "slide_relative": {"cpu": 0.05, "jax": 0.05, "warp": 0.05},
     "lift_error_m": {"cpu": 3e-3, "jax": 3e-3, "warp": 3e-3},
-    "touch_relative": {"cpu": 0.0, "jax": 0.02, "warp": 0.02},
+    "touch_relative": {"cpu": 0.0, "jax": 0.2, "warp": 0.02},
     "fall_from_cpu_m": {"cpu": 0.0, "jax": 1e-5, "warp": 1e-5},
     "slide_from_cpu_m": {"cpu": 0.0, "jax": 1e-3, "warp": 1e-3},
     "arm_from_cpu_rad": {"cpu": 0.0, "jax": 2e-4, "warp": 2e-4},
     "lift_from_cpu_m": {"cpu": 0.0, "jax": 1e-3, "warp": 1e-3},
 }
-"""Largest value of each measure. Relative to a closed form, to what was commanded, or to `cpu`."""
+"""Largest value of each measure. Relative to a closed form, to what was commanded, or to `cpu`.
+
+MJX-JAX's pads may press otherwise: it chooses other contact points, of which the sensor takes the strongest.
+"""
 
 Step = Callable[[ModelParams, PhysicsState, jax.Array], PhysicsState]
 """A jitted, vmapped `Physics.step`."""
