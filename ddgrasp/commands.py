@@ -117,6 +117,38 @@ class TeacherEval:
 
 
 @dataclass(frozen=True)
+class TeacherCompare:
+    """Measure a trained teacher on several physics backends; the run's report shows what it loses."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run."""
+    backends: tuple[str, ...] = ("cpu", "jax")
+    """Physics backends: cpu, jax, warp."""
+    trials: int | None = None
+    """Episodes per backend; by default 1000, on jax 200 (without a GPU it compiles for minutes)."""
+    seed: int = 0
+    """Of the episodes."""
+
+    def run(self) -> None:
+        if self.trials is not None:
+            _check_count("--trials", self.trials)
+        from evaluation import backends as measured
+        from evaluation import wilson
+        from ppo.backends import evaluate_backends
+        from ppo.policy import load_policy
+
+        config = load_config(self.run_dir, "teacher")
+        directory, results = self.run_dir / "teacher", {}
+        policy = load_policy(directory)
+        for name, result in evaluate_backends(config.world, policy, self.backends, self.trials, self.seed):
+            success = wilson.success(result["success"]["successes"], result["success"]["n"])
+            print(f"{name:<6} {wilson.describe(success)}", flush=True)
+            results[name] = result
+            measured.save(directory, results, self.seed)
+        print(f"{directory / measured.BACKENDS_FILE}: `ddgrasp report {self.run_dir}` shows it.")
+
+
+@dataclass(frozen=True)
 class StudentEval:
     """Measure a trained student again, closed loop in simulation: clean and generated depth, same seeds."""
 
@@ -417,6 +449,7 @@ COMMANDS: dict[str, type] = {
     "run": Run,
     "teacher train": TeacherTrain,
     "teacher eval": TeacherEval,
+    "teacher compare": TeacherCompare,
     "demos collect": DemosCollect,
     "record": Record,
     "record import": RecordImport,

@@ -83,7 +83,7 @@ class WorldConfig:
     objects: tuple[str, ...] = contract.SEEN_OBJECTS
     """Objects, mixed in one batch (`ddgrasp objects list` names them all)."""
     backend: str = "cpu"
-    """Physics: cpu (MuJoCo's C engine on all cores) or jax (MJX)."""
+    """Physics: cpu (MuJoCo's C engine on all cores), jax (MJX) or warp (MJX-Warp, on an NVIDIA GPU)."""
     episode_steps: int = 60
     """Control steps in an episode (10 Hz)."""
     sim_dt_s: float = 0.005

@@ -13,7 +13,7 @@ from typing import Any
 from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
 from ddgrasp.pipeline import STAGES
-from evaluation import teacher_trials, wilson
+from evaluation import backends, teacher_trials, wilson
 
 REPORT = "report.json"
 _TOP_LEVEL = "student_"
@@ -25,7 +25,8 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     Keys: `stages.<name>.{seconds, trained, loaded}`; `<name>` holds what that stage measured, except keys
     that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top; `machine`,
     `versions`, `preset`, `seed`, `config`. A success rate is {rate, n, successes, low, high}.
-    `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows.
+    `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows; `teacher.backends`, if `ddgrasp
+    teacher compare` was, is `evaluation.backends.table`.
     """
     finished = {
         stage.name: artifacts.read_manifest(run_dir / stage.name)
@@ -58,6 +59,10 @@ def build_report(run_dir: Path) -> dict[str, Any]:
         report.update({key: value for key, value in metrics.items() if key.startswith(_TOP_LEVEL)})
     if "teacher" in finished and (rows := teacher_trials.load(run_dir / "teacher")):
         report["teacher"]["trials"] = rows
+    if "teacher" in finished:
+        trained_on = finished["teacher"].config["world"]["backend"]
+        if rows := backends.table(run_dir / "teacher", trained_on):
+            report["teacher"]["backends"] = rows
     report["config"] = latest.config
     return report
 
@@ -130,11 +135,12 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
     if stage == "teacher":
         lines = [f"success {wilson.describe(metrics['success'])}"] if "success" in metrics else []
         per_object = metrics.get("per_object") or metrics.get("objects") or {}
-        return lines + [
+        lines += [
             f"{name}: {wilson.describe(value.get('success', value))}"
             for name, value in (per_object.items() if isinstance(per_object, Mapping) else ())
             if "rate" in value.get("success", value)
         ]
+        return lines + [_on_backend(row) for row in metrics.get("backends", [])]
     if stage == "student":
         named = (("student_clean", "clean depth"), ("student_ddg", "generated depth"))
         return [f"{text}: success {rate}" for key, text in named if (rate := _success(report, key))]
@@ -151,6 +157,12 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
         for name, value in metrics.items()
         if isinstance(value, (int, float)) and not isinstance(value, bool)
     ][:3]
+
+
+def _on_backend(row: Mapping[str, Any]) -> str:
+    drop = row["drop_points"]
+    text = f"on {row['backend']}: success {wilson.describe(row['success'])}"
+    return text if not drop else f"{text}, drop {drop:.1f} points"
 
 
 def _success(report: Mapping[str, Any], key: str) -> str:

@@ -1,8 +1,9 @@
 """The physics interface that the environment is written against.
 
 A backend advances one environment by one control step and keeps nothing between calls: all that
-matters is in `PhysicsState` and `ModelParams`. Backends: `physics_cpu` (MuJoCo's C engine) and
-`physics_jax` (MJX). All functions are for one environment; use `jax.vmap` for many.
+matters is in `PhysicsState` and `ModelParams`. Backends: `physics_cpu` (MuJoCo's C engine),
+`physics_jax` (MJX) and `physics_warp` (MJX-Warp); `conformance` says how closely they agree. All
+functions are for one environment; use `jax.vmap` for many.
 """
 
 from typing import Protocol
@@ -88,6 +89,7 @@ class ModelIndex:
         self.links = np.array([model.body(link.name).id for link in scene.ARM_LINKS])
         self.arm_dofs = np.array([model.joint(n).dofadr[0] for n in contract.ARM_JOINTS])
         self.arm_actuators = np.arange(scene.N_ARM)
+        self._in_subtree = _subtrees(model)
 
     def fields(self, model, params, xp=np) -> dict:
         """Model fields with `params` written in; works batched for NumPy (leading dimensions)."""
@@ -123,6 +125,29 @@ class ModelIndex:
             "actuator_biasprm": put(bias, (arm, slice(1, 3)), bias[..., arm, 1:3] * gain[..., None]),
         }
 
+    def derived(self, model, fields: dict) -> dict:
+        """Fields of one environment that MuJoCo precomputes from `fields` and MJX takes as they are (JAX).
+
+        Without the first MJX-Warp takes each body's frame of reference for its centre of mass and free
+        bodies accelerate in the air; the second sets how soft the object's contacts are. The arm's
+        own weights stay the nominal ones.
+        """
+        obj = self.object_body
+        mass, inertia = fields["body_mass"][obj], fields["body_inertia"][obj]
+        inverse = jp.stack([1 / mass, jp.mean(1 / inertia)])
+        return {
+            "body_subtreemass": jp.asarray(self._in_subtree, jp.float32) @ fields["body_mass"],
+            "body_invweight0": jp.asarray(model.body_invweight0).at[obj].set(inverse),
+        }
+
+
+def _subtrees(model: mujoco.MjModel) -> np.ndarray:
+    """(bodies, bodies) 1 where the column's body is the row's or a descendant of it."""
+    inside = np.eye(model.nbody)
+    for body in range(model.nbody - 1, 0, -1):  # children come after their parents
+        inside[model.body_parentid[body]] += inside[body]
+    return inside
+
 
 def _put_numpy(array, index, value):
     array = np.array(array)
@@ -134,8 +159,11 @@ def _put_jax(array, index, value):
     return array.at[(..., *index)].set(value)
 
 
+BACKENDS = ("cpu", "jax", "warp")
+
+
 def make_physics(backend: str, sim_dt_s: float, layout: SlotLayout = DEFAULT_SLOTS) -> Physics:
-    """The named backend at `sim_dt_s` seconds a substep; UserError for an unknown name."""
+    """The named backend at `sim_dt_s` seconds a substep; UserError if it is unknown or cannot run here."""
     substeps = round(contract.CONTROL_DT_S / sim_dt_s)
     if backend == "cpu":
         from mjx_envs.physics_cpu import CpuPhysics
@@ -145,4 +173,9 @@ def make_physics(backend: str, sim_dt_s: float, layout: SlotLayout = DEFAULT_SLO
         from mjx_envs.physics_jax import JaxPhysics
 
         return JaxPhysics(sim_dt_s, substeps, layout)
-    raise unknown_name("physics backend", backend, ("cpu", "jax"))
+    if backend == "warp":
+        from mjx_envs.physics_warp import WarpPhysics, require_gpu
+
+        require_gpu()
+        return WarpPhysics(sim_dt_s, substeps, layout)
+    raise unknown_name("physics backend", backend, BACKENDS)

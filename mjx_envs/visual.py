@@ -1,4 +1,4 @@
-"""What a depth camera sees of a batch of environments: physics state to pictures by the JAX ray caster."""
+"""What a depth camera sees of a batch of environments: physics state to pictures."""
 
 import dataclasses
 
@@ -8,10 +8,11 @@ import numpy as np
 
 from ddgrasp import contract
 from mjx_envs import kinematics, scene
+from mjx_envs.batch_render import make_renderer
 from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.objects import DEFAULT_SLOTS, SlotLayout
 from mjx_envs.physics import ModelParams
-from mjx_envs.raycast import Geoms, render, render_depth
+from mjx_envs.raycast import Geoms, render
 from mjx_envs.visible_geoms import visible_geoms
 
 
@@ -22,9 +23,12 @@ class Viewer:
     Args:
       profile: the camera at the scale wanted.
       layout: the object's slots, as the environments have them (`ObjectTable.layout`).
+      renderer: one of `batch_render.RENDERERS`.
     """
 
-    def __init__(self, profile: contract.CameraProfile, layout: SlotLayout = DEFAULT_SLOTS):
+    def __init__(
+        self, profile: contract.CameraProfile, layout: SlotLayout = DEFAULT_SLOTS, renderer: str = "jax"
+    ):
         self.profile = profile
         model = scene.build_model(layout=layout)
         table = visible_geoms(model)
@@ -34,6 +38,8 @@ class Viewer:
         self._slots = np.searchsorted(table.ids, scene.slot_ids(model))
         self._bodies = [model.body(int(b)).name for b in model.geom_bodyid[table.ids]]
         self._camera = nominal_camera(profile)
+        self._draw = make_renderer(renderer, self._camera)
+        self._draw_depth = make_renderer(renderer, self._camera, depth_only=True)
 
     @property
     def nominal_pose(self) -> np.ndarray:
@@ -59,15 +65,11 @@ class Viewer:
 
     def depth_mm(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
         """(B, H, W) uint16 planar depth of a batch of scenes, 0 where nothing is hit."""
-        return jax.lax.map(lambda a: to_mm(render_depth(a[0], self._seen_from(a[1]))), (geoms, T_world_cam))
+        return to_mm(self._draw_depth(geoms, T_world_cam).depth_m)
 
     def rgb(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
         """(B, H, W, 3) uint8 colour of a batch of scenes."""
-
-        def draw(a):
-            return jp.round(255 * render(a[0], self._seen_from(a[1])).rgb).astype(jp.uint8)
-
-        return jax.lax.map(draw, (geoms, T_world_cam))
+        return jp.round(255 * self._draw(geoms, T_world_cam).rgb).astype(jp.uint8)
 
     def object_pixels(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
         """(B,) int32 pixels of the object in the centred crop window, for a batch of scenes."""

@@ -3,10 +3,29 @@
 import os
 from pathlib import Path
 
+import pytest
+
 _CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 
 # Through the environment: subprocesses that tests start use the same cache, and JAX is not imported here.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
+os.environ.setdefault("WARP_CACHE_PATH", str(_CACHE.with_name("warp")))
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+
+@pytest.fixture
+def open_gl(monkeypatch: pytest.MonkeyPatch):
+    """mujoco.Renderer over EGL, whatever MUJOCO_GL was when mujoco was imported; or a skip."""
+    import mujoco
+
+    try:
+        from mujoco.egl import GLContext
+        from mujoco.rendering.classic import gl_context
+
+        monkeypatch.setattr(gl_context, "GLContext", GLContext, raising=False)
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:  # the back ends raise whatever their loaders do
+        pytest.skip(f"no OpenGL context could be made through EGL: {type(error).__name__} {error}")
+    return mujoco.Renderer

@@ -6,11 +6,10 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
-from mjx_envs import raycast_numpy, scene
+from mjx_envs import raycast_numpy, render_check, scene
 from mjx_envs.camera import Camera, look_at, nominal_camera
 from mjx_envs.visible_geoms import BACKGROUND_RGB, visible_geoms
 
@@ -82,41 +81,7 @@ SCENES = [
 ]
 
 
-def _edges(segmentation: np.ndarray) -> np.ndarray:
-    """Pixels next to another geom: a rasteriser may decide them differently."""
-    low, high = (f(segmentation, size=3) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
-    return low != high
-
-
 # --- against MuJoCo's OpenGL ------------------------------------------------------------------
-
-
-@pytest.fixture
-def open_gl(monkeypatch: pytest.MonkeyPatch) -> type[mujoco.Renderer]:
-    """mujoco.Renderer over EGL, whatever MUJOCO_GL was when mujoco was imported; or a skip."""
-    try:
-        from mujoco.egl import GLContext
-        from mujoco.rendering.classic import gl_context
-
-        monkeypatch.setattr(gl_context, "GLContext", GLContext, raising=False)
-        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
-    except Exception as error:  # the back ends raise whatever their loaders do
-        pytest.skip(f"no OpenGL context could be made through EGL: {type(error).__name__} {error}")
-    return mujoco.Renderer
-
-
-def _aim(renderer: mujoco.Renderer, data: mujoco.MjData, camera: Camera) -> None:
-    """MuJoCo's cameras look along -z with y up; the scene's camera is given by forward and up."""
-    renderer.update_scene(data)
-    near = data.model.vis.map.znear * data.model.stat.extent
-    for gl_camera in renderer.scene.camera:
-        gl_camera.pos = camera.T_world_cam[:3, 3]
-        gl_camera.forward = camera.T_world_cam[:3, 2]
-        gl_camera.up = -camera.T_world_cam[:3, 1]
-        gl_camera.frustum_top = near * camera.cy_px / camera.fy_px
-        gl_camera.frustum_bottom = -near * (camera.height_px - camera.cy_px) / camera.fy_px
-        gl_camera.frustum_center = 0
-        gl_camera.frustum_width = near * camera.width_px / 2 / camera.fx_px
 
 
 @pytest.mark.parametrize(("make_scene", "make_camera"), SCENES)
@@ -126,15 +91,15 @@ def test_depth_agrees_with_open_gl(make_scene, make_camera, open_gl) -> None:
         (model, data), camera = make_scene(seed), make_camera(seed)
         with open_gl(model, camera.height_px, camera.width_px) as renderer:
             renderer.enable_depth_rendering()
-            _aim(renderer, data, camera)
+            render_check.aim(renderer, data, camera)
             expected = renderer.render().copy()
             renderer.disable_depth_rendering()
             renderer.enable_segmentation_rendering()
-            _aim(renderer, data, camera)
+            render_check.aim(renderer, data, camera)
             expected_geom = renderer.render()[..., 0].copy()
         ours = raycast_numpy.render(model, data, camera)
         both = (ours.depth_m > 0) & (expected < 2.0)
-        edges = _edges(ours.segmentation)
+        edges = render_check.edges_of(ours.segmentation)
         error = abs(ours.depth_m - expected)
         errors.append(error[both])
         plain = ~edges & (expected < 2.0)

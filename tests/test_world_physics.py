@@ -1,4 +1,4 @@
-"""The backends agree: same scene, same controls, same trajectories."""
+"""Every backend passes the conformance experiments; the drawn parameters stay in their ranges."""
 
 import jax
 import jax.numpy as jp
@@ -7,9 +7,9 @@ import pytest
 
 from ddgrasp.config import RandomConfig
 from ddgrasp.errors import UserError
-from mjx_envs import inverse_kinematics, kinematics, physics, randomize, scene
+from mjx_envs import conformance, inverse_kinematics, kinematics, physics, physics_warp, randomize, scene
 from mjx_envs.grasp_math import HAND_DOWN
-from mjx_envs.objects import OBJECTS
+from mjx_envs.objects import DEFAULT_SLOTS, OBJECTS
 
 NAMES = ("cube", "apple", "banana")
 DT_S = 0.005
@@ -20,64 +20,48 @@ def table():
     return randomize.ObjectTable(NAMES)
 
 
-@pytest.fixture(scope="module")
-def params(table):
-    one = [randomize.sample_params(jax.random.PRNGKey(i), RandomConfig(), table, i)[0] for i in range(3)]
-    return jax.tree.map(lambda *x: jp.stack(x), *one)
+def make_backend(name):
+    """Warp on its CPU device where there is no GPU: the same kernels and the same route through JAX."""
+    if name == "warp":
+        return physics_warp.WarpPhysics(DT_S, 20, DEFAULT_SLOTS)
+    return physics.make_physics(name, DT_S)
 
 
-def batch_at(height_m, x_m=0.5, y_m=0.0):
-    fingers = jp.full(2, 0.04)
-    rows = []
-    for name in NAMES:
-        place = jp.array([x_m, y_m, OBJECTS[name].rest_height_m + height_m, 1.0, 0, 0, 0])
-        rows.append(jp.concatenate([jp.array(scene.HOME_RAD), fingers, place]))
-    return jax.vmap(physics.initial_state)(jp.stack(rows))
+@pytest.fixture(scope="module", params=physics.BACKENDS)
+def measured(request):
+    """(backend's name, every measure of its experiments)."""
+    step = conformance.make_step(make_backend(request.param))
+    measures = conformance.measure(step)
+    print(request.param, {name: f"{value:.3g}" for name, value in measures.items()})
+    return request.param, measures
 
 
-@pytest.fixture(scope="module")
-def steppers():
-    return {name: jax.jit(jax.vmap(physics.make_physics(name, DT_S).step)) for name in ("cpu", "jax")}
+def test_every_backend_stays_within_its_limits(measured):
+    name, measures = measured
+    assert measures.keys() == conformance.LIMITS.keys()
+    assert conformance.violations(name, measures) == []
 
 
-def hold_still():
-    return jp.tile(jp.concatenate([jp.array(scene.HOME_RAD), jp.full(2, 0.04)]), (len(NAMES), 1))
+def test_violations_are_named():
+    measures = dict.fromkeys(conformance.LIMITS, 0.0) | {"fall_relative": 0.1, "slide_relative": np.nan}
+    assert conformance.violations("jax", measures) == [
+        "jax: fall_relative is 0.1, limit 0.001",
+        "jax: slide_relative is nan, limit 0.05",
+    ]
 
 
-def test_free_fall_agrees_and_obeys_gravity(steppers, params):
-    for step in steppers.values():
-        start = batch_at(0.3, 0.65, 0.2)  # clear of the hand
-        state = step(params, start, hold_still())
-        fallen = start.qpos[:, 11] - state.qpos[:, 11]
-        # Semi-implicit Euler over n steps of h: g h^2 n (n + 1) / 2.
-        np.testing.assert_allclose(fallen, 9.81 * DT_S**2 * 20 * 21 / 2, rtol=0.01)
-
-
-def test_backends_agree_with_the_object_on_the_table_and_the_arm_moving(steppers, params):
-    states = {name: batch_at(0.0) for name in steppers}
-    target = hold_still().at[:, 3].add(0.1).at[:, 7:].set(0.0)
-    for _ in range(3):
-        states = {name: steppers[name](params, s, target) for name, s in states.items()}
-    np.testing.assert_allclose(states["cpu"].qpos[:, :9], states["jax"].qpos[:, :9], atol=2e-3)
-    np.testing.assert_allclose(states["cpu"].qpos[:, 9:12], states["jax"].qpos[:, 9:12], atol=2e-3)
-
-
-def test_grasp_and_lift_on_both(steppers, params):
-    down = jp.array(HAND_DOWN)
-    heights = jp.array([max(OBJECTS[n].rest_height_m, 0.02) for n in NAMES])
-    solve = jax.vmap(lambda p: inverse_kinematics.solve(jp.array(scene.HOME_RAD), p, down))
-    at = solve(jp.stack([jp.full(3, 0.5), jp.zeros(3), heights], axis=1))
-    lifted = solve(jp.stack([jp.full(3, 0.5), jp.zeros(3), heights + 0.12], axis=1))
-    for name, step in steppers.items():
-        state = batch_at(0.0)
-        state = state.replace(qpos=state.qpos.at[:, :7].set(at))
-        for t in range(16):
-            joints = at + (lifted - at) * min(1.0, max(0, t - 5) / 8)
-            ctrl = jp.concatenate([joints, jp.full((3, 2), 0.0)], axis=1)
-            state = step(params, state, ctrl)
-            if t == 4:
-                assert np.all(np.asarray(state.touch) > 1.0), (name, state.touch)
-        assert np.all(np.asarray(state.qpos[:, 11]) > 0.1), (name, state.qpos[:, 11])
+def test_the_experiments_do_what_they_say():
+    """The C engine: objects fall, harder friction stops them sooner, the gripper holds with force."""
+    seen = conformance.cpu_reference()
+    fall, slide, lift = (seen[name].qpos[..., 9:12] for name in ("free_fall", "sliding", "grasp_and_lift"))
+    np.testing.assert_allclose(fall[0, :, 2] - fall[-1, :, 2], 9.81 * DT_S**2 * 20 * 21 / 2, rtol=1e-3)
+    scenario, _ = conformance.experiments()["sliding"]
+    mu = conformance.contact_friction(np.asarray(scenario.params.object_friction))
+    slid = (slide[-1] - slide[0])[np.argsort(mu, kind="stable"), 0]
+    assert 0.04 < slid.min() and slid[:2].min() > 1.1 * slid[2:4].max() > 1.2 * slid[4:].max()
+    assert (lift[-1, :, 2] - lift[0, :, 2]).min() > 0.1
+    assert seen["grasp_and_lift"].touch[4:].min() > 1.0
+    assert np.ptp(seen["moving_arm"].qpos[1, :, :7], axis=0).max() > 1e-3  # parameters differ
 
 
 def test_inverse_kinematics_reaches_the_pose():
@@ -104,3 +88,10 @@ def test_randomisation_stays_in_range_and_moves_only_what_it_should(table):
 def test_unknown_backend_is_named():
     with pytest.raises(UserError, match="'cpuu'.*Did you mean 'cpu'"):
         physics.make_physics("cpuu", DT_S)
+
+
+def test_warp_without_a_gpu_says_what_to_do():
+    if any(device.platform == "gpu" for device in jax.devices()):
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(UserError, match="'warp' needs an NVIDIA GPU.*choose cpu or jax"):
+        physics.make_physics("warp", DT_S)

@@ -1,0 +1,337 @@
+"""What this project does on an NVIDIA GPU, in at most nine minutes: one JSON of checks and throughputs.
+
+    python -m benchmarks.gpu_check [--out runs/gpu_check.json] [--sections NAME ...] [--device cpu]
+
+Conformance of the physics backends, pictures against MuJoCo's OpenGL renderer, frames/s, environment
+steps/s, and the time a teacher takes to 95 % success. Each section is a process of its own with a
+deadline; what it has measured so far is on disk after every figure, so that a section cut off, or the
+whole command, leaves its results. A section that fails, is cut off, or finds a limit exceeded is
+recorded under "errors", and the command ends with status 1. `--device cpu` runs the same sections at
+sizes that mean nothing, to test the command where there is no GPU.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import artifacts, contract
+from ddgrasp.progress import Progress
+
+TOTAL_S = 530.0
+NO_GPU = 3
+"""Exit status of section `machine` without a GPU."""
+SUCCESS_AIM = 0.95
+
+Save = Callable[..., None]
+"""save(name=value, ...) adds measurements to the section's file."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much to run."""
+
+    physics: str
+    conformance: tuple[str, ...]
+    renderers: tuple[str, ...]
+    env_counts: tuple[int, ...]
+    control_steps: int
+    frame_sizes_px: tuple[int, ...]
+    frame_pixels: int
+    """Of all pictures of a batch together."""
+    scenes: int
+    """Compared with OpenGL."""
+    teacher: dict[str, Any]
+    """Fields of TeacherConfig that differ from preset laptop's."""
+    slack: float
+    """Deadlines are longer by this factor."""
+
+
+GPU = Sizes(
+    physics="warp",
+    conformance=("warp", "jax"),
+    renderers=("warp", "jax"),
+    env_counts=(256, 1024, 4096, 16384),
+    control_steps=20,
+    frame_sizes_px=(64, 128, 256),
+    frame_pixels=2**26,
+    scenes=48,
+    teacher={"total_steps": 20_000_000, "num_envs": 4096, "minibatches": 16, "eval_every": 2},
+    slack=1.0,
+)
+CPU = Sizes(
+    physics="cpu",
+    conformance=("cpu",),
+    renderers=("jax",),
+    env_counts=(4, 16),
+    control_steps=2,
+    frame_sizes_px=(16,),
+    frame_pixels=2**11,
+    scenes=2,
+    teacher={
+        "total_steps": 64, "num_envs": 8, "unroll_steps": 4, "minibatches": 2, "epochs": 1, "eval_every": 1,
+        "clone_rounds": 0, "critic_warmup": 0, "hidden": (8,),
+    },
+    slack=5.0,
+)  # fmt: skip
+SIZES = {"gpu": GPU, "cpu": CPU}
+
+
+# --- sections -------------------------------------------------------------------------------------
+
+
+def machine(sizes: Sizes, save: Save) -> Iterator[str]:
+    """Devices and versions; without the GPU asked for, one line and the status NO_GPU."""
+    import jax
+
+    from evaluation.report import describe_machine
+
+    kinds = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+    if sizes is GPU and not any(device.platform == "gpu" for device in jax.devices()):
+        print(
+            f"gpu-check needs an NVIDIA GPU; JAX sees {', '.join(kinds)}. Install the GPU's packages with "
+            "pip install -e '.[cuda,warp]', or try the command itself with --device cpu.",
+            file=sys.stderr,
+        )
+        sys.exit(NO_GPU)
+    save(devices=kinds, versions=artifacts.library_versions(), **describe_machine())
+    yield from ()
+
+
+def conformance(sizes: Sizes, save: Save) -> Iterator[str]:
+    """The experiments of `mjx_envs.conformance` on each backend; their violations."""
+    from mjx_envs import conformance as experiments
+    from mjx_envs import physics
+
+    for name in sizes.conformance:
+        start = time.monotonic()
+        step = experiments.make_step(physics.make_physics(name, experiments.SIM_DT_S))
+        measures = experiments.measure(step)
+        save(**{name: measures | {"seconds": time.monotonic() - start}})
+        yield from experiments.violations(name, measures)
+
+
+def pictures(sizes: Sizes, save: Save) -> Iterator[str]:
+    """Each renderer against OpenGL; where there is none, Warp's against the ray caster, which says so."""
+    import jax
+
+    from mjx_envs import batch_render, render_check
+
+    scenes = render_check.random_scenes(sizes.scenes)
+    drawn = {}
+    for name in sizes.renderers:
+        renderer = batch_render.make_renderer(name, scenes.camera)
+        drawn[name] = jax.device_get(jax.jit(renderer)(scenes.geoms, scenes.T_world_cam))
+    try:
+        reference, expected = "OpenGL", render_check.draw_with_open_gl(scenes)
+    except Exception as error:  # the back ends raise whatever their loaders do
+        yield f"no OpenGL to compare with: {type(error).__name__}: {error}"
+        reference, expected = "the JAX ray caster", drawn["jax"]
+    for name, seen in drawn.items():
+        measures = render_check.compare(seen, expected)
+        save(**{name: {"against": reference} | measures})
+        yield from (f"{name}: {line}" for line in render_check.violations(measures))
+
+
+def frames(sizes: Sizes, save: Save) -> Iterator[str]:
+    """Depth frames/s of each renderer by picture size, many scenes a call."""
+    import jax
+    import numpy as np
+
+    from mjx_envs import batch_render, render_check
+
+    scenes = render_check.random_scenes(12)
+    for side in sizes.frame_sizes_px:
+        count = min(4096, sizes.frame_pixels // side**2)
+        which = np.arange(count) % 12
+        repeated = jax.tree.map(lambda x, which=which: x[which], (scenes.geoms, scenes.T_world_cam))
+        geoms, T = jax.device_put(repeated)
+        scale = side / scenes.camera.height_px
+        camera = replace(
+            scenes.camera, fx_px=scenes.camera.fx_px * scale, fy_px=scenes.camera.fy_px * scale,
+            cx_px=side / 2, cy_px=side / 2, height_px=side, width_px=side,
+        )  # fmt: skip
+        for name in sizes.renderers:
+            draw = jax.jit(batch_render.make_renderer(name, camera, depth_only=True))
+            seconds = _seconds(lambda draw=draw, geoms=geoms, T=T: draw(geoms, T))
+            save(**{f"{name}_{side}px": {"scenes": count, "frames_per_s": count / seconds}})
+    yield from ()
+
+
+def env_steps(sizes: Sizes, save: Save) -> Iterator[str]:
+    """Control steps/s of the whole environment, episodes restarting, random actions."""
+    import jax
+
+    from ddgrasp.config import WorldConfig
+    from mjx_envs.grasp_env import AutoReset, GraspEnv
+
+    config = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics)
+    env = AutoReset(GraspEnv(config))
+
+    def roll(state, key):
+        def step(state, key):
+            action = jax.random.uniform(key, (state.reward.shape[0], contract.ACTION_SIZE), minval=-1.0)
+            return env.step(state, action), None
+
+        return jax.lax.scan(step, state, jax.random.split(key, sizes.control_steps))[0]
+
+    substeps = round(contract.CONTROL_DT_S / config.sim_dt_s)
+    for count in sizes.env_counts:
+        state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), count))
+        advance = jax.jit(roll)
+        seconds = _seconds(lambda advance=advance, state=state: advance(state, jax.random.PRNGKey(1)))
+        rate = count * sizes.control_steps / seconds
+        save(
+            **{f"{sizes.physics}_{count}": {"env_steps_per_s": rate, "physics_steps_per_s": rate * substeps}}
+        )
+    yield from ()
+
+
+def teacher(sizes: Sizes, save: Save) -> Iterator[str]:
+    """Trains a teacher from nothing until an evaluation reaches SUCCESS_AIM; wall time, compilation too."""
+    from ddgrasp.config import WorldConfig
+    from ddgrasp.presets import LAPTOP
+    from ppo.train import train
+
+    world = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics)
+    config = replace(LAPTOP, world=world, teacher=replace(LAPTOP.teacher, **sizes.teacher))
+    evaluations: list[dict[str, float]] = []
+    start = time.monotonic()
+
+    class Watch(Progress):
+        """Keeps the evaluations, and ends the training once the aim is reached."""
+
+        def scalars(self, step: int, **values: Any) -> None:
+            if "eval_success" not in values:
+                return
+            seconds = time.monotonic() - start
+            evaluations.append({"iteration": step, "success": values["eval_success"], "seconds": seconds})
+            save(num_envs=config.teacher.num_envs, evaluations=evaluations)
+            if values["eval_success"] >= SUCCESS_AIM:
+                save(seconds_to_95_percent=seconds)
+                raise _Reached
+
+    with tempfile.TemporaryDirectory() as directory:
+        try:
+            train(config, Path(directory), Watch(name="teacher"))
+        except _Reached:
+            return
+    if sizes is GPU:
+        yield f"the teacher ended below {SUCCESS_AIM:.0%}"
+
+
+class _Reached(Exception):
+    """The aim of section `teacher`."""
+
+
+SECTIONS: dict[str, tuple[Callable[[Sizes, Save], Iterator[str]], float]] = {
+    "machine": (machine, 40.0),
+    "conformance": (conformance, 150.0),
+    "pictures": (pictures, 60.0),
+    "frames": (frames, 60.0),
+    "env_steps": (env_steps, 80.0),
+    "teacher": (teacher, 300.0),
+}
+"""Name -> (function, seconds it may take). What a section leaves is the next one's; the sum is cut at
+TOTAL_S."""
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Runs all sections; prints what failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/gpu_check.json"))
+    parser.add_argument("--device", choices=sorted(SIZES), default="gpu")
+    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=list(SECTIONS))
+    parser.add_argument("--here", action="store_true", help="one section, in this process")
+    args = parser.parse_args()
+    if args.here:
+        sys.exit(run_section(args.sections[0], SIZES[args.device], args.out))
+    sys.exit(run_all(args.sections, args.device, args.out))
+
+
+def run_section(name: str, sizes: Sizes, out: Path) -> int:
+    """One section in this process: {measurements..., "errors": [...]} in `out`. Returns the exit status."""
+    result: dict[str, Any] = {"errors": []}
+
+    def save(**values: Any) -> None:
+        result.update(values)
+        artifacts.atomic_write_json(out, result)
+
+    for error in SECTIONS[name][0](sizes, save):
+        save(errors=[*result["errors"], error])
+    save()
+    return 1 if result["errors"] else 0
+
+
+def run_all(sections: Sequence[str], device: str, out: Path) -> int:
+    """Each section in a process of its own; writes `out` after each. Returns the exit status."""
+    start, slack = time.monotonic(), SIZES[device].slack
+    report: dict[str, Any] = {"device": device, "complete": False}
+    for name in sections:
+        left = slack * TOTAL_S - (time.monotonic() - start)
+        allowed = min(slack * SECTIONS[name][1], max(left, 1.0))
+        report[name], status = _in_process(name, device, allowed)
+        if status == NO_GPU:
+            return 2
+        report |= {"seconds": time.monotonic() - start, "complete": name == sections[-1]}
+        artifacts.atomic_write_json(out, report)
+        print(f"{name}: {report[name]['seconds']:.0f} s, {len(report[name]['errors'])} errors", flush=True)
+    errors = [f"{name}: {error}" for name in sections for error in report[name]["errors"]]
+    print("\n".join([str(out), *errors]))
+    return 1 if errors else 0
+
+
+def _in_process(name: str, device: str, allowed_s: float) -> tuple[dict[str, Any], int]:
+    """({measurements..., "errors", "seconds"}, exit status) of a section; cut off after `allowed_s`."""
+    start = time.monotonic()
+    with tempfile.TemporaryDirectory() as directory:
+        out, log = Path(directory) / "section.json", Path(directory) / "log"
+        command = [sys.executable, "-m", "benchmarks.gpu_check", "--here", "--sections", name]
+        command += ["--device", device, "--out", str(out)]
+        with open(log, "w") as stderr:
+            try:
+                status = subprocess.run(command, env=_environment(device), stderr=stderr, timeout=allowed_s)
+                status = status.returncode
+            except subprocess.TimeoutExpired:
+                status = None
+        said = log.read_text(errors="replace").strip()
+        if status == NO_GPU:
+            print(said.splitlines()[-1], file=sys.stderr)
+        result = artifacts.read_json(out) if out.exists() else {"errors": []}
+    if status is None:
+        result["errors"].append(f"cut off after {allowed_s:.0f} s")
+    elif status and not result["errors"]:
+        result["errors"].append(f"exit status {status}: {' | '.join(said.splitlines()[-3:])}")
+    return result | {"seconds": time.monotonic() - start}, status or 0
+
+
+def _environment(device: str) -> dict[str, str]:
+    """Warp allocates beside JAX, so JAX takes memory as it needs it."""
+    chosen = {"JAX_PLATFORMS": "cpu"} if device == "cpu" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    return {"MUJOCO_GL": "egl"} | dict(os.environ) | chosen
+
+
+def _seconds(function: Callable[[], Any], repeats: int = 5) -> float:
+    """Least wall time of `repeats` calls, after one that compiles."""
+    import jax
+
+    jax.block_until_ready(function())
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""What a teacher loses on physics backends it was not trained on: kept beside it, shown by the report."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import artifacts
+from evaluation import wilson
+
+BACKENDS_FILE = "backends.json"
+_KEPT = ("success", "objects", "saturated_actions")
+
+
+def save(directory: Path, results: Mapping[str, Mapping[str, Any]], seed: int) -> Path:
+    """Writes `results` (backend -> what `ppo.evaluate` gave) beside the teacher in `directory`.
+
+    Backends measured before stay, unless the teacher was made anew since. Returns the file.
+    """
+    rows = {row["backend"]: row for row in load(directory)}
+    for name, result in results.items():
+        rows[name] = {"backend": name, "seed": seed} | {key: result[key] for key in _KEPT}
+    path = directory / BACKENDS_FILE
+    teacher = artifacts.read_artifact(directory).hash
+    artifacts.atomic_write_json(path, {"teacher": teacher, "backends": list(rows.values())})
+    return path
+
+
+def load(directory: Path) -> list[dict[str, Any]]:
+    """A row for each backend that `save` wrote of the teacher now in `directory`."""
+    path = directory / BACKENDS_FILE
+    if not path.exists():
+        return []
+    saved = artifacts.read_json(path)
+    return saved["backends"] if saved["teacher"] == artifacts.read_artifact(directory).hash else []
+
+
+def table(directory: Path, trained_on: str) -> list[dict[str, Any]]:
+    """For the report: backend, success, drop in points from the backend trained on (None if that one was
+    not measured), and the success of each object."""
+    rows = {row["backend"]: row for row in load(directory)}
+    rates = {name: _success(row["success"]) for name, row in rows.items()}
+    home = rates.get(trained_on)
+    return [
+        {
+            "backend": name + (" (trained on)" if name == trained_on else ""),
+            "success": rates[name],
+            "drop_points": None if home is None else 100 * (home["rate"] - rates[name]["rate"]),
+            **{key: _success(counts) for key, counts in row["objects"].items()},
+        }
+        for name, row in rows.items()
+    ]
+
+
+def _success(counts: Mapping[str, int]) -> dict[str, Any]:
+    return wilson.success(counts["successes"], counts["n"])
