@@ -14,6 +14,7 @@ from pathlib import Path
 
 if sys.platform.startswith("linux"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(".cache/jax").absolute()))
 
 from benchmarks import physics_speed, render_speed
 from benchmarks.compare import as_json, print_table
