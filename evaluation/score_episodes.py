@@ -6,6 +6,7 @@ One file per episode, written when complete: a run that was stopped goes on with
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +51,9 @@ def score_episodes(
                 continue
             episode = load()
             seen[episode.side] = seen.get(episode.side, 0) + 1
-            arrays = _score(methods, extractors, episode, names, seen[episode.side] <= EXAMPLES)
+            arrays: dict[str, Any] = _score(
+                methods, extractors, episode, names, seen[episode.side] <= EXAMPLES
+            )
             with artifacts.atomic_path(file) as path:
                 np.savez(path, **arrays)
             task.advance()

@@ -46,8 +46,9 @@ def draw_holes(scored: Mapping[str, Any]) -> bytes:
         for domain, value in scored.items():
             y = np.asarray(value["curves"][name], float)
             if np.nansum(y) > 0:
-                style = {"linewidth": 2.2} if domain in (RAW, FLOOR) else {"linewidth": 1.2}
-                axes.plot(_places(name, len(y)), y, label=DOMAINS[domain].title, marker=".", **style)
+                width = 2.2 if domain in (RAW, FLOOR) else 1.2
+                x, title = _places(name, len(y)), DOMAINS[domain].title
+                axes.plot(x, y, label=title, marker=".", linewidth=width)
         axes.set_xlabel(_LABELS.get(name, "hole size (px)"), fontsize=8)
         axes.set_ylabel("regions per frame" if name == "size_px" else "hole rate", fontsize=8)
         if name == "size_px":
@@ -69,7 +70,8 @@ def _places(name: str, count: int) -> np.ndarray:
 
 
 def draw_embedding(flat: Mapping[str, np.ndarray], table: Mapping[str, Any], floor: float) -> bytes:
-    """PNG: the t-SNE, one panel per column: recorded depth in blue, the method's in orange (paper, Fig. 4).
+    """PNG: the t-SNE, one panel per column: recorded depth in blue, the method's in orange (the paper's t-SNE
+    figure, with its letters).
 
     flat: domain -> (n, 2). Titles give the neighbour mixing in feature space; 1 = mixed.
     """
@@ -82,7 +84,8 @@ def draw_embedding(flat: Mapping[str, np.ndarray], table: Mapping[str, Any], flo
         for domain, color in ((table[name]["real"], REAL_COLOR), (table[name]["sim"], SIM_COLOR)):
             axes.scatter(*flat[domain].T, s=3, c=color, label=DOMAINS[domain].title, alpha=0.5, linewidths=0)
         mixing = table[name]["mixing"]["value"]
-        axes.set_title(f"({'abcdef'[index]}) {table[name]['title']}: mixing {mixing:.2f}", fontsize=9)
+        letter = "abcdef"[list(COLUMNS).index(name)]
+        axes.set_title(f"({letter}) {table[name]['title']}: mixing {mixing:.2f}", fontsize=9)
         axes.set_xticks([])
         axes.set_yticks([])
         axes.legend(fontsize=7, markerscale=3, loc="upper right")

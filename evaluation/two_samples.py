@@ -29,7 +29,7 @@ def compare(real: Sample, sim: Sample, config: ScoreConfig, drawn: Drawn) -> dic
     mixing, mixings = neighbour_mixing(real, sim, config.neighbours, drawn)
     return {
         "fid": interval(fid, fids),
-        "kid_x100": interval(KID_SCALE * kid, KID_SCALE * _kid_draws(real, sim, drawn)),
+        "kid_x100": interval(KID_SCALE * kid, [KID_SCALE * v for v in _kid_draws(real, sim, drawn)]),
         "auc": interval(auc, aucs),
         "mixing": interval(mixing, mixings),
         "resampled_fid": fids,
@@ -45,7 +45,7 @@ def _kid(x: np.ndarray, y: np.ndarray, config: ScoreConfig) -> float:
     return distances.kid(x, y, config.kid_subsets, size)[0]
 
 
-def _kid_draws(real: Sample, sim: Sample, drawn: Drawn) -> np.ndarray:
+def _kid_draws(real: Sample, sim: Sample, drawn: Drawn) -> list[float]:
     """The squared maximum mean discrepancy of every draw, by weights: kernels are computed once."""
     x, y = real.features.astype(np.float64), sim.features.astype(np.float64)
 
@@ -62,7 +62,7 @@ def _kid_draws(real: Sample, sim: Sample, drawn: Drawn) -> np.ndarray:
         w = np.bincount(real.rows(r), minlength=len(x)).astype(float)
         v = np.bincount(sim.rows(s), minlength=len(y)).astype(float)
         values.append(within(kxx, w) + within(kyy, v) - 2 * (w @ kxy @ v) / (w.sum() * v.sum()))
-    return np.asarray(values)
+    return values
 
 
 # --- classifier ------------------------------------------------------------------------------------

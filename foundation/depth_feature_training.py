@@ -136,7 +136,8 @@ def _target_scale(pool: Pool, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _outputs(params: Any, depth_m: Array) -> tuple[Array, Array, Array]:
     features: Any = depth_features.Trunk().apply({"params": params["trunk"]}, depth_m)
-    logits, measured = Heads().apply({"params": params["heads"]}, features)  # pyright: ignore
+    outputs: Any = Heads().apply({"params": params["heads"]}, features)
+    logits, measured = outputs
     return features, logits, measured
 
 
