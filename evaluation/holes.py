@@ -110,12 +110,12 @@ def repeat_sums(depth_m: np.ndarray) -> Sums:
         if (union := (a | b).sum())  # two pictures without a hole have no overlap to speak of
     ]
     always = ~holes.any(0)
-    deviation = np.std(depth_m[:, always], axis=0, ddof=1)
+    deviation = np.std(depth_m[:, always], axis=0, ddof=1, dtype=np.float64)
     return {
         "overlap": np.array(sum(overlaps)), "overlap_pairs": np.array(len(overlaps)),
         "still_changed": np.array((holes[1:] != holes[:-1]).sum()),
         "still_pairs": np.array(holes[1:].size),
-        "deviation": np.array(deviation.sum(dtype=np.float64)), "deviation_pixels": np.array(always.sum()),
+        "deviation": np.array(deviation.sum()), "deviation_pixels": np.array(always.sum()),
     }  # fmt: skip
 
 

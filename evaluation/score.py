@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,9 +17,12 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.progress import PICTURES, Progress
 from evaluation import score_data, score_features, score_figures, score_table, two_samples
-from evaluation.score_domains import DOMAINS, FLOOR, Methods, wanted_domains
+from evaluation.score_domains import COLUMNS, DOMAINS, Methods, wanted_domains
 from evaluation.score_episodes import Load, Scored, collect, score_episodes
 from evaluation.score_page import HTML, JSON, render, summary
+
+if TYPE_CHECKING:
+    from ddg_jax.sample import Generator
 
 STAGE, STAGE_REAL = "score", "score_real"
 _EMBED_SEED = 0
@@ -64,23 +67,28 @@ def run_real(
 ) -> Artifact:
     """Fits a generator on the first frames of the recordings below `root` and scores it on the last ones."""
     directory = out / STAGE_REAL
-    frames = score_data.load_real(root, config.ddg.width_px)
-    if fit_frames < 2 or fit_frames + score_frames > len(frames.depth_mm):
+    least = 4 * score_data.BLOCK_FRAMES
+    if score_frames < least:
+        raise UserError(f"--score-frames is {score_frames}; expected {least} or more: two blocks per side.")
+    frames = score_data.load_real(root, config.ddg.width_px, score_frames)
+    if fit_frames < 2 or fit_frames + score_frames > frames.total:
         raise UserError(
-            f"--fit-frames {fit_frames} and --score-frames {score_frames} of {len(frames.depth_mm)} frames: "
+            f"--fit-frames {fit_frames} and --score-frames {score_frames} of {frames.total} frames: "
             "they must not overlap, and fitting needs 2 or more."
         )
     config = replace(config, ddg=replace(config.ddg, height_px=frames.depth_mm.shape[1]))
     fitted = _fit_real(config, root, fit_frames, directory / "ddg", progress)
     methods = Methods(config.score, config.seed, fitted)
-    episodes = score_data.real_episodes(frames, score_frames, methods.needs_rgb)
+    episodes = score_data.real_episodes(frames, methods.needs_rgb)
     loads: list[Load] = [partial(lambda e: e, episode) for episode in episodes]
     text = REAL_SETTING.format(root=root.name, fit=fit_frames, score=score_frames)
     parents = [artifacts.read_artifact(directory / "ddg")]
     return _finish(STAGE_REAL, Setting(text, config, directory), methods, loads, parents, progress)
 
 
-def _fit_real(config: Config, root: Path, fit_frames: int, directory: Path, progress: Progress):
+def _fit_real(
+    config: Config, root: Path, fit_frames: int, directory: Path, progress: Progress
+) -> "Generator":
     """The generator fitted on the first frames, or the finished one."""
     from ddg_jax.data import load_frames
     from ddg_jax.prior import make_prior
@@ -155,13 +163,14 @@ def _draw(scored: Scored, result: dict[str, Any], config: Config, progress: Prog
         for name, value in result["tables"].items()
     }
     pictures["holes"] = score_figures.draw_holes(result["holes"])
-    shown = {name: sample for name, sample in scored.features[first].items() if name != FLOOR}
+    paired = {domain for name in config.score.columns for domain in vars(COLUMNS[name]).values()}
+    shown = {name: sample for name, sample in scored.features[first].items() if name in paired}
     share = max(2, config.score.tsne_maps // len(shown))
     thin = {name: _spread(sample.features, share) for name, sample in shown.items()}
     progress.note(f"t-SNE of {sum(map(len, thin.values()))} maps")
     result["tsne_maps"] = {name: len(f) for name, f in thin.items()}
     flat = two_samples.embed(thin, _EMBED_SEED)
-    floor = own[score_table.FLOOR]["mixing"]["value"]
+    floor = own["floor"]["mixing"]["value"]
     pictures["tsne"] = score_figures.draw_embedding(flat, own, floor)
     return pictures
 

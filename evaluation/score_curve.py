@@ -55,7 +55,7 @@ def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Arti
         points.append(_point(config, size, frames, common, extractor, loads, directory, progress))
     result = {"features": {extractor.name: extractor.source}, "points": points}
     artifacts.atomic_write_json(directory / JSON, result)
-    floor, base = points[0][score_table.FLOOR], points[0]["sim_gt"]["fid"]["value"]
+    floor, base = points[0]["floor"], points[0]["sim_gt"]["fid"]["value"]
     picture = score_figures.draw_efficiency(points, floor, base)
     artifacts.atomic_write_bytes(directory / PICTURES / "curve.png", picture)
     parents = [artifacts.read_artifact(run_dir / name) for name in ("teacher", "ddg")]
@@ -69,7 +69,7 @@ def rows(points: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
     return [
         {"trajectories": str(p["trajectories"]), "frames": str(p["frames"]), "steps": str(p["steps"]),
          **{f"{p[name]['title']}, {title}": score_table.describe(p[name][key])
-            for name in (*COLUMNS[1:], score_table.FLOOR)
+            for name in (*COLUMNS[1:], "floor")
             for key, title in (("fid", "FID"), ("kid_x100", "KID x 100"))}}
         for p in points
     ]  # fmt: skip

@@ -164,16 +164,17 @@ def load_episode(file: Path) -> Episode:
 
 @dataclass(frozen=True)
 class RealFrames:
-    """A camera's frames in time order. depth_mm (N, H, W); rgb (N, h, w, 3)."""
+    """The last frames of a camera, in time order. depth_mm (N, H, W); rgb (N, h, w, 3); total: all frames."""
 
+    total: int
     depth_mm: np.ndarray
     rgb: np.ndarray
     focal_px: float
     baseline_m: float
 
 
-def load_real(root: Path, width_px: int) -> RealFrames:
-    """Every frame of the recordings at or below `root`, at `width_px` (nearest neighbours).
+def load_real(root: Path, width_px: int, last: int) -> RealFrames:
+    """The `last` frames of the recordings at or below `root`, at `width_px` (nearest neighbours).
 
     Raises UserError for recordings of different sizes, or none.
     """
@@ -186,10 +187,11 @@ def load_real(root: Path, width_px: int) -> RealFrames:
     (height, width) = sizes.pop()
     size = (round(height * width_px / width), width_px)
     frames = [(r, i) for r in recordings for i in range(len(r))]
-    depth = np.stack([resize_nearest(r.depth_mm(i), size) for r, i in frames])
-    rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in frames])
+    chosen = frames[-last:]
+    depth = np.stack([resize_nearest(r.depth_mm(i), size) for r, i in chosen])
+    rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
     focal = recordings[0].fx_px or contract.D455.fx_px * width / contract.D455.width_px
-    return RealFrames(depth, rgb, focal * width_px / width, _baseline_m(recordings[0]))
+    return RealFrames(len(frames), depth, rgb, focal * width_px / width, _baseline_m(recordings[0]))
 
 
 def _baseline_m(recording: Recording) -> float:
@@ -210,22 +212,16 @@ def completed(depth_mm: np.ndarray) -> np.ndarray:
     return millimetres(invert(smooth))
 
 
-def real_episodes(frames: RealFrames, score_frames: int, with_rgb: bool) -> list[Episode]:
-    """The last `score_frames` frames as episodes: even ones are the real side, odd ones give the geometry.
+def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
+    """The frames as episodes: even ones are the real side, odd ones give the geometry.
 
-    Both sides see the same room, 1 / rate apart: the distance between them is the sensor's alone.
-    UserError if there are too few frames for two blocks per side.
+    Both sides see the same room, a frame apart: the distance between them is the sensor's alone.
     """
-    if score_frames > len(frames.depth_mm) or score_frames < 4 * BLOCK_FRAMES:
-        raise UserError(
-            f"--score-frames is {score_frames}; expected {4 * BLOCK_FRAMES} to {len(frames.depth_mm)}, the "
-            "number of frames."
-        )
-    depth, rgb = frames.depth_mm[-score_frames:], frames.rgb[-score_frames:]
+    depth, rgb = frames.depth_mm, frames.rgb
     clean = completed(depth)
     episodes = []
     for parity, side in enumerate(SIDES):
-        for block in range(score_frames // (2 * BLOCK_FRAMES)):
+        for block in range(len(depth) // (2 * BLOCK_FRAMES)):
             rows = np.arange(BLOCK_FRAMES) * 2 + parity + block * 2 * BLOCK_FRAMES
             episodes.append(
                 Episode(

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 RAW = "real_raw"
 FLOOR = "sim_sensed"
 """What the camera recorded of the episodes whose geometry the methods get: the real-vs-real floor."""
+LIMIT = "sim_graft_limit"
+"""Exact simulated depth under the holes that the camera itself had there: what grafting of holes alone can
+reach at best, whatever the generator."""
 _REPEATS = 100_000
 """Added to an episode's number where its world stands still: other noise than the moving episode's."""
 
@@ -91,6 +94,11 @@ class Domain:
     make: Callable[[Methods, Episode], dict[str, np.ndarray]]
 
 
+def _graft_limit(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
+    del methods
+    return {LIMIT: np.where(episode.sensed_mm > 0, episode.clean_mm, 0)}
+
+
 def _rand_noise(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
     from sensors.procedural import corrupt
 
@@ -139,6 +147,7 @@ DOMAINS: dict[str, Domain] = {
     RAW: Domain("Real Raw", REAL, lambda m, e: {RAW: e.sensed_mm}),
     FLOOR: Domain("Real Raw, other episodes", SIM, lambda m, e: {FLOOR: e.sensed_mm}),
     "sim_gt": Domain("Sim GT", SIM, lambda m, e: {"sim_gt": e.clean_mm}),
+    LIMIT: Domain("Camera's holes, exact depth", SIM, _graft_limit),
     "sim_rand_noise": Domain("Sim Rand Noise", SIM, _rand_noise),
     "real_inpaint": Domain(
         "Real Inpaint",
@@ -170,11 +179,15 @@ COLUMNS: dict[str, Column] = {
     "ddg": Column("DDG", RAW, "sim_ddg"),
 }
 """The paper's Table I and its t-SNE's six pairings, by the names of `ddgrasp.config.SCORE_COLUMNS`."""
-FLOOR_COLUMN = Column("Real vs real", RAW, FLOOR)
+REFERENCES: dict[str, Column] = {
+    "graft_limit": Column("Graft limit", RAW, LIMIT),
+    "floor": Column("Real vs real", RAW, FLOOR),
+}
+"""What figures are to be read against; no methods, and no column can be expected to pass the floor."""
 
 
 def wanted_domains(columns: Sequence[str]) -> list[str]:
-    """Domains that the columns and the floor need, in the order of DOMAINS."""
-    pairs = [COLUMNS[name] for name in columns] + [FLOOR_COLUMN]
+    """Domains that the columns and the references need, in the order of DOMAINS."""
+    pairs = [*(COLUMNS[name] for name in columns), *REFERENCES.values()]
     needed = {name for pair in pairs for name in (pair.real, pair.sim)}
     return [name for name in DOMAINS if name in needed]

@@ -78,7 +78,9 @@ def draw_embedding(flat: Mapping[str, np.ndarray], table: Mapping[str, Any], flo
     shown = [name for name in table if name in COLUMNS and "fid" in table[name]]
     rows = -(-len(shown) // 3)
     figure = Figure(figsize=(11, 3.4 * rows), layout="constrained")
-    figure.suptitle(f"t-SNE; neighbour mixing of real with real {floor:.2f}", fontsize=10)
+    count = sum(len(points) for points in flat.values())
+    title = f"t-SNE of {count} maps; neighbour mixing (1 = mixed), real with real {floor:.2f}"
+    figure.suptitle(title, fontsize=10)
     for index, name in enumerate(shown):
         axes = figure.add_subplot(rows, 3, index + 1)
         for domain, color in ((table[name]["real"], REAL_COLOR), (table[name]["sim"], SIM_COLOR)):

@@ -8,10 +8,9 @@ import numpy as np
 from ddgrasp.config import ScoreConfig
 from evaluation import holes, two_samples
 from evaluation.resampling import Sample, draws, interval, intervals
-from evaluation.score_domains import COLUMNS, DOMAINS, FLOOR_COLUMN, RAW, Column
+from evaluation.score_domains import COLUMNS, DOMAINS, RAW, REFERENCES, Column
 from evaluation.score_episodes import Scored
 
-FLOOR = "floor"
 NO_WEIGHTS = "no weights"
 RATIO_TARGET = 0.15
 """DDG's FID over Sim GT's; the paper's is 87.01 / 422.24 = 0.206."""
@@ -22,15 +21,14 @@ Table = dict[str, Any]
 
 
 def make_table(samples: Mapping[str, Sample], config: ScoreConfig, seed: int) -> Table:
-    """Column -> figures with intervals (see two_samples.compare), and the real-vs-real floor.
+    """Column -> figures with intervals (see two_samples.compare), then the references that there are.
 
     The same resampled trajectories serve all columns, so that their ratios have intervals too. A column
     whose domains are missing says why.
     """
     drawn = _draw(samples, config, seed)
-    table: Table = {FLOOR: _compare(FLOOR_COLUMN, samples, config, drawn)}
-    for name in config.columns:
-        table[name] = _compare(COLUMNS[name], samples, config, drawn)
+    table: Table = {n: _compare(COLUMNS[n], samples, config, drawn) for n in config.columns}
+    table |= {n: _compare(c, samples, config, drawn) for n, c in REFERENCES.items() if c.sim in samples}
     base = table.get("sim_gt", {})
     for figures in table.values():
         if "fid" in figures and "fid" in base:
@@ -42,8 +40,7 @@ def _draw(
     samples: Mapping[str, Sample], config: ScoreConfig, seed: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     rng = np.random.default_rng(seed)
-    real = samples[FLOOR_COLUMN.real].groups
-    sim = samples[FLOOR_COLUMN.sim].groups
+    real, sim = samples[REFERENCES["floor"].real].groups, samples[REFERENCES["floor"].sim].groups
     return list(zip(draws(real, config.bootstrap, rng), draws(sim, config.bootstrap, rng), strict=True))
 
 
@@ -96,7 +93,7 @@ def _domain_figures(
 
 def targets(table: Table) -> list[dict[str, str]]:
     """Each target with what was measured and whether it is met."""
-    present = {name: f for name, f in table.items() if name != FLOOR and "fid" in f}
+    present = {name: f for name, f in table.items() if name not in REFERENCES and "fid" in f}
     ranks = {key: sorted(present, key=lambda n: present[n][key]["value"]) for key in ("fid", "kid_x100")}
     order = [" < ".join(present[n]["title"] for n in names) for names in ranks.values()]
     measured_order = order if len(present) > 1 else [None, None]
@@ -138,11 +135,10 @@ HOLES = {
 
 
 def distance_rows(table: Table) -> list[dict[str, str]]:
-    """Table I as text: one record per measure, one entry per column, the floor last."""
-    names = [name for name in table if name != FLOOR] + [FLOOR]
+    """Table I as text: one record per measure, one entry per column, references last."""
     return [
         {"measure": title,
-         **{table[n]["title"]: describe(table[n].get(key), table[n].get("absent", "")) for n in names}}
+         **{table[n]["title"]: describe(table[n].get(key), table[n].get("absent", "")) for n in table}}
         for key, title in DISTANCES.items()
     ]  # fmt: skip
 

@@ -15,7 +15,17 @@ from ddgrasp.config import Config, DDGConfig, RecordConfig, ScoreConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from evaluation import score_data, score_features
-from evaluation.score_domains import COLUMNS, DOMAINS, FLOOR, Methods, inpainted, sense, wanted_domains
+from evaluation.score_domains import (
+    COLUMNS,
+    DOMAINS,
+    FLOOR,
+    LIMIT,
+    REFERENCES,
+    Methods,
+    inpainted,
+    sense,
+    wanted_domains,
+)
 from evaluation.score_figures import draw_efficiency
 from evaluation.stage import write_report
 from foundation import convert, store
@@ -89,7 +99,7 @@ def scored(run_dir, tmp_path_factory):
 def test_the_score_has_every_column_the_floor_and_the_targets(scored):
     result = json.loads((scored / "score" / "score.json").read_text())
     table = result["tables"]["depthfeat-v1"]
-    assert set(table) == {*COLUMNS, "floor"}
+    assert set(table) == {*COLUMNS, *REFERENCES}
     assert table["monocular"] == {"title": "Monocular", "absent": "no weights"}
     for name, figures in table.items():
         if name != "monocular":
@@ -200,7 +210,7 @@ def test_domains_belong_to_one_side_and_depend_on_seed_and_episode_alone(run_dir
     names = [name for name in DOMAINS if "monocular" not in name]
     real, sim = (sense(methods, episode(side), names) for side in score_data.SIDES)
     assert set(real) == {"real_raw", "real_inpaint"}
-    assert set(sim) == {FLOOR, "sim_gt", "sim_rand_noise", "sim_ddg", "sim_ddg_no_graft"}
+    assert set(sim) == {FLOOR, LIMIT, "sim_gt", "sim_rand_noise", "sim_ddg", "sim_ddg_no_graft"}
     again = sense(methods, episode("sim"), ["sim_ddg"])["sim_ddg"]
     np.testing.assert_array_equal(again, sim["sim_ddg"])
     kept = sim["sim_ddg"] > 0
