@@ -39,9 +39,12 @@ def make_table(samples: Mapping[str, Sample], config: ScoreConfig, seed: int) ->
 def _draw(
     samples: Mapping[str, Sample], config: ScoreConfig, seed: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Groups resampled on either side; the same ones where both sides show the same scenes."""
     rng = np.random.default_rng(seed)
     real, sim = samples[REFERENCES["floor"].real].groups, samples[REFERENCES["floor"].sim].groups
-    return list(zip(draws(real, config.bootstrap, rng), draws(sim, config.bootstrap, rng), strict=True))
+    drawn = draws(real, config.bootstrap, rng)
+    paired = np.array_equal(np.unique(real), np.unique(sim))
+    return list(zip(drawn, drawn if paired else draws(sim, config.bootstrap, rng), strict=True))
 
 
 def _compare(

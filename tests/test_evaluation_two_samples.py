@@ -96,6 +96,15 @@ def test_what_was_not_measured_is_not_called_missed():
     assert [row["met"] for row in rows] == ["not measured"] * 4
 
 
+def test_scenes_on_both_sides_are_resampled_together():
+    real, same, others = sample(0), sample(1), sample(1, first=50)
+    for sim, together in ((same, True), (others, False)):
+        drawn = score_table._draw({"real_raw": real, "sim_sensed": sim}, CONFIG, 0)
+        assert len(drawn) == CONFIG.bootstrap
+        assert all(np.array_equal(r, s) for r, s in drawn) == together
+        assert all(set(r) <= set(real.groups) and set(s) <= set(sim.groups) for r, s in drawn)
+
+
 def test_unknown_names_are_refused_with_the_nearest():
     with pytest.raises(UserError, match="'ddg_graft'.*Did you mean 'ddg_no_graft'"):
         ScoreConfig(columns=("sim_gt", "ddg_graft"))
