@@ -205,7 +205,8 @@ def completed(depth_mm: np.ndarray) -> np.ndarray:
 
     It keeps the room's layout and loses holes and most noise; it is not the room's true depth.
     """
-    from ddg_jax.prior import fill_from_background, invert, smooth_in_time
+    from ddg_jax.prior import invert, smooth_in_time
+    from sensors.holes import fill_from_background
 
     filled = np.stack([fill_from_background(frame) for frame in invert(metres(depth_mm))])
     smooth = np.stack([cv2.medianBlur(frame, 5) for frame in smooth_in_time(filled)])

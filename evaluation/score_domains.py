@@ -6,14 +6,14 @@ and the monocular network with recorded depth treated alike.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from ddgrasp import contract
-from ddgrasp.config import ScoreConfig
+from ddgrasp.config import DextrahConfig, ScoreConfig
 from ddgrasp.errors import UserError
 from evaluation.score_data import REAL, SIM, Episode, metres, millimetres
 
@@ -100,12 +100,23 @@ def _graft_limit(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
 
 
 def _rand_noise(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
-    from sensors.procedural import corrupt
+    """DextrAH-G's published noise."""
+    import jax
 
     base = contract.D455.scaled(episode.clean_mm.shape[2] / contract.D455.width_px)
     profile = replace(base, fx_px=episode.focal_px, fy_px=episode.focal_px, baseline_m=episode.baseline_m)
-    rng = np.random.default_rng([methods.seed, episode.number])
-    return {"sim_rand_noise": millimetres(corrupt(metres(episode.clean_mm), rng, profile))}
+    key = jax.random.fold_in(jax.random.key(methods.seed), episode.number)
+    noisy = _dextrah(profile)(key, metres(episode.clean_mm), None)
+    return {"sim_rand_noise": millimetres(np.asarray(noisy))}
+
+
+@cache
+def _dextrah(profile: contract.CameraProfile) -> Callable[..., Any]:
+    import jax
+
+    from sensors.procedural import dextrah
+
+    return jax.jit(dextrah(DextrahConfig(), profile))
 
 
 def inpainted(depth_mm: np.ndarray, radius_px: float) -> np.ndarray:

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from ddgrasp.contract import D455
+from foundation.depth_feature_noise import ProceduralConfig, corrupt
 from sensors import stats
-from sensors.procedural import ProceduralConfig, corrupt
 
 GRID = (2, 3)
 """Rows and columns of the coarse layout that is asked for."""
@@ -55,7 +55,7 @@ def _stereo(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _procedural(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
-    """sensors/procedural.py at random strengths."""
+    """foundation/depth_feature_noise.py at random strengths."""
     strength = np.exp(rng.normal(0, 0.7, 4))
     config = ProceduralConfig(
         shift_px=0.5 * strength[0],

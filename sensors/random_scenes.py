@@ -13,7 +13,8 @@ from ddgrasp.config import StereoConfig
 from ddgrasp.contract import D455, CameraProfile
 from mjx_envs.camera import Buffers, Camera, look_at
 from mjx_envs.raycast_numpy import render, render_depth
-from sensors.active_stereo import ActiveStereo, Material
+from sensors.active_stereo import ActiveStereo
+from sensors.materials import Material
 
 FAR_M = 10.0
 """Surfaces beyond are not drawn."""
