@@ -36,6 +36,9 @@ STAGE_FIELDS: dict[str, tuple[str, ...]] = {
     "deploy": (
         "seed", "world", "teacher", "demos", "record", "ddg", "student", "export", "deploy", "evaluation",
     ),
+    "score": ("seed", "world", "record", "ddg", "score"),
+    "score_real": ("seed", "ddg", "score"),
+    "curve": ("seed", "world", "record", "ddg", "score"),
 }  # fmt: skip
 """The parts of `Config` that a stage's result depends on: these are hashed, and must match on --resume."""
 
@@ -130,7 +133,7 @@ class Manifest:
     """Where an artefact came from and what was measured on it."""
 
     stage: str
-    """teacher, demos, record, ddg, student, export or deploy."""
+    """A name of ddgrasp/pipeline.py: teacher, demos, record, ddg, student, export, deploy, score, ..."""
     config: dict[str, Any]
     """The whole configuration, as JSON."""
     config_hash: str

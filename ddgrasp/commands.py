@@ -3,7 +3,8 @@
 Stages are imported inside `run`, so that `--help` starts without JAX.
 """
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Protocol
@@ -11,7 +12,15 @@ from typing import Annotated, Any, Protocol
 import tyro
 
 from ddgrasp import artifacts, contract, pipeline
-from ddgrasp.config import Config, HostsConfig, RecordConfig, StereoConfig, WorldConfig
+from ddgrasp.config import (
+    Config,
+    DepthFeatureConfig,
+    HostsConfig,
+    RecordConfig,
+    ScoreConfig,
+    StereoConfig,
+    WorldConfig,
+)
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.presets import get_preset
 
@@ -274,6 +283,92 @@ class DDGSample:
 
 
 @dataclass(frozen=True)
+class _Scoring:
+    score: Annotated[ScoreConfig, tyro.conf.arg(name="")]
+    """How to score; the rest of the configuration is the run's own."""
+    preset: str
+    """Preset whose sizes to take."""
+    out: Path
+    """Directory of the result, a folder in it; usually the run's."""
+    run_dir: Path | None = None
+    """Run whose teacher and generator to use; none takes --out."""
+    seed: int = 0
+    """Of trajectories, noise and resampling."""
+    resume: bool = False
+    """Continue what is there."""
+
+    def _make(self, stage_name: str, work: Callable[[Config, Path, Any], artifacts.Artifact]) -> None:
+        """Lets `work` make the stage from the run's teacher and generator, and prints where the result is."""
+        source = self.run_dir or self.out
+        config = replace(load_config(source, "ddg"), score=self.score, seed=self.seed)
+        parents = {name: artifacts.read_artifact(source / name).hash for name in ("teacher", "ddg")}
+        pipeline.make(
+            pipeline.get_stage(stage_name), config, self.out, lambda progress: work(config, source, progress),
+            resume=self.resume, inputs=parents,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DDGScore(_Scoring):
+    """Compare generated depth with recorded depth: the paper's Table I, hole measures, t-SNE."""
+
+    real: Path | None = None
+    """Recordings of a real camera: fits on the first frames and scores the last, instead of the rig."""
+    fit_frames: int = 80
+    """Frames that --real is fitted on."""
+    score_frames: int = 40
+    """Frames that --real is scored on."""
+
+    def run(self) -> None:
+        from evaluation import score
+        from evaluation.score_page import print_result
+
+        if self.real is None:
+            self._make("score", lambda config, source, p: score.run(config, source, self.out, progress=p))
+            print_result(self.out / "score")
+            return
+        _check_count("--fit-frames", self.fit_frames)
+        config = replace(get_preset(self.preset), score=self.score, seed=self.seed)
+        root, stage = self.real, pipeline.get_stage("score_real")
+
+        def work(progress):
+            return score.run_real(
+                config, root, self.fit_frames, self.score_frames, self.out, progress=progress
+            )
+
+        inputs = {"frames": f"{root.resolve()} {self.fit_frames} {self.score_frames}"}
+        pipeline.make(stage, config, self.out, work, resume=self.resume, inputs=inputs)
+        print_result(self.out / stage.name)
+
+
+@dataclass(frozen=True)
+class DDGCurve(_Scoring):
+    """Fit and score the generator on 5, 10, 20, ... recorded trajectories: the data-efficiency curve."""
+
+    def run(self) -> None:
+        from evaluation import score_curve
+        from evaluation.score_page import print_result
+
+        self._make("curve", lambda config, source, p: score_curve.run(config, source, self.out, progress=p))
+        print_result(self.out / "curve")
+
+
+@dataclass(frozen=True)
+class DDGFeatures:
+    """Train the depth feature extractor that scores use; the frozen one is part of the repository."""
+
+    config: Annotated[DepthFeatureConfig, tyro.conf.arg(name="")] = DepthFeatureConfig()
+    out: Path = Path("runs") / "depthfeat"
+    """Folder of the extractor; the same command continues what was begun there."""
+
+    def run(self) -> None:
+        from foundation.depth_feature_training import train
+
+        manifest = train(self.config, self.out)
+        print(json.dumps(manifest["tested_on_new_cameras"], indent=2))
+
+
+@dataclass(frozen=True)
 class StudentTrain(_OneStage):
     """Train the depth-only student on noisy demonstrations."""
 
@@ -455,6 +550,9 @@ COMMANDS: dict[str, type] = {
     "record import": RecordImport,
     "ddg fit": DDGFit,
     "ddg sample": DDGSample,
+    "ddg score": DDGScore,
+    "ddg curve": DDGCurve,
+    "ddg features": DDGFeatures,
     "student train": StudentTrain,
     "student eval": StudentEval,
     "export": Export,
@@ -475,6 +573,9 @@ def parse(name: str, args: Sequence[str]) -> Command:
     if issubclass(cls, _FromPreset):
         preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
         options["default"] = cls(config=preset, out=Path("runs") / preset.preset)
+    elif issubclass(cls, _Scoring):
+        preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
+        options["default"] = cls(preset.score, preset.preset, Path("runs") / preset.preset)
     elif cls is Deploy:
         policy = Path(_option(args, "--policy") or Path("runs") / DEFAULT_PRESET / "export" / "policy.onnx")
         options["default"] = Deploy(config=_config_of(policy, _option(args, "--preset")), policy=policy)

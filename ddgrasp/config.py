@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ddgrasp import contract
-from ddgrasp.errors import UserError
+from ddgrasp.errors import UserError, unknown_name
 
 
 def _check_counts(section: str, config: Any, *names: str) -> None:
@@ -644,6 +644,101 @@ class EvalConfig:
         _check_counts("evaluation", self, "teacher_trials", "student_trials", "rig_trials")
 
 
+SCORE_COLUMNS = ("sim_gt", "rand_noise", "inpaint", "monocular", "ddg_no_graft", "ddg")
+"""Columns of the paper's Table I; ddg_no_graft is its ablation."""
+SCORE_FEATURES = ("depthfeat-v1", "fid_inception", "resnet18", "resnet18_random_v1")
+"""Feature extractors of scores; fid_inception and resnet18 need converted weights."""
+
+
+@dataclass(frozen=True)
+class ScoreConfig:
+    """How generated depth is compared with recorded depth (paper Table I and its t-SNE)."""
+
+    trajectories: int = 64
+    """Rig trajectories recorded for scoring per side: as many give real depth, as many others simulated."""
+    frames: int = 16
+    """Consecutive frames of each, from a random step on."""
+    columns: tuple[str, ...] = SCORE_COLUMNS
+    """Columns of the table: sim_gt, rand_noise, inpaint, monocular (needs weights), ddg_no_graft, ddg."""
+    features: tuple[str, ...] = ("depthfeat-v1",)
+    """Feature extractors, the first of which the targets are judged by: depthfeat-v1, fid_inception, resnet18
+    (both need converted weights in weights/) or resnet18_random_v1."""
+    kid_subsets: int = 100
+    """Random subsets behind KID."""
+    kid_subset_size: int = 500
+    """Maps per subset, at most half of what there is."""
+    bootstrap: int = 100
+    """Resamplings of whole trajectories behind every interval."""
+    tsne_maps: int = 8000
+    """Maps in the t-SNE, all domains together, at most."""
+    neighbours: int = 10
+    """Nearest neighbours behind the mixing number."""
+    repeat_scenes: int = 8
+    """Scenes that are sensed again and again while nothing moves."""
+    repeats: int = 6
+    """How often each of them is sensed."""
+    monocular: str = "depth_anything_v2"
+    """Network behind the monocular column: depth_anything_v2 or video_depth_anything."""
+    monocular_weights: str = ""
+    """Folder of its converted weights; empty takes weights/<network>_small."""
+    inpaint_radius_px: float = 3.0
+    """Neighbourhood of OpenCV's inpainting."""
+    curve_trajectories: tuple[int, ...] = (5, 10, 20, 40, 80)
+    """Sizes of the data-efficiency curve."""
+    curve_steps: int = 0
+    """Training steps of every point of the curve; 0 takes as many as the run's generator had."""
+
+    def __post_init__(self) -> None:
+        _check_counts("score", self, "kid_subsets", "bootstrap", "tsne_maps", "neighbours")
+        for field_name, value, least in (
+            ("trajectories", self.trajectories, 2), ("frames", self.frames, 2), ("repeats", self.repeats, 2),
+            ("kid_subset_size", self.kid_subset_size, 2),
+        ):  # fmt: skip
+            if value < least:
+                raise UserError(f"score.{field_name} is {value}; expected at least {least}.")
+        _check_names("score.columns", self.columns, SCORE_COLUMNS)
+        _check_names("score.features", self.features, SCORE_FEATURES)
+        if any(count < 1 for count in self.curve_trajectories):
+            raise UserError(
+                f"score.curve_trajectories is {self.curve_trajectories}; expected 1 or more each."
+            )
+
+
+def _check_names(field_name: str, given: tuple[str, ...], known: tuple[str, ...]) -> None:
+    if not given:
+        raise UserError(f"{field_name} is empty; expected at least one of {', '.join(known)}.")
+    for name in given:
+        if name not in known:
+            raise unknown_name(field_name, name, known)
+
+
+@dataclass(frozen=True)
+class DepthFeatureConfig:
+    """Training of the depth feature extractor (foundation/depth_feature_training.py)."""
+
+    seed: int = 0
+    """Of rooms, cameras, corruptions and initial weights."""
+    devices: int = 96
+    """Random cameras; the last eighth of them is kept for testing."""
+    pictures: int = 24
+    """Random rooms seen by each camera."""
+    width_px: int = 320
+    """Width of the pictures; the frozen extractor's is 320."""
+    steps: int = 800
+    """Optimiser steps."""
+    batch_size: int = 24
+    """Maps per step."""
+    learning_rate: float = 1e-3
+    """Adam's step size after the warm-up; falls to nothing along a cosine."""
+    checkpoint_every: int = 100
+    """Steps between checkpoints."""
+
+    def __post_init__(self) -> None:
+        _check_counts(
+            "features", self, "devices", "pictures", "width_px", "steps", "batch_size", "checkpoint_every",
+        )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Config:
     """Everything a run needs; a preset is one value of this."""
@@ -659,3 +754,4 @@ class Config:
     export: ExportConfig = field(default_factory=ExportConfig)
     deploy: DeployConfig = field(default_factory=DeployConfig)
     evaluation: EvalConfig = field(default_factory=EvalConfig)
+    score: ScoreConfig = field(default_factory=ScoreConfig)

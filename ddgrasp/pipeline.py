@@ -58,6 +58,13 @@ STAGES = (
     Stage("deploy", "deploy", ("export",), "the exported student in the pseudo-real rig at 10 Hz"),
 )
 
+ON_REQUEST = (
+    Stage("score", "evaluation", ("teacher", "ddg"), "generated depth against the rig's: Table I"),
+    Stage("score_real", "evaluation", (), "generated depth against a real camera's"),
+    Stage("curve", "evaluation", ("teacher", "record", "ddg"), "score against recorded trajectories"),
+)
+"""Stages that `run` leaves out; each has a command of its own (`ddgrasp ddg score`, `ddg curve`)."""
+
 
 def run(
     config: Config, run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES, quiet: bool = False
@@ -131,7 +138,7 @@ def make(
 
 def get_stage(name: str) -> Stage:
     """The stage of that name."""
-    return next(stage for stage in STAGES if stage.name == name)
+    return next(stage for stage in (*STAGES, *ON_REQUEST) if stage.name == name)
 
 
 def _create(directory: Path) -> None:

@@ -8,6 +8,7 @@ from ddgrasp.config import (
     EvalConfig,
     ExportConfig,
     RecordConfig,
+    ScoreConfig,
     StudentConfig,
     TeacherConfig,
     WorldConfig,
@@ -77,6 +78,18 @@ DEBUG = Config(
     export=ExportConfig(parity_batches=4, latency_runs=20),
     deploy=DeployConfig(realtime_trials=1),
     evaluation=EvalConfig(teacher_trials=16, student_trials=4, rig_trials=4),
+    score=ScoreConfig(
+        trajectories=3,
+        frames=4,
+        kid_subsets=4,
+        kid_subset_size=6,
+        bootstrap=8,
+        tsne_maps=60,
+        neighbours=3,
+        repeat_scenes=1,
+        repeats=2,
+        curve_trajectories=(1, 2),
+    ),
 )
 """Every stage at its smallest; no quality claimed. PPO goes on from the pretrained policy, since a teacher
 that never succeeds leaves no demos."""
@@ -99,6 +112,7 @@ DEMO = Config(
         head_steps=1500,
     ),
     evaluation=EvalConfig(student_trials=60),
+    score=ScoreConfig(trajectories=24, kid_subset_size=150, tsne_maps=3000),
 )
 """For two cores within 45 minutes (24 on two AMD EPYC cores, 2026-11-21); the student starts from the
 pretrained one."""
@@ -137,6 +151,7 @@ PAPER = Config(
     ),
     deploy=DeployConfig(workers=8, realtime_trials=10),
     evaluation=EvalConfig(rig_trials=300),
+    score=ScoreConfig(trajectories=160, kid_subset_size=1000),
 )  # fmt: skip
 """The paper's sizes, for one GPU. Not run yet."""
 

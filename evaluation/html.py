@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ddgrasp.pipeline import STAGES
+from ddgrasp.pipeline import ON_REQUEST, STAGES
 from ddgrasp.progress import PICTURES, read_curves
 from evaluation import figures, wilson
 from evaluation.report import summary_rows
@@ -41,9 +41,9 @@ def render_html(report: Mapping[str, Any], run_dir: Path) -> str:
         f"<p class=note>{escape(made)} Success: rate of n trials, Wilson 95 % interval. The pseudo-real "
         "rig is a Franka in MuJoCo's C engine seen by a simulated active-stereo camera; no real robot was "
         "used.</p>",
-        _table(("Stage", "From", "Time", "Measured"), summary_rows(report), last_bold=True),
+        table(("Stage", "From", "Time", "Measured"), summary_rows(report), last_bold=True),
     ]
-    for stage in STAGES:
+    for stage in (*STAGES, *ON_REQUEST):
         if stage.name in report["stages"]:
             body.append(f"<h2>{stage.name}</h2><p class=note>{escape(stage.makes)}</p>")
             body.extend(_stage_section(stage.name, report, run_dir / stage.name))
@@ -51,7 +51,12 @@ def render_html(report: Mapping[str, Any], run_dir: Path) -> str:
     body.append(f"<h2>How it was made</h2><p>Seed {report['seed']}. {escape(versions)}.</p>")
     config = escape(json.dumps(report["config"], indent=2))
     body.append(f"<details><summary>Configuration</summary><pre>{config}</pre></details>")
-    head = f"<meta charset=utf-8><title>{preset}: DiffuDepGrasp-JAX report</title><style>{_STYLE}</style>"
+    return page(f"{preset}: DiffuDepGrasp-JAX report", body)
+
+
+def page(title: str, body: Sequence[str]) -> str:
+    """An HTML document with the report's style; `title` and `body` are HTML already."""
+    head = f"<meta charset=utf-8><title>{title}</title><style>{_STYLE}</style>"
     lines = "\n".join(body)
     return f"<!doctype html><html lang=en><head>{head}</head><body>\n{lines}\n</body></html>\n"
 
@@ -64,13 +69,13 @@ def _stage_section(name: str, report: Mapping[str, Any], directory: Path) -> lis
         metrics["student_rig"] = report["student_rig"]
     tables = {key: value for key, value in metrics.items() if _is_records(value)}
     scalars = _flatten({key: value for key, value in metrics.items() if key not in tables})
-    parts = [_table((), scalars)] if scalars else []
+    parts = [table((), scalars)] if scalars else []
     for title, records in tables.items():
         columns = list(dict.fromkeys(key for record in records for key in record))
         rows = [[_text(record.get(column, "")) for column in columns] for record in records]
-        parts.append(f"<h3>{escape(title.replace('_', ' '))}</h3>" + _table(columns, rows))
+        parts.append(f"<h3>{escape(title.replace('_', ' '))}</h3>" + table(columns, rows))
     if curves := read_curves(directory):
-        parts.append("<h3>Curves</h3>" + _image(figures.draw_curves(curves), f"curves of stage {name}"))
+        parts.append("<h3>Curves</h3>" + image(figures.draw_curves(curves), f"curves of stage {name}"))
     for path in sorted((directory / PICTURES).glob("*")):
         title = path.stem.replace("_", " ")
         parts.append(f"<h3>{escape(title)}</h3>" + _picture(path, title))
@@ -79,22 +84,24 @@ def _stage_section(name: str, report: Mapping[str, Any], directory: Path) -> lis
 
 def _picture(path: Path, title: str) -> str:
     if path.suffix == ".png":
-        return _image(path.read_bytes(), title)
+        return image(path.read_bytes(), title)
     if path.suffix != ".npz" or path.name.startswith("."):
         return ""
     try:
         with np.load(path) as panels:
-            return _image(figures.draw_panels(dict(panels)), title)
+            return image(figures.draw_panels(dict(panels)), title)
     except (ValueError, OSError, EOFError) as error:
         return f"<p>{escape(path.name)} cannot be shown: {escape(str(error))}</p>"
 
 
-def _image(png: bytes, alt: str) -> str:
+def image(png: bytes, alt: str) -> str:
+    """An <img> with the picture in it."""
     data = base64.b64encode(png).decode()
     return f'<img alt="{escape(alt)}" src="data:image/png;base64,{data}">'
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], last_bold: bool = False) -> str:
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], last_bold: bool = False) -> str:
+    """A <table> of plain text, which is escaped."""
     head = "<tr>" + "".join(f"<th>{escape(title)}</th>" for title in header) + "</tr>" if header else ""
     lines = []
     for index, row in enumerate(rows):

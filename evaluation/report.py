@@ -12,7 +12,7 @@ from typing import Any
 
 from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
-from ddgrasp.pipeline import STAGES
+from ddgrasp.pipeline import ON_REQUEST, STAGES
 from evaluation import backends, teacher_trials, wilson
 
 REPORT = "report.json"
@@ -30,14 +30,15 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     """
     finished = {
         stage.name: artifacts.read_manifest(run_dir / stage.name)
-        for stage in STAGES
+        for stage in (*STAGES, *ON_REQUEST)
         if artifacts.is_finished(run_dir / stage.name)
     }
     if not finished:
         raise UserError(
             f"{run_dir} holds no finished stage: nothing to report. Start one with `ddgrasp run`."
         )
-    latest = list(finished.values())[-1]
+    flow = [stage.name for stage in STAGES if stage.name in finished]
+    latest = finished[flow[-1]] if flow else next(iter(finished.values()))
     report: dict[str, Any] = {
         "preset": latest.config.get("preset"),
         "seed": latest.seed,
@@ -97,7 +98,8 @@ def describe_machine() -> dict[str, Any]:
 def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     """(stage, made or loaded, time, result) per line; the last line is the exported student in the rig."""
     rows = []
-    for stage in STAGES:
+    asked_for = [stage for stage in ON_REQUEST if stage.name in report["stages"]]
+    for stage in (*STAGES[:-1], *asked_for, STAGES[-1]):
         entry = report["stages"].get(stage.name)
         if entry is None:
             rows.append((stage.name, "", "", "not run"))
@@ -152,6 +154,10 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
     if stage == "deploy" and "latency_ms" in metrics:
         latency = metrics["latency_ms"]
         return [f"inference p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"]
+    if "targets" in metrics:
+        met = [target["met"] for target in metrics["targets"]]
+        return [f"{metrics['targets'][0]['target']}: {metrics['targets'][0]['measured']}",
+                f"targets met: {met.count('met')} of {len(met)}"]  # fmt: skip
     return [
         f"{name.replace('_', ' ')} {_number(value)}"
         for name, value in metrics.items()

@@ -1,0 +1,57 @@
+"""Bootstrap over whole episodes: frames of one trajectory resemble each other, trajectories do not."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Features (N, d) of one domain and the group (N,) each map belongs to."""
+
+    features: np.ndarray
+    groups: np.ndarray
+
+    def rows(self, drawn: np.ndarray) -> np.ndarray:
+        """Row numbers of the drawn groups, one after the other, as often as they were drawn."""
+        members = {group: np.flatnonzero(self.groups == group) for group in np.unique(drawn)}
+        return np.concatenate([members[group] for group in drawn])
+
+
+def draws(groups: np.ndarray, count: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """`count` times as many groups as there are, with replacement."""
+    names = np.unique(groups)
+    return [rng.choice(names, len(names)) for _ in range(count)]
+
+
+def interval(point: float, resampled: Sequence[float]) -> dict[str, float]:
+    """{value, low, high}: percentile interval of the resampled values, moved so that their mean lies on the
+    point.
+
+    Resampling with replacement repeats maps, which moves Frechet distances and polynomial MMD upwards by more
+    than they vary: only the spread is taken from it.
+    """
+    values = np.asarray([v for v in resampled if np.isfinite(v)])
+    if not len(values) or not np.isfinite(point):
+        return {"value": float(point), "low": float("nan"), "high": float("nan")}
+    tail = (1 - LEVEL) / 2
+    low, high = np.quantile(values - values.mean(), (tail, 1 - tail))
+    return {"value": float(point), "low": float(point + low), "high": float(point + high)}
+
+
+def intervals(
+    point: Mapping[str, float], resampled: Sequence[Mapping[str, float]]
+) -> dict[str, dict[str, float]]:
+    """`interval` of every named figure."""
+    return {name: interval(value, [other[name] for other in resampled]) for name, value in point.items()}
+
+
+def bootstrap_pairs(
+    real: Sample, sim: Sample, drawn: Sequence[tuple[np.ndarray, np.ndarray]],
+    statistic: Callable[[np.ndarray, np.ndarray], float],
+) -> list[float]:  # fmt: skip
+    """statistic(real rows, sim rows) for every (real groups, sim groups) drawn."""
+    return [statistic(real.rows(r), sim.rows(s)) for r, s in drawn]

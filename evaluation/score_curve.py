@@ -1,0 +1,148 @@
+"""Stage `curve`: how many recorded trajectories the generator needs. Behind `ddgrasp ddg curve`.
+
+A generator per size is fitted on the first n trajectories, all for as many steps, and scored on the same
+frames. Points are finished one by one: a stopped curve goes on inside the point it stopped in.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.progress import PICTURES, Progress
+from evaluation import score_data, score_features, score_figures, score_table
+from evaluation.resampling import Sample
+from evaluation.score_domains import FLOOR, RAW, Methods
+from evaluation.score_episodes import Load, collect, score_episodes
+
+if TYPE_CHECKING:
+    from ddg_jax.data import Frames
+    from ddg_jax.sample import Generator
+
+STAGE = "curve"
+JSON = "curve.json"
+POINT = "point.json"
+COLUMNS = ("sim_gt", "ddg_no_graft", "ddg")
+
+
+def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Artifact:
+    """Fits and scores at every size of `config.score.curve_trajectories`; works in `out`/curve.
+
+    Recordings come from `run_dir`/record; those that it lacks are recorded as it would have been.
+    """
+    from ddg_jax.sample import Generator
+
+    directory, sizes = out / STAGE, sorted(set(config.score.curve_trajectories))
+    config = replace(config, score=replace(config.score, columns=COLUMNS))
+    start = Methods(config.score, config.seed, Generator.load(run_dir / "ddg"))
+    files = score_data.record_rig(config, run_dir, directory / "data", start.needs_rgb, progress)
+    loads = [partial(score_data.load_episode, file) for file in files]
+    extractor = score_features.load(config.score.features[0])
+    reference = score_episodes(
+        start, [extractor], loads, [RAW, FLOOR, "sim_gt"], directory / "reference", progress
+    )
+    common = collect(reference).features[extractor.name]
+    frames = _frames(config, run_dir, max(sizes), directory / "record", progress)
+    points = []
+    for size in sizes:
+        progress.note(f"{size} trajectories")
+        points.append(_point(config, size, frames, common, extractor, loads, directory, progress))
+    result = {"features": {extractor.name: extractor.source}, "points": points}
+    artifacts.atomic_write_json(directory / JSON, result)
+    floor, base = points[0]["floor"], points[0]["sim_gt"]["fid"]["value"]
+    picture = score_figures.draw_efficiency(points, floor, base)
+    artifacts.atomic_write_bytes(directory / PICTURES / "curve.png", picture)
+    parents = [artifacts.read_artifact(run_dir / name) for name in ("teacher", "ddg")]
+    return artifacts.finish(
+        directory, STAGE, config, seconds=progress.seconds, metrics={"points": rows(points)}, parents=parents
+    )
+
+
+def rows(points: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
+    """The curve as text, one record per size."""
+    return [
+        {"trajectories": str(p["trajectories"]), "frames": str(p["frames"]), "steps": str(p["steps"]),
+         **{f"{p[name]['title']}, {title}": score_table.describe(p[name][key])
+            for name in (*COLUMNS[1:], "floor")
+            for key, title in (("fid", "FID"), ("kid_x100", "KID x 100"))}}
+        for p in points
+    ]  # fmt: skip
+
+
+def _point(
+    config: Config, size: int, frames: "Frames", common: dict[str, Sample],
+    extractor: score_features.FeatureExtractor, loads: Sequence[Load], directory: Path, progress: Progress,
+) -> dict[str, Any]:  # fmt: skip
+    """One point: read if it was finished, else fitted and scored."""
+    folder = directory / f"n{size:03d}"
+    if (folder / POINT).exists():
+        return artifacts.read_json(folder / POINT)
+    chosen = frames.part(frames.recording < size)
+    generator = _fitted(config, chosen, folder, progress)
+    methods = Methods(config.score, config.seed, generator)
+    simulated = loads[len(loads) // 2 :]  # the real side comes first and needs no generator
+    files = score_episodes(
+        methods, [extractor], simulated, ["sim_ddg_no_graft", "sim_ddg"], folder / "episodes", progress
+    )
+    samples = {**common, **collect(files).features[extractor.name]}
+    table = score_table.make_table(samples, config.score, config.seed)
+    for figures in table.values():
+        figures.pop("resampled_fid", None)
+    point = {"trajectories": size, "frames": len(chosen), "steps": generator.config.train_steps, **table}
+    artifacts.atomic_write_json(folder / POINT, point)
+    return artifacts.to_json(point)
+
+
+def _fitted(config: Config, frames: "Frames", folder: Path, progress: Progress) -> "Generator":
+    """A generator fitted on `frames`, from its checkpoints if there are any."""
+    from ddg_jax.prior import make_prior
+    from ddg_jax.sample import Generator
+    from ddg_jax.train import fit
+
+    steps = config.score.curve_steps or config.ddg.train_steps
+    settings = replace(config.ddg, train_steps=steps, init_from="")
+    params = fit(settings, frames, folder, config.seed, progress)
+    return Generator(settings, params, make_prior(settings))
+
+
+def _frames(config: Config, run_dir: Path, count: int, extra: Path, progress: Progress) -> "Frames":
+    """Frames of `count` trajectories: the run's, then more from the same teacher, recorded into `extra`."""
+    from ddg_jax.data import Frames, load_frames
+    from ddg_jax.prior import make_prior
+    from sensors.recordings import find_recordings
+
+    recorded = len(find_recordings(run_dir / "record"))
+    _record_more(config, run_dir, range(recorded, count), extra, progress)
+    prior = make_prior(config.ddg)
+    roots = [run_dir / "record", *([extra] if count > recorded else [])]
+    parts = [load_frames(root, config.ddg, prior, config.seed, progress) for root in roots]
+    offsets = np.cumsum([0, recorded])[: len(parts)]
+    return Frames(
+        np.concatenate([part.depth_m for part in parts]),
+        np.concatenate([part.prior for part in parts]),
+        np.concatenate([part.recording + offset for part, offset in zip(parts, offsets, strict=True)]),
+    )
+
+
+def _record_more(config: Config, run_dir: Path, numbers: range, directory: Path, progress: Progress) -> None:
+    """Trajectories that the run's record stage would have recorded next; finished ones are kept."""
+    from mjx_envs.rig import RigWorld
+    from ppo import policy as teacher_policy
+    from sensors.recordings import is_recording
+    from sensors.rig_camera import RigCamera
+    from sensors.stage import record_trajectory
+
+    missing = [n for n in numbers if not is_recording(directory / f"rig_{n:04d}")]
+    if not missing:
+        return
+    policy = teacher_policy.load(run_dir / "teacher")
+    world = RigWorld(objects=config.world.objects, randomise=True)
+    camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+    for number in progress.track(missing, "more trajectories"):
+        record_trajectory(config, number, directory / f"rig_{number:04d}", world, camera, policy)

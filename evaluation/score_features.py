@@ -1,0 +1,49 @@
+"""Feature extractors of scores by name: depth maps in metres to vectors. What each is, foundation/ says."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddgrasp.config import SCORE_FEATURES
+from ddgrasp.errors import unknown_name
+
+NEAR_M, FAR_M = 0.25, 10.0
+"""Depths drawn white and almost black for networks that look at pictures; holes are black."""
+
+
+@dataclass(frozen=True)
+class FeatureExtractor:
+    """A named function of maps (N, H, W) metres, 0 = invalid, to (N, d) float32."""
+
+    name: str
+    source: Any
+    """Which weights: goes into reports."""
+    function: Callable[[np.ndarray], np.ndarray]
+
+    def __call__(self, depth_m: np.ndarray) -> np.ndarray:
+        return self.function(depth_m)
+
+
+def load(name: str, weights_dir: Path = Path("weights")) -> FeatureExtractor:
+    """The extractor of a name in SCORE_FEATURES; UserError for another, or weights that are not there."""
+    from foundation import catalog, depth_features, features
+
+    if name == depth_features.NAME:
+        extractor = depth_features.load()
+        return FeatureExtractor(name, extractor.source, extractor)
+    if name not in SCORE_FEATURES:
+        raise unknown_name("score.features", name, SCORE_FEATURES)
+    published = name in (catalog.FID_INCEPTION, catalog.RESNET18)
+    network = features.load_extractor(weights_dir / name if published else None)
+    return FeatureExtractor(name, network.source, lambda depth_m: network(as_pictures(depth_m)))
+
+
+def as_pictures(depth_m: np.ndarray) -> np.ndarray:
+    """(N, H, W) metres -> (N, H, W, 3) uint8 grey: inverse depth, holes black, on one fixed scale."""
+    inverse = np.divide(1, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)
+    level = (inverse - 1 / FAR_M) / (1 / NEAR_M - 1 / FAR_M)
+    grey = np.rint(255 * np.clip(level, 0, 1)).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)

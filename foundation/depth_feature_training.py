@@ -1,0 +1,225 @@
+"""Trains depthfeat: which treatment, and what was measured, from the pooled features. `ddgrasp ddg features`.
+
+Supervised by what a simulator knows for free, on depth that no camera and no generator of this project made
+in the robot's scene. The heads are thrown away; the trunk is frozen under a version.
+"""
+
+import shutil
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from ddgrasp import artifacts
+from ddgrasp.config import DepthFeatureConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from foundation import depth_features
+from foundation.depth_feature_data import MEASURED, TREATMENTS, Batch, Pool, make_batch
+from sensors.random_scenes import random_device, take_picture
+
+WORK = ".work"
+"""Folder of unfinished training, beside the result; removed at the end."""
+TEST_SHARE = 1 / 8
+"""Of the devices: cameras, and rooms, that training never sees."""
+WARMUP_STEPS = 50
+_TEST_MAPS = 768
+_SCALE_MAPS = 512
+_HIDDEN = 128
+
+State = dict[str, Any]
+"""`step`, `params` (trunk and heads), `optimiser`."""
+
+
+class Heads(nn.Module):
+    """Features -> logits of the treatments and the standardised measurements."""
+
+    @nn.compact
+    def __call__(self, features: Array) -> tuple[Array, Array]:
+        h = nn.relu(nn.Dense(_HIDDEN)(nn.LayerNorm()(features)))
+        return nn.Dense(len(TREATMENTS))(h), nn.Dense(len(MEASURED))(h)
+
+
+def train(config: DepthFeatureConfig, out: Path, *, quiet: bool = False) -> dict[str, Any]:
+    """Trains, freezes the trunk into `out` and returns its manifest. Continues what is in `out`/.work.
+
+    UserError if `out` holds a finished extractor, or one begun with another configuration.
+    """
+    if (out / artifacts.MANIFEST).exists():
+        raise UserError(f"{out} holds a finished extractor: choose another --out, or delete it.")
+    work = out / WORK
+    _check_begun(config, work)
+    progress = Progress(work, "features", quiet=quiet)
+    training, test = load_pools(config, work, progress)
+    scale = _target_scale(training, config.seed)
+    params = _optimise(config, training, scale, work, progress)
+    result, tested = _frozen(params, training, config.seed), _test(params, test, scale, config.seed)
+    artifacts.save_params(out / depth_features.PARAMS_FILE, result)
+    manifest = {
+        "name": depth_features.NAME,
+        "sha256": depth_features.file_digest(out / depth_features.PARAMS_FILE),
+        "config": config,
+        "trained_on": {"pictures": len(training), "treatments": list(TREATMENTS)},
+        "tested_on_new_cameras": tested,
+        "versions": artifacts.library_versions(),
+        "seconds": round(progress.seconds),
+    }
+    progress.close()
+    artifacts.atomic_write_json(out / artifacts.MANIFEST, manifest)
+    shutil.rmtree(work, ignore_errors=True)
+    return artifacts.to_json(manifest)
+
+
+def _check_begun(config: DepthFeatureConfig, work: Path) -> None:
+    path = work / artifacts.STARTED
+    wanted = artifacts.to_json(config)
+    if path.exists() and artifacts.read_json(path) != wanted:
+        raise UserError(f"{work} was begun with other settings: use those, another --out, or delete it.")
+    artifacts.atomic_write_json(path, wanted)
+
+
+# --- pictures ------------------------------------------------------------------------------------
+
+
+def load_pools(config: DepthFeatureConfig, work: Path, progress: Progress) -> tuple[Pool, Pool]:
+    """(training, test) pictures; devices whose file is in `work` are not taken anew."""
+    files = [work / f"device_{number:03d}.npz" for number in range(config.devices)]
+    with progress.task("random cameras", config.devices) as task:
+        for number, file in enumerate(files):
+            if not file.exists():
+                _take_pictures(config, number, file)
+            task.advance()
+    pools = [_read(file) for file in files]
+    tested = max(1, round(config.devices * TEST_SHARE))
+    if tested >= len(pools):
+        raise UserError(f"features.devices is {config.devices}; expected at least 2: one is for testing.")
+    return _joined(pools[:-tested]), _joined(pools[-tested:])
+
+
+def _take_pictures(config: DepthFeatureConfig, number: int, file: Path) -> None:
+    rng = np.random.default_rng((config.seed, number))
+    device = random_device(rng, config.width_px)
+    taken = [take_picture(rng, device) for _ in range(config.pictures)]
+    arrays: dict[str, Any] = {name: np.stack([vars(p)[name] for p in taken]) for name in vars(taken[0])}
+    with artifacts.atomic_path(file) as path:
+        np.savez_compressed(path, **arrays)
+
+
+def _read(file: Path) -> Pool:
+    with np.load(file) as arrays:
+        return Pool(**dict(arrays))
+
+
+def _joined(pools: list[Pool]) -> Pool:
+    return Pool(**{name: np.concatenate([vars(p)[name] for p in pools]) for name in vars(pools[0])})
+
+
+def _draw(pool: Pool, count: int, *seed: int) -> Batch:
+    rng = np.random.default_rng(seed)
+    return make_batch(pool, rng.integers(len(pool), size=count), rng)
+
+
+def _target_scale(pool: Pool, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """(mean, deviation) of the regression targets."""
+    measured = _draw(pool, _SCALE_MAPS, seed, 1).measured
+    return measured.mean(0), measured.std(0) + 1e-3
+
+
+# --- optimisation ----------------------------------------------------------------------------------
+
+
+def _outputs(params: Any, depth_m: Array) -> tuple[Array, Array, Array]:
+    features: Any = depth_features.Trunk().apply({"params": params["trunk"]}, depth_m)
+    outputs: Any = Heads().apply({"params": params["heads"]}, features)
+    logits, measured = outputs
+    return features, logits, measured
+
+
+def loss(params: Any, depth_m: Array, family: Array, target: Array) -> Array:
+    """Cross-entropy of the treatment + mean squared error of the standardised measurements."""
+    _, logits, measured = _outputs(params, depth_m)
+    named = optax.softmax_cross_entropy_with_integer_labels(logits, family).mean()
+    return named + jnp.mean((measured - target) ** 2)
+
+
+def _optimizer(config: DepthFeatureConfig) -> optax.GradientTransformation:
+    warmup = min(WARMUP_STEPS, max(1, config.steps // 10))
+    rate = optax.warmup_cosine_decay_schedule(
+        0.0, config.learning_rate, warmup, max(config.steps, warmup + 1)
+    )
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(
+    config: DepthFeatureConfig, state: State, depth_m: Array, family: Array, target: Array
+) -> tuple[State, Array]:
+    value, grads = jax.value_and_grad(loss)(state["params"], depth_m, family, target)
+    updates, optimiser = _optimizer(config).update(grads, state["optimiser"], state["params"])
+    params = optax.apply_updates(state["params"], updates)
+    return {"step": state["step"] + 1, "params": params, "optimiser": optimiser}, value
+
+
+def _init(config: DepthFeatureConfig) -> State:
+    keys = jax.random.split(jax.random.key(config.seed))
+    trunk = depth_features.Trunk().init(keys[0], jnp.zeros((1, 32, 32)))["params"]
+    heads = Heads().init(keys[1], jnp.zeros((1, depth_features.FEATURES)))["params"]
+    params = {"trunk": trunk, "heads": heads}
+    return {
+        "step": jnp.zeros((), jnp.int32), "params": params, "optimiser": _optimizer(config).init(params),
+    }  # fmt: skip
+
+
+def _optimise(
+    config: DepthFeatureConfig, pool: Pool, scale: tuple[np.ndarray, np.ndarray], work: Path,
+    progress: Progress,
+) -> Any:  # fmt: skip
+    """Parameters after `config.steps`; batch n is a function of (seed, n) alone, so a resumed run equals an
+    uninterrupted one."""
+    file, state = work / "state.msgpack", _init(config)
+    if file.exists():
+        state = artifacts.load_params(file, state)
+    with progress.task("training", config.steps) as task:
+        task.start_at(int(state["step"]))
+        for number in range(int(state["step"]), config.steps):
+            batch = _draw(pool, config.batch_size, config.seed, 2, number)
+            target = (batch.measured - scale[0]) / scale[1]
+            state, value = _step(config, state, batch.depth_m, batch.family, target)
+            if (number + 1) % config.checkpoint_every == 0:
+                artifacts.save_params(file, state)
+                progress.scalars(number + 1, loss=float(value))
+            task.advance(loss=float(value))
+    return state["params"]
+
+
+def _frozen(params: Any, pool: Pool, seed: int) -> dict[str, Any]:
+    """What is kept: the trunk, and the mean and deviation of its features over training pictures."""
+    features = _features(params, _draw(pool, _TEST_MAPS, seed, 3).depth_m)
+    return {"trunk": params["trunk"], "mean": features.mean(0), "std": features.std(0) + 1e-4}
+
+
+def _test(params: Any, pool: Pool, scale: tuple[np.ndarray, np.ndarray], seed: int) -> dict[str, Any]:
+    """Share of treatments named rightly and R^2 per measurement, on cameras that training never saw."""
+    batch = _draw(pool, _TEST_MAPS, seed, 4)
+    outputs = [_outputs_jit(params, part) for part in np.array_split(batch.depth_m, len(batch.depth_m) // 16)]
+    logits, measured = (np.concatenate([np.asarray(o[i]) for o in outputs]) for i in (1, 2))
+    target = (batch.measured - scale[0]) / scale[1]
+    unexplained = ((measured - target) ** 2).mean(0) / (target.var(0) + 1e-6)
+    return {
+        "treatment_accuracy": float(np.mean(logits.argmax(1) == batch.family)),
+        "r_squared": {name: round(1 - float(u), 3) for name, u in zip(MEASURED, unexplained, strict=True)},
+    }
+
+
+_outputs_jit = jax.jit(_outputs)
+
+
+def _features(params: Any, depth_m: np.ndarray) -> np.ndarray:
+    parts = np.array_split(depth_m, len(depth_m) // 16)
+    return np.concatenate([np.asarray(_outputs_jit(params, part)[0]) for part in parts])

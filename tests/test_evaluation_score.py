@@ -1,0 +1,250 @@
+"""`ddgrasp ddg score` and `ddg curve` end to end at their smallest, on a small generator and the rig."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ddg_jax import stage as ddg_stage
+from ddg_jax.sample import Generator
+from ddgrasp import artifacts, cli
+from ddgrasp.config import Config, DDGConfig, RecordConfig, ScoreConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from evaluation import score_data, score_features
+from evaluation.score_domains import (
+    COLUMNS,
+    DOMAINS,
+    FLOOR,
+    LIMIT,
+    REFERENCES,
+    Methods,
+    inpainted,
+    sense,
+    wanted_domains,
+)
+from evaluation.score_figures import draw_efficiency
+from evaluation.stage import write_report
+from foundation import convert, store
+from sensors.recordings import RecordingWriter
+
+ROOT = Path(__file__).parents[1]
+CONFIG = Config(
+    preset="test",
+    record=RecordConfig(trajectories=1, frames=6),
+    ddg=DDGConfig(
+        height_px=36,
+        width_px=64,
+        widths=(8, 8),
+        blocks=(0, 1),
+        attention_heads=1,
+        diffusion_steps=20,
+        train_steps=4,
+        batch_size=2,
+        sample_steps=2,
+        sample_batch=4,
+        checkpoint_every=2,
+        prior_input_px=28,
+    ),
+)
+SIZES = [
+    "--preset",
+    "debug",
+    "--trajectories",
+    "2",
+    "--frames",
+    "2",
+    "--kid-subset-size",
+    "2",
+    "--bootstrap",
+    "3",
+]
+
+
+def write_recording(path: Path, frames: int, size: tuple[int, int]) -> None:
+    """A slope, a box that moves, and its shadow."""
+    rng = np.random.default_rng(0)
+    with RecordingWriter(path, {"fx_px": 0.6 * size[1]}) as writer:
+        for t in range(frames):
+            depth = np.broadcast_to(np.linspace(1500, 700, size[0])[:, None], size).copy()
+            left = size[1] // 3 + t % 10
+            depth[size[0] // 3 : size[0] // 2, left : left + size[1] // 5] = 650
+            depth[size[0] // 3 : size[0] // 2, left - 4 : left] = 0
+            depth[rng.random(size) < 0.02] = 0
+            writer.add(rng.integers(0, 255, (*size, 3)).astype(np.uint8), depth.astype(np.uint16))
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    """A run with the pretrained teacher, one recording and a generator fitted on it."""
+    root = tmp_path_factory.mktemp("run")
+    shutil.copytree(ROOT / "pretrained" / "teacher", root / "teacher")
+    write_recording(root / "record" / "rig_0000", 6, (180, 320))
+    progress = Progress(root / "ddg", "ddg", quiet=True)
+    ddg_stage.fit_folder(CONFIG, root / "record", root / "ddg", progress=progress)
+    progress.close()
+    return root
+
+
+@pytest.fixture(scope="module")
+def scored(run_dir, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    assert cli.main(["ddg", "score", *SIZES, "--out", str(out), "--run-dir", str(run_dir)]) == 0
+    return out
+
+
+def test_the_score_has_every_column_the_floor_and_the_targets(scored):
+    result = json.loads((scored / "score" / "score.json").read_text())
+    table = result["tables"]["depthfeat-v1"]
+    assert set(table) == {*COLUMNS, *REFERENCES}
+    assert table["monocular"] == {"title": "Monocular", "absent": "no weights"}
+    for name, figures in table.items():
+        if name != "monocular":
+            assert figures["fid"]["low"] <= figures["fid"]["high"] and np.isfinite(figures["fid"]["value"])
+    assert table["sim_gt"]["fid_ratio"]["value"] == 1
+    ratio = table["ddg"]["fid"]["value"] / table["sim_gt"]["fid"]["value"]
+    assert table["ddg"]["fid_ratio"]["value"] == pytest.approx(ratio)
+    assert [t["met"] in ("met", "not met") for t in result["targets"]] == [True] * 4
+    assert result["maps"] == {name: 4 for name in wanted_domains(COLUMNS) if "monocular" not in name}
+    assert result["features"]["depthfeat-v1"]["sha256"]
+
+
+def test_hole_figures_say_what_must_be_so(scored):
+    holes = json.loads((scored / "score" / "score.json").read_text())["holes"]
+    value = {name: {k: v["value"] for k, v in item["figures"].items()} for name, item in holes.items()}
+    assert value["sim_gt"]["rmse_mm"] == value["sim_ddg"]["rmse_mm"] == 0  # grafted: exact where valid
+    assert value["real_inpaint"]["invalid_share"] == 0
+    assert value["real_raw"]["invalid_share"] > 0.05 and value["real_raw"]["gap_depth_m"] == 0
+    assert 0 < value["sim_sensed"]["repeat_iou"] < 1
+    assert value["sim_sensed"]["gap_edge_distance_px"] < value["sim_gt"]["gap_edge_distance_px"]
+
+
+def test_pages_and_pictures_are_there_and_the_report_shows_them(scored):
+    pictures = {path.name for path in (scored / "score" / "pictures").iterdir()}
+    assert pictures == {"table_1_depthfeat_v1.png", "holes.png", "tsne.png", "examples.npz"}
+    page = (scored / "score" / "score.html").read_text()
+    assert "no weights" in page and page.count("data:image/png") == 2
+    report = write_report(scored)
+    assert report["score"]["targets"][0]["target"].startswith("FID of DDG <= 0.15")
+    html = (scored / "report.html").read_text()
+    assert "Real vs real" in html and "table 1 depthfeat v1" in html
+
+
+def test_a_stopped_score_goes_on_to_the_same_figures(scored, run_dir, capsys):
+    command = ["ddg", "score", *SIZES, "--out", str(scored), "--run-dir", str(run_dir)]
+    before = (scored / "score" / "score.json").read_bytes()
+    assert cli.main(command) == 2 and "--resume" in capsys.readouterr().err
+    for name in ("manifest.json", "score.json", "episodes/0003.npz", "data/sim_0001.npz"):
+        (scored / "score" / name).unlink()
+    kept = (scored / "score" / "episodes" / "0000.npz").stat().st_mtime_ns
+    assert cli.main([*command, "--resume"]) == 0
+    assert (scored / "score" / "episodes" / "0000.npz").stat().st_mtime_ns == kept
+    assert (scored / "score" / "score.json").read_bytes() == before
+
+
+def test_a_real_cameras_recordings_are_fitted_and_scored(tmp_path, capsys):
+    write_recording(tmp_path / "room", 26, (48, 64))
+    command = ["ddg", "score", *SIZES, "--out", str(tmp_path / "out"), "--real", str(tmp_path / "room")]
+    assert cli.main([*command, "--fit-frames", "20", "--score-frames", "16"]) == 2
+    assert "must not overlap" in capsys.readouterr().err
+    assert cli.main([*command, "--fit-frames", "10", "--score-frames", "16", "--resume"]) == 0
+    result = json.loads((tmp_path / "out" / "score_real" / "score.json").read_text())
+    table = result["tables"]["depthfeat-v1"]
+    assert "Nobody modelled that room" in result["setting"]
+    assert table["sim_gt"]["fid"]["value"] > table["floor"]["fid"]["value"] >= 0
+    assert "score.html" in capsys.readouterr().out
+
+
+def test_the_curve_fits_and_scores_every_size_and_keeps_finished_points(run_dir, tmp_path, capsys):
+    command = ["ddg", "curve", *SIZES, "--curve-trajectories", "2", "1", "--out", str(tmp_path)]
+    command += ["--run-dir", str(run_dir)]
+    assert cli.main(command) == 0
+    result = json.loads((tmp_path / "curve" / "curve.json").read_text())
+    assert [(p["trajectories"], p["frames"], p["steps"]) for p in result["points"]] == [(1, 6, 4), (2, 12, 4)]
+    assert (tmp_path / "curve" / "record" / "rig_0001" / "meta.json").exists()
+    assert (tmp_path / "curve" / "pictures" / "curve.png").exists()
+    point = tmp_path / "curve" / "n001" / "point.json"
+    kept = point.stat().st_mtime_ns
+    (tmp_path / "curve" / "manifest.json").unlink()
+    (tmp_path / "curve" / "n002" / "point.json").unlink()
+    assert cli.main([*command, "--resume"]) == 0
+    assert point.stat().st_mtime_ns == kept
+    assert json.loads((tmp_path / "curve" / "curve.json").read_text()) == result
+    png = draw_efficiency(result["points"], result["points"][0]["floor"], 1.0)
+    assert png.startswith(b"\x89PNG")
+
+
+def test_unknown_columns_and_extractors_are_refused_at_once(capsys, tmp_path):
+    for option, value, near in (("--columns", "sim", "sim_gt"), ("--features", "depthfeat", "depthfeat-v1")):
+        assert cli.main(["ddg", "score", option, value, "--out", str(tmp_path)]) == 2
+        assert f"Did you mean {near!r}" in capsys.readouterr().err
+    with pytest.raises(UserError, match="holds no converted weights"):
+        score_features.load("fid_inception", tmp_path)
+
+
+# --- methods by themselves -------------------------------------------------------------------------
+
+
+def episode(side: str) -> score_data.Episode:
+    rng = np.random.default_rng(3)
+    clean = np.broadcast_to(np.linspace(1500, 700, 36)[:, None], (3, 36, 64)).astype(np.uint16).copy()
+    sensed = np.where(rng.random(clean.shape) < 0.1, 0, clean).astype(np.uint16)
+    rgb = rng.integers(0, 255, (3, 36, 64, 3)).astype(np.uint8)
+    return score_data.Episode(side, 5, 5, sensed, clean, sensed[:0], rgb, 40.0, 0.095)
+
+
+def test_inpainting_fills_holes_and_touches_nothing_else():
+    real = episode("real")
+    filled = inpainted(real.sensed_mm, 3.0)
+    valid = real.sensed_mm > 0
+    np.testing.assert_array_equal(filled[valid], real.sensed_mm[valid])
+    assert (filled > 0).all()
+    assert np.abs(filled.astype(int) - real.clean_mm)[:, 2:-2].max() < 40  # a row of the slope is 23 mm
+
+
+def test_domains_belong_to_one_side_and_depend_on_seed_and_episode_alone(run_dir):
+    methods = Methods(ScoreConfig(), 0, Generator.load(run_dir / "ddg"))
+    names = [name for name in DOMAINS if "monocular" not in name]
+    real, sim = (sense(methods, episode(side), names) for side in score_data.SIDES)
+    assert set(real) == {"real_raw", "real_inpaint"}
+    assert set(sim) == {FLOOR, LIMIT, "sim_gt", "sim_rand_noise", "sim_ddg", "sim_ddg_no_graft"}
+    again = sense(methods, episode("sim"), ["sim_ddg"])["sim_ddg"]
+    np.testing.assert_array_equal(again, sim["sim_ddg"])
+    kept = sim["sim_ddg"] > 0
+    np.testing.assert_array_equal(sim["sim_ddg"][kept], sim["sim_gt"][kept])
+    other = sense(replace(methods, seed=1), episode("sim"), ["sim_ddg", "sim_rand_noise"])
+    assert any((other[name] != sim[name]).any() for name in other)
+
+
+def test_the_monocular_column_uses_the_users_weights(run_dir, tmp_path):
+    network = "depth_anything_v2_small"
+    rng = np.random.default_rng(0)
+    arrays = {
+        key: (rng.normal(0, 0.3, target.shape) / max(1, np.prod(target.shape[1:])) ** 0.5).astype(np.float32)
+        for key, target in convert.targets(network).items()
+    }
+    arrays["depth_head.scratch.output_conv2.2.bias"] += 1
+    store._save(tmp_path / store.CHECKPOINT, convert.convert(network, arrays))
+    manifest = store.WeightsManifest(network, "x.pth", "ab12", "Apache-2.0", "here", 1, 0.0, {}, "today")
+    artifacts.atomic_write_json(tmp_path / store.MANIFEST, manifest)
+    generator = Generator.load(run_dir / "ddg")
+    methods = Methods(ScoreConfig(monocular_weights=str(tmp_path)), 0, generator)
+    assert methods.needs_rgb
+    for side in score_data.SIDES:
+        made = sense(methods, episode(side), ["real_monocular", "sim_monocular"])[f"{side}_monocular"]
+        reference = episode(side).clean_mm
+        assert made.shape == reference.shape and (made > 0).all() and len(np.unique(made)) > 100
+        assert abs(np.median(made.astype(float)) / np.median(reference) - 1) < 0.25
+    with pytest.raises(UserError, match="holds no converted weights"):
+        _ = Methods(ScoreConfig(monocular_weights=str(tmp_path / "absent")), 0, generator).monocular
+    assert not Methods(ScoreConfig(), 0, generator).needs_rgb
+
+
+def test_completed_depth_has_no_holes_and_keeps_the_surfaces():
+    frames = episode("real")
+    completed = score_data.completed(frames.sensed_mm)
+    assert (completed > 0).all()
+    assert np.abs(completed.astype(int) - frames.clean_mm)[:, 3:-3, 3:-3].max() <= 50
