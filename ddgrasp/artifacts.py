@@ -31,6 +31,7 @@ STAGE_FIELDS: dict[str, tuple[str, ...]] = {
     "demos": ("seed", "world", "teacher", "demos"),
     "record": ("seed", "world", "teacher", "record"),
     "ddg": ("seed", "world", "teacher", "record", "ddg"),
+    "noisy": ("seed", "ddg"),
     "student": ("seed", "world", "teacher", "demos", "record", "ddg", "student"),
     "export": ("seed", "world", "teacher", "demos", "record", "ddg", "student", "export"),
     "deploy": (
@@ -130,7 +131,7 @@ class Manifest:
     """Where an artefact came from and what was measured on it."""
 
     stage: str
-    """teacher, demos, record, ddg, student, export or deploy."""
+    """teacher, demos, record, ddg, noisy, student, export or deploy."""
     config: dict[str, Any]
     """The whole configuration, as JSON."""
     config_hash: str
