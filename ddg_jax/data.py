@@ -1,16 +1,18 @@
 """Recordings as training arrays: noisy depth in diffusion space and its prior, at the generator's size."""
 
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ddg_jax import normalise
 from ddg_jax.prior import Prior
+from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
-from sensors.recordings import Recording, find_recordings
+from sensors.recordings import Recording, find_recordings, is_recording
 
 
 @dataclass(frozen=True)
@@ -18,20 +20,29 @@ class Frames:
     """Frames of several recordings, one after the other.
 
     depth_m (N, H, W) float32, 0 = hole; prior (N, H, W) float16; recording (N,) int: which one a frame is
-    from.
+    from. What could not be used: frames without a valid pixel or damaged, and whole recordings.
     """
 
     depth_m: np.ndarray
     prior: np.ndarray
     recording: np.ndarray
-    skipped: tuple[str, ...] = ()
+    skipped_frames: int = 0
+    refused_recordings: int = 0
 
     def __len__(self) -> int:
         return len(self.depth_m)
 
     def part(self, chosen: slice | np.ndarray) -> "Frames":
         """The chosen frames."""
-        return Frames(self.depth_m[chosen], self.prior[chosen], self.recording[chosen], self.skipped)
+        return replace(
+            self, depth_m=self.depth_m[chosen], prior=self.prior[chosen], recording=self.recording[chosen]
+        )
+
+    @property
+    def number(self) -> np.ndarray:
+        """(N,) number of each frame within its recording, as far as it is here."""
+        first = np.searchsorted(self.recording, self.recording)
+        return np.arange(len(self)) - first
 
     def split(self, holdout_fraction: float) -> tuple["Frames", "Frames"]:
         """(training, held-out) frames: the held-out ones are the last, at least one."""
@@ -46,34 +57,67 @@ class Frames:
 def load_frames(
     root: Path, config: DDGConfig, prior: Prior, seed: int, progress: Progress, max_frames: int | None = None
 ) -> Frames:
-    """Every readable frame of the recordings at or below `root` (at most `max_frames`), with its prior.
+    """The usable frames of the recordings at or below `root`, at most `max_frames`, with their priors.
 
-    Raises UserError if there is no recording or one is refused (see sensors/recordings.py).
+    Names what it leaves out, and says at the end how much that was. Raises UserError if there is no
+    recording, none can be used, or they are of another contract version (see sensors/recordings.py).
     """
-    depth, priors, index, skipped, left = [], [], [], [], max_frames
-    recordings = find_recordings(root)
-    for number, recording in enumerate(progress.track(recordings, "reading recordings")):
-        if recording.skipped:
-            skipped.append(recording.skipped_summary())
-            progress.note(recording.skipped_summary())
-        count = len(recording) if left is None else min(left, len(recording))
-        if count == 0:
-            break
-        frames = read_depth(recording, count, config)
-        rgb = np.stack([recording.rgb(i) for i in range(count)]) if prior.needs_rgb else None
-        priors.append(
-            prior.from_recording(frames, rgb, np.random.default_rng((seed, number))).astype(np.float16)
-        )
+    folders = _folders(root)
+    depth, priors, index, skipped, refused = [], [], [], 0, []
+    left = sys.maxsize if max_frames is None else max_frames
+    for number, folder in enumerate(progress.track(folders, "reading recordings")):
+        try:
+            recording = find_recordings(folder)[0]
+            frames, rgb, left_out = _read(recording, left, config, prior, progress)
+        except UserError as error:
+            refused.append(error)
+            progress.note(f"left out: {error}")
+            continue
+        skipped += left_out
+        c = prior.from_recording(frames, rgb, np.random.default_rng((seed, number)))
+        priors.append(c.astype(np.float16))
         depth.append(frames)
-        index.append(np.full(count, number))
-        left = None if left is None else left - count
-    return Frames(np.concatenate(depth), np.concatenate(priors), np.concatenate(index), tuple(skipped))
+        index.append(np.full(len(frames), number))
+        if (left := left - len(frames)) <= 0:
+            break
+    if not depth:
+        raise UserError(
+            f"{root}: none of its {len(folders)} recording(s) can be used. The first: {refused[0]}"
+        )
+    if skipped or refused:
+        progress.note(f"left out {skipped} frame(s), and {len(refused)} of {len(folders)} recording(s)")
+    return Frames(np.concatenate(depth), np.concatenate(priors), np.concatenate(index), skipped, len(refused))
 
 
-def read_depth(recording: Recording, count: int, config: DDGConfig) -> np.ndarray:
-    """The first `count` frames in metres at the generator's size, (count, H, W) float32, 0 = hole."""
+def _folders(root: Path) -> list[Path]:
+    """Recordings at or directly below `root`, by name; `root` itself, for its error, if there are none."""
+    if (root / artifacts.MANIFEST).exists():
+        artifacts.read_manifest(root)
+    below = root.iterdir() if root.is_dir() and not (root / "depth").is_dir() else ()
+    return sorted(p for p in below if is_recording(p) and not p.name.startswith(".")) or [root]
+
+
+def _read(
+    recording: Recording, limit: int, config: DDGConfig, prior: Prior, progress: Progress
+) -> tuple[np.ndarray, np.ndarray | None, int]:
+    """Of the first `limit` frames: (depth (T, H, W) in metres at the generator's size, rgb (T, h, w, 3) if
+    the prior wants it, number of frames left out).
+    """
+    if recording.skipped:
+        progress.note(recording.skipped_summary())
     size = (config.height_px, config.width_px)
-    return np.stack([resize_nearest(recording.depth_m(i), size) for i in range(count)])
+    count = min(limit, len(recording))
+    frames = np.stack([resize_nearest(recording.depth_m(i), size) for i in range(count)])
+    usable = np.flatnonzero((frames > 0).any(axis=(1, 2)))
+    blind = len(frames) - len(usable)
+    if len(usable) == 0:
+        raise UserError(
+            f"{recording.path}: no frame has a valid pixel in the window that the generator sees."
+        )
+    if blind:
+        progress.note(f"{recording.path}: left out {blind} frame(s) without a valid pixel in the window")
+    rgb = np.stack([recording.rgb(int(i)) for i in usable]) if prior.needs_rgb else None
+    return frames[usable], rgb, len(recording.skipped) + blind
 
 
 def resize_nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

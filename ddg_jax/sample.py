@@ -1,7 +1,6 @@
 """Sampling: prior c -> noisy depth; simulated depth -> grafted noisy depth, per batch or per episode."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,21 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.typing import ArrayLike
 
 from ddg_jax import normalise
 from ddg_jax import schedule as diffusion
+from ddg_jax.distil import X_LIMIT, params_file
 from ddg_jax.graft import artefact_mask, graft_mask
+from ddg_jax.loop import Params
 from ddg_jax.prior import C_LIMIT, Prior, make_prior
-from ddg_jax.train import Params, config_schedule, init_params, predict_noise
+from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError, unknown_name
 
 PARAMS_FILE = "params.msgpack"
-X_LIMIT = 1.0
-"""|x_0| of the diffusion space: predictions are clipped to it."""
-SAMPLERS = ("ddim", "ddpm")
+PROGRESSIVE = "progressive"
+SAMPLERS = ("ddim", "ddpm", PROGRESSIVE)
 SHARED = 2**31 - 1
 """Stands for the frame number in the key of the noise that an episode's frames share."""
 _ASPECT_TOLERANCE = 0.02
@@ -35,25 +36,41 @@ FARTHEST_SANE_M = 200.0
 
 @dataclass(frozen=True)
 class Generator:
-    """A fitted generator: what `generate` needs."""
+    """A generator ready to sample: what `generate` needs."""
 
     config: DDGConfig
     params: Params
+    """Of the fitted network, or of the distilled one for sampler progressive."""
     prior: Prior
 
     @classmethod
-    def load(cls, directory: Path | str) -> "Generator":
-        """The generator in a finished `ddg` stage directory; UserError if there is none."""
+    def load(cls, directory: Path | str, sampler: str = "", steps: int = 0) -> "Generator":
+        """The generator in a finished `ddg` stage directory; UserError if there is none.
+
+        Args:
+          sampler, steps: instead of those it was made with. Sampler progressive with any number of steps to
+            which the stage distilled on its way.
+        """
+        directory = Path(directory)
         manifest = artifacts.read_manifest(directory)
         if manifest.stage != "ddg":
             raise UserError(f"{directory} holds a {manifest.stage!r} artefact; expected one of stage 'ddg'.")
         config = artifacts.config_from_json(manifest.config).ddg
-        target = jax.eval_shape(partial(_init_shapes, config))
-        params = artifacts.load_params(Path(directory) / PARAMS_FILE, target)
+        sampler, steps = sampler or config.sampler, steps or config.sample_steps
+        if sampler not in SAMPLERS:
+            raise unknown_name("sampler", sampler, SAMPLERS)
+        file = directory / (params_file(steps) if sampler == PROGRESSIVE else PARAMS_FILE)
+        if sampler == PROGRESSIVE and not file.exists():
+            raise UserError(
+                f"{directory} holds no {file.name}: distil one with `ddgrasp ddg distil --model {directory} "
+                f"--evaluations {steps}`."
+            )
+        config = replace(config, sampler=sampler, sample_steps=steps)
+        params = artifacts.load_params(file, jax.eval_shape(partial(_init_shapes, config)))
         return cls(config, params, make_prior(config))
 
     def save(self, directory: Path | str) -> None:
-        """Writes the parameters; the manifest, written by the stage, makes them loadable."""
+        """Writes a fitted network's parameters; the manifest, written by the stage, makes them loadable."""
         artifacts.save_params(Path(directory) / PARAMS_FILE, self.params)
 
 
@@ -101,6 +118,11 @@ def sample(
     """
     if config.sampler not in SAMPLERS:
         raise unknown_name("sampler", config.sampler, SAMPLERS)
+    if config.sampler == PROGRESSIVE and steps != config.sample_steps:
+        raise UserError(
+            f"This generator was distilled to {config.sample_steps} evaluations, not {steps}: load the one "
+            "for those, or sampler ddim."
+        )
     made = config_schedule(config)
     visited = diffusion.timesteps(made.steps, steps, "trailing")
     noise = partial(
@@ -119,6 +141,8 @@ def sample(
         fresh = partial(noise, jax.random.fold_in(step_key, k))
         if config.sampler == "ddpm":
             return diffusion.ddpm_step(made, x, k, previous, eps, fresh(), X_LIMIT), None
+        if config.sampler == PROGRESSIVE:
+            return diffusion.ddim_step(made, x, k, previous, eps, None), None
         extra = fresh() if config.eta else 0.0
         return diffusion.ddim_step(made, x, k, previous, eps, X_LIMIT, config.eta, extra), None
 
@@ -163,16 +187,37 @@ def generate(
 
     Raises UserError for depth of another type, rank or aspect ratio.
     """
-    config = generator.config
+    c = condition(generator, depth_m, rgb, one_episode=np.ndim(episode) == 0)
+    x = predict(key, generator, c, episode=episode, frame=frame, steps=steps)
+    return grafted(generator.config, depth_m, x)
+
+
+def condition(
+    generator: Generator, depth_m: np.ndarray, rgb: np.ndarray | None, *, one_episode: bool
+) -> np.ndarray:
+    """c (B, h, w) at the generator's size of one sequence, or of frames that have nothing to do with each
+    other. Arguments and errors of `generate`.
+    """
+    config, prior = generator.config, generator.prior
     _check_depth(depth_m, config)
     clean = _at_size(depth_m, (config.height_px, config.width_px))
-    c = _prior(generator.prior, clean, rgb, one_episode=np.ndim(episode) == 0)
-    x = predict(key, generator, c, episode=episode, frame=frame, steps=steps)
+    if one_episode:
+        return prior.from_sim(clean, rgb)
+    pictures = [None] * len(clean) if rgb is None else [picture[None] for picture in rgb]
+    return np.concatenate([prior.from_sim(d[None], p) for d, p in zip(clean, pictures, strict=True)])
+
+
+def grafted(config: DDGConfig, depth_m: np.ndarray, x: np.ndarray) -> Generated:
+    """Maps x (B, h, w) of `predict` on clean depth_m (B, H, W)."""
     mask = np.asarray(artefact_mask(x, config.noise_threshold))
     predicted = np.asarray(normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold))
     mask, predicted = (_at_size(a, depth_m.shape[1:]) for a in (mask, predicted))
-    grafted = np.asarray(graft_mask(depth_m, predicted, mask), np.float32)
-    return Generated(grafted, predicted)
+    return Generated(np.asarray(graft_mask(depth_m, predicted, mask), np.float32), predicted)
+
+
+def batch_size(config: DDGConfig) -> int:
+    """Frames that one call of the network takes, over all devices of this process."""
+    return config.sample_batch * jax.local_device_count()
 
 
 def predict(
@@ -184,52 +229,35 @@ def predict(
     frame: np.ndarray | None = None,
     steps: int | None = None,
 ) -> np.ndarray:
-    """Maps in diffusion space for priors c (B, H, W), in batches of one compiled size. Arguments of
-    `generate`.
+    """Maps in diffusion space for priors c (B, H, W), in batches of one compiled size, split over this
+    process's devices. Arguments of `generate`.
     """
-    config, size = generator.config, generator.config.sample_batch
+    config, size = generator.config, batch_size(generator.config)
     frame = np.arange(len(c)) if frame is None else np.asarray(frame)
     number = np.asarray(episode)
+    mesh = Mesh(np.array(jax.local_devices()), ("frames",))
+    split, everywhere = (NamedSharding(mesh, PartitionSpec(*axes)) for axes in (("frames",), ()))
+    params = jax.device_put(generator.params, everywhere)
     parts = []
     for start in range(0, len(c), size):
         now = slice(start, start + size)
         x = sample(
             config,
             key,
-            generator.params,
-            jnp.clip(_filled_up(c[now], size), -C_LIMIT, C_LIMIT),
-            jnp.asarray(number if number.ndim == 0 else _filled_up(number[now], size)),
-            jnp.asarray(_filled_up(frame[now], size)),
+            params,
+            jax.device_put(np.clip(_filled_up(c[now], size), -C_LIMIT, C_LIMIT), split),
+            jnp.asarray(number) if number.ndim == 0 else jax.device_put(_filled_up(number[now], size), split),
+            jax.device_put(_filled_up(frame[now], size), split),
             steps=steps or config.sample_steps,
         )
         parts.append(np.asarray(x)[: len(c[now])])
     return np.concatenate(parts)
 
 
-def _prior(prior: Prior, clean_m: np.ndarray, rgb: np.ndarray | None, one_episode: bool) -> np.ndarray:
-    """c of one sequence, or of frames that have nothing to do with each other."""
-    if one_episode:
-        return prior.from_sim(clean_m, rgb)
-    pictures = [None] * len(clean_m) if rgb is None else [picture[None] for picture in rgb]
-    return np.concatenate([prior.from_sim(d[None], p) for d, p in zip(clean_m, pictures, strict=True)])
-
-
 def _filled_up(values: np.ndarray, size: int) -> np.ndarray:
     """`values` (n <= size, ...) with zeros behind them up to `size`; float32 if floating."""
     values = np.asarray(values, np.float32 if np.issubdtype(values.dtype, np.floating) else np.int32)
     return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype)])
-
-
-def generate_episodes(
-    key: Array, generator: Generator, episodes: Iterable[np.ndarray], first: int = 0
-) -> Iterator[np.ndarray]:
-    """Streams `generate` over clean episodes (T, H, W) metres: yields their grafted depth, one at a time.
-
-    `first` is the number of the first episode: a job that resumes after n episodes passes n and gets the
-    depth that an uninterrupted one would have made.
-    """
-    for number, depth_m in enumerate(episodes, start=first):
-        yield generate(key, generator, depth_m, episode=number).depth_m
 
 
 def _check_depth(depth_m: np.ndarray, config: DDGConfig) -> None:

@@ -156,14 +156,14 @@ def ddpm_step(
     previous: ArrayLike,
     eps: ArrayLike,
     noise: ArrayLike,
-    clip: float | None,
+    clip: ArrayLike | None,
 ) -> Array:
     """One ancestral step x_k -> x_previous from predicted `eps` (Ho et al. 2020, algorithm 2).
 
     `noise` is standard normal, shaped like x_k, unused when previous = -1. `clip`: |x_0| is limited to it.
     """
     x_0 = predict_x_0(schedule, x_k, step, eps)
-    x_0 = x_0 if clip is None else jnp.clip(x_0, -clip, clip)
+    x_0 = x_0 if clip is None else jnp.clip(x_0, -jnp.asarray(clip), clip)
     variance = jnp.maximum(posterior_variance(schedule, step, previous, x_k), VARIANCE_FLOOR)
     noise = jnp.where(jnp.asarray(previous) < 0, 0.0, 1.0) * noise
     return posterior_mean(schedule, x_k, x_0, step, previous) + jnp.sqrt(variance) * noise
@@ -175,7 +175,7 @@ def ddim_step(
     step: ArrayLike,
     previous: ArrayLike,
     eps: ArrayLike,
-    clip: float | None,
+    clip: ArrayLike | None,
     eta: float = 0.0,
     noise: ArrayLike = 0.0,
 ) -> Array:
@@ -185,7 +185,7 @@ def ddim_step(
     `clip`: |x_0| is limited to it; the direction towards x_k keeps the predicted eps.
     """
     x_0 = predict_x_0(schedule, x_k, step, eps)
-    x_0 = x_0 if clip is None else jnp.clip(x_0, -clip, clip)
+    x_0 = x_0 if clip is None else jnp.clip(x_0, -jnp.asarray(clip), clip)
     a_prev = alpha_bar_at(schedule, previous, x_k)
     sigma = eta * jnp.sqrt(posterior_variance(schedule, step, previous, x_k))
     # A step from pure noise has sigma^2 = 1 - alpha_bar_previous, and rounding may push the rest below 0.

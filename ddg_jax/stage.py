@@ -9,9 +9,11 @@ import jax
 import numpy as np
 
 from ddg_jax import data, normalise
+from ddg_jax.distil import distil
 from ddg_jax.graft import artefact_mask, graft_mask
+from ddg_jax.loop import Params
 from ddg_jax.prior import invert, make_prior
-from ddg_jax.sample import Generator, predict
+from ddg_jax.sample import PROGRESSIVE, Generator, predict
 from ddg_jax.train import fit
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
@@ -22,8 +24,8 @@ from sensors import stats
 from sensors.holes import fill_from_background
 
 STAGE = "ddg"
-SCORED_FRAMES = 64
-"""Held-out frames on which the statistics are taken, at most."""
+SCORED_FRAMES = 180
+"""Held-out frames, the last ones, on which the statistics are taken, at most."""
 SHOWN_FRAMES = 4
 _SAMPLE_SEED = 1
 
@@ -46,16 +48,21 @@ def fit_folder(
     prior = make_prior(config.ddg)
     frames = data.load_frames(root, config.ddg, prior, config.seed, progress)
     training, held_out = frames.split(config.ddg.holdout_fraction)
-    if config.ddg.init_from:
-        generator = _loaded(config.ddg)
-    else:
-        generator = Generator(config.ddg, fit(config.ddg, training, directory, config.seed, progress), prior)
-    generator.save(directory)
-    scored = held_out.part(np.linspace(0, len(held_out) - 1, min(SCORED_FRAMES, len(held_out))).astype(int))
+    params = _fitted(config, training, directory, progress)
+    Generator(config.ddg, params, prior).save(directory)
+    if config.ddg.sampler == PROGRESSIVE:
+        params = distil(config.ddg, params, training, directory, config.seed, progress)
+    generator = Generator(config.ddg, params, prior)
+    scored = held_out.part(slice(-SCORED_FRAMES, None))
     metrics = {
         "prior": prior.name,
         "prior_source": prior.source,
-        "frames": {"training": len(training), "held_out": len(held_out), "skipped": len(frames.skipped)},
+        "frames": {
+            "training": len(training),
+            "held_out": len(held_out),
+            "skipped": frames.skipped_frames,
+            "refused_recordings": frames.refused_recordings,
+        },
         **_score(generator, scored, progress),
     }
     return artifacts.finish(
@@ -84,10 +91,17 @@ def sample_folder(directory: Path, root: Path, out: Path, *, seed: int, count: i
     return path
 
 
-def _loaded(config: DDGConfig) -> Generator:
-    """The generator of `config.init_from`, refused if its network or depth space is another."""
+def _fitted(config: Config, training: data.Frames, directory: Path, progress: Progress) -> Params:
+    """Parameters of a network fitted on `training`, or of the one that `ddg.init_from` names."""
+    if config.ddg.init_from:
+        return _loaded(config.ddg)
+    return fit(config.ddg, training, directory, config.seed, progress)
+
+
+def _loaded(config: DDGConfig) -> Params:
+    """Parameters of `config.init_from`'s fitted network, refused if network or depth space are others."""
     source = Path(config.init_from)
-    generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source)
+    generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source, sampler="ddim")
     for name in (
         "height_px", "width_px", "near_m", "far_m", "prior", "space_to_depth", "widths", "blocks",
         "attention_heads", "diffusion_steps", "schedule", "log_snr_shift",
@@ -98,7 +112,7 @@ def _loaded(config: DDGConfig) -> Generator:
                 f"The generator in {source} has ddg.{name} {there!r}, this configuration {here!r}: "
                 "use the same value, or fit a new one (empty ddg.init_from)."
             )
-    return Generator(config, generator.params, make_prior(config))
+    return generator.params
 
 
 def _score(generator: Generator, frames: data.Frames, progress: Progress) -> dict[str, Any]:
@@ -110,8 +124,8 @@ def _score(generator: Generator, frames: data.Frames, progress: Progress) -> dic
     if progress.directory is not None:
         _write_png(progress.directory / "samples.png", few)
     return {
-        "recorded": hole_statistics(panels["recorded"]),
-        "generated": hole_statistics(panels["generated"]),
+        "recorded": hole_statistics(panels["recorded"], frames.recording),
+        "generated": hole_statistics(panels["generated"], frames.recording),
         "grafted_error_m": _largest_change(panels["clean"], panels["grafted"]),
     }
 
@@ -119,7 +133,7 @@ def _score(generator: Generator, frames: data.Frames, progress: Progress) -> dic
 def _panels(generator: Generator, frames: data.Frames, seed: int) -> dict[str, np.ndarray]:
     """clean (holes filled), recorded, generated and grafted depth in metres, (N, H, W) each."""
     config = generator.config
-    x = predict(jax.random.key(seed), generator, frames.prior)
+    x = predict(jax.random.key(seed), generator, frames.prior, episode=frames.recording, frame=frames.number)
     generated = normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold)
     clean = np.stack([invert(fill_from_background(f)) for f in invert(frames.depth_m)])
     grafted = graft_mask(clean, generated, artefact_mask(x, config.noise_threshold))
@@ -131,8 +145,10 @@ def _panels(generator: Generator, frames: data.Frames, seed: int) -> dict[str, n
     }
 
 
-def hole_statistics(depth_m: np.ndarray) -> dict[str, float]:
-    """Share of invalid pixels, regions per frame, median region and left band of (N, H, W) metres."""
+def hole_statistics(depth_m: np.ndarray, recording: np.ndarray) -> dict[str, float]:
+    """Share of invalid pixels, regions per frame, median region, left band and validity flicker of (N, H, W)
+    metres; `recording` (N,) says which frames follow each other.
+    """
     sizes = [stats.hole_sizes_px(frame) for frame in (depth_m > 0).astype(np.uint16)]
     every = np.concatenate(sizes)
     return {
@@ -140,7 +156,16 @@ def hole_statistics(depth_m: np.ndarray) -> dict[str, float]:
         "hole_components": float(np.mean([len(s) for s in sizes])),
         "hole_median_px": float(np.median(every)) if len(every) else 0.0,
         "left_band_px": float(np.mean([stats.left_band_px(frame) for frame in depth_m])),
+        "flicker_fraction": flicker_fraction(depth_m > 0, recording),
     }
+
+
+def flicker_fraction(valid: np.ndarray, recording: np.ndarray) -> float:
+    """Share of pixels that change validity between neighbouring frames of one recording; valid (N, H, W),
+    recording (N,). nan if every frame is from another one.
+    """
+    same = recording[1:] == recording[:-1]
+    return float(np.mean((valid[1:] != valid[:-1])[same])) if same.any() else float("nan")
 
 
 def _largest_change(clean: np.ndarray, grafted: np.ndarray) -> float:

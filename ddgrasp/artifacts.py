@@ -31,6 +31,7 @@ STAGE_FIELDS: dict[str, tuple[str, ...]] = {
     "demos": ("seed", "world", "teacher", "demos"),
     "record": ("seed", "world", "teacher", "record"),
     "ddg": ("seed", "world", "teacher", "record", "ddg"),
+    "noisy": ("seed", "ddg"),
     "student": ("seed", "world", "teacher", "demos", "record", "ddg", "student"),
     "export": ("seed", "world", "teacher", "demos", "record", "ddg", "student", "export"),
     "deploy": (
@@ -133,7 +134,7 @@ class Manifest:
     """Where an artefact came from and what was measured on it."""
 
     stage: str
-    """A name of ddgrasp/pipeline.py: teacher, demos, record, ddg, student, export, deploy, score, ..."""
+    """A name of ddgrasp/pipeline.py (teacher, demos, record, ...), or noisy."""
     config: dict[str, Any]
     """The whole configuration, as JSON."""
     config_hash: str

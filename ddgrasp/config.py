@@ -355,8 +355,9 @@ class DDGConfig:
     """Nearest depth that is told apart."""
     far_m: float = 10.0
     """Farthest depth that is told apart."""
-    noise_threshold: float = -0.5
-    """The paper's noise_threshold: below it a generated pixel is a hole (holes are -1, surfaces 0 to 1)."""
+    noise_threshold: float = -0.2
+    """The paper's: below it a generated pixel is a hole (holes are -1, surfaces 0 to 1). Lower
+    ones lose small and unsure holes (docs/generator.md)."""
     # --- geometric prior c (ddg_jax/prior.py) ---
     prior: str = "inverse_depth"
     """Where c comes from: inverse_depth (built in), video_depth_anything (the paper's) or depth_anything_v2.
@@ -417,20 +418,33 @@ class DDGConfig:
     """Folder with a fitted generator to use instead of fitting one; empty fits."""
     # --- sampling (ddg_jax/sample.py) ---
     sampler: str = "ddim"
-    """ddim (few steps) or ddpm (ancestral)."""
-    sample_steps: int = 5
+    """ddim, ddpm (ancestral) or progressive (distilled to sample_steps evaluations, ddg_jax/distil.py)."""
+    sample_steps: int = 4
     """Network evaluations per map."""
+    distil_from: int = 8
+    """Evaluations of the fitted network's DDIM from which distillation starts; sample_steps times a power of
+    two."""
+    distil_steps: int = 100
+    """Optimiser steps per halving of the evaluations (sampler progressive only)."""
     eta: float = 0.0
     """Fresh noise in DDIM: 0 none, 1 as much as DDPM."""
-    frame_correlation: float = 0.9
-    """Share of the initial noise's variance that the frames of an episode have in common."""
+    frame_correlation: float = 0.6
+    """Share of the initial noise's variance that the frames of an episode have in common: decides the flicker
+    (docs/generator.md)."""
     sample_batch: int = 16
-    """Frames generated together."""
+    """Frames generated together on each device."""
 
     def __post_init__(self) -> None:
         _check_counts(
             "ddg", self, "diffusion_steps", "batch_size", "checkpoint_every", "sample_steps", "sample_batch",
+            "distil_steps",
         )  # fmt: skip
+        halvings, rest = divmod(self.distil_from, self.sample_steps)
+        if self.sampler == "progressive" and (rest or halvings < 2 or halvings & (halvings - 1)):
+            raise UserError(
+                f"ddg.distil_from is {self.distil_from} and ddg.sample_steps {self.sample_steps}: sampler "
+                "progressive halves the one until it is the other; expected for example 8 and 4, 2 or 1."
+            )
 
 
 @dataclass(frozen=True)

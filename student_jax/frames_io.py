@@ -5,8 +5,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from ddg_jax.sample import Generator, generate
-from ddgrasp import contract
+from ddg_jax.generate import Clip, noisy_episodes
+from ddg_jax.sample import Generator
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
 from demos.rollout import Episodes
@@ -24,18 +24,30 @@ def add_noisy_demos(
 
     A share of `config.student.clean_share` keeps clean depth. Steps long after the grasp are left out.
     """
-    key = jax.random.key(config.seed)
     ends = np.concatenate([[0], demos.ends])
+    held = np.split(demos.steps("held"), ends[1:-1])
+    lengths = [useful_steps(episode, config.student.demo_held_steps) for episode in held]
     keep_clean = np.random.default_rng(config.seed).random(len(demos)) < config.student.clean_share
+    chosen = np.flatnonzero(~keep_clean)
+
+    def read(i: int) -> Clip:
+        rows = int(ends[chosen[i]]), int(ends[chosen[i]]) + lengths[chosen[i]]
+        rgb = demos.steps("rgb", *rows) if generator.prior.needs_sim_rgb else None
+        return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb)
+
+    noisy = noisy_episodes(
+        jax.random.key(config.seed),
+        generator,
+        [lengths[i] for i in chosen],
+        read,
+        int(np.sum(~keep_clean[: len(frames)])),
+    )
     with progress.task("artefacts on the demos", len(demos)) as task:
         task.start_at(len(frames))
         for i in range(len(frames), len(demos)):
-            held = demos.steps("held", ends[i], ends[i + 1])
-            end = ends[i] + useful_steps(held, config.student.demo_held_steps)
-            steps = {name: demos.steps(name, ends[i], end) for name in _FIELDS}
+            steps = {name: demos.steps(name, ends[i], ends[i] + lengths[i]) for name in _FIELDS}
             if not keep_clean[i]:
-                rgb = demos.steps("rgb", ends[i], end) if generator.prior.needs_sim_rgb else None
-                steps["depth_mm"] = corrupt_episode(generator, key, steps["depth_mm"], i, rgb)
+                steps["depth_mm"] = next(noisy)
             frames.append(steps, {"from_demo": np.bool_(True)})
             task.advance()
 
@@ -44,15 +56,6 @@ def useful_steps(held: np.ndarray, held_steps: int) -> int:
     """Number of an episode's first steps up to `held_steps` with the object in the hand; held: (T,) bool."""
     enough = np.flatnonzero(np.cumsum(held) >= held_steps)
     return int(enough[0]) + 1 if len(enough) else len(held)
-
-
-def corrupt_episode(
-    generator: Generator, key: jax.Array, depth_mm: np.ndarray, episode: int, rgb: np.ndarray | None = None
-) -> np.ndarray:
-    """(T, H, W) uint16 clean depth, and (T, H, W, 3) if the prior needs it, to depth with artefacts."""
-    depth_m = depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
-    noisy = generate(key, generator, depth_m, rgb, episode=episode).depth_m
-    return np.round(noisy / contract.DEPTH_UNIT_M).astype(np.uint16)
 
 
 def add_rollouts(frames: EpisodeStore, episodes: Episodes, seen_mm: list[np.ndarray]) -> None:

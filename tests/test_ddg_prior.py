@@ -1,11 +1,16 @@
 """The built-in prior and the loading of recordings, by value on small pictures."""
 
+import json
+
+import cv2
 import numpy as np
 import pytest
 
 from ddg_jax import data, prior
+from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
 from sensors.holes import fill_from_background
 from sensors.recordings import RecordingWriter
@@ -90,3 +95,73 @@ def test_frames_and_batches(recordings):
         frames.part(slice(0, 1)).split(0.1)
     with pytest.raises(UserError, match="inverse_depth"):
         prior.make_prior(DDGConfig(prior="inverse_dept"))
+
+
+def _record(path, frames: int = 2, size=(36, 64), **changes):
+    with RecordingWriter(path, {}) as writer:
+        for _ in range(frames):
+            writer.add(np.zeros((*size, 3), np.uint8), np.full(size, 900, np.uint16))
+    for name, value in changes.items():
+        meta = json.loads((path / "meta.json").read_text())
+        (path / "meta.json").write_text(json.dumps(meta | {name: value}))
+
+
+class Notes(Progress):
+    """Keeps what is said."""
+
+    def __init__(self):
+        super().__init__(quiet=True)
+        self.said = []
+
+    def note(self, text):
+        self.said.append(text)
+
+
+def load(root, config=DDGConfig(height_px=18, width_px=32)):  # noqa: B008
+    notes = Notes()
+    return data.load_frames(root, config, prior.make_prior(config), 0, notes), notes.said
+
+
+def _depth(root, name, frame, image):
+    (root / name / "depth" / f"{frame:06d}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def test_what_cannot_be_used_is_named_and_counted(recordings):
+    _depth(recordings, "a", 1, np.zeros((36, 64), np.uint16))  # nothing valid
+    (recordings / "b" / "color" / "000000.jpg").unlink()  # no colour
+    _record(recordings / "mixed")
+    _depth(recordings, "mixed", 1, np.full((18, 32), 900, np.uint16))
+    _record(recordings / "unit", depth_unit_m=0.00001)
+    _record(recordings / "blind", size=(64, 64))
+    edge = np.zeros((64, 64), np.uint16)
+    edge[0] = 900  # outside the window that a wide generator sees of a square picture
+    _depth(recordings, "blind", 0, edge)
+    frames, said = load(recordings)
+    assert len(frames) == 2 + 2 + 1
+    assert (frames.skipped_frames, frames.refused_recordings) == (3, 2)
+    assert frames.recording.tolist() == [0, 0, 1, 1, 2] and frames.number.tolist() == [0, 1, 0, 1, 0]
+    for words in ("000001.png: no valid depth", "000000.jpg is missing", "32x18", "unit: median depth"):
+        assert sum(words in line for line in said) == 1, (words, said)
+    assert any("blind: left out 1 frame(s) without a valid pixel in the window" in line for line in said)
+    assert said[-1] == "left out 3 frame(s), and 2 of 5 recording(s)"
+    config = DDGConfig(height_px=18, width_px=32)
+    few = data.load_frames(recordings, config, prior.make_prior(config), 0, Progress(quiet=True), 3)
+    np.testing.assert_array_equal(few.depth_m, frames.depth_m[:3])
+
+
+def test_nothing_usable_is_refused_with_the_first_reason(tmp_path):
+    for name in ("a", "b"):
+        _record(tmp_path / name, depth_unit_m=0.00001)
+    with pytest.raises(UserError, match="none of its 2 recording.*The first: .*a: median depth"):
+        load(tmp_path)
+    with pytest.raises(UserError, match="no such folder"):
+        load(tmp_path / "nowhere")
+
+
+def test_recordings_of_another_contract_version_are_refused(recordings):
+    artifacts.finish(recordings, "record", PRESETS["debug"], seconds=1, metrics={})
+    assert len(load(recordings)[0]) == 6
+    path = recordings / artifacts.MANIFEST
+    path.write_text(path.read_text().replace('"contract_version": 1', '"contract_version": 99'))
+    with pytest.raises(UserError, match="contract version 99"):
+        load(recordings)

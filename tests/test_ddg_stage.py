@@ -58,7 +58,14 @@ def fitted(recordings, tmp_path_factory):
 def test_manifest_says_what_was_made(fitted):
     metrics = fitted.manifest.metrics
     assert fitted.manifest.origin == "trained" and metrics["prior"] == "inverse_depth"
-    assert metrics["frames"] == {"training": 6, "held_out": 2, "skipped": 0}
+    assert metrics["frames"] == {
+        "training": 6,
+        "held_out": 2,
+        "skipped": 0,
+        "refused_recordings": 0,
+    }
+    # frames 2 and 3 of the second recording: the hole moves by a column of 32, half a column of 16
+    assert 0 <= metrics["recorded"]["flicker_fraction"] <= 12 / 384
     # a quarter of the pixels: rows 4 to 9 and columns 8 to 9 (or 9 to 10) of 16 x 24
     assert metrics["recorded"]["invalid_fraction"] == pytest.approx(12 / 384, abs=1e-6)
     assert metrics["grafted_error_m"] == 0.0
@@ -94,3 +101,47 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
     other = dataclasses.replace(config, ddg=dataclasses.replace(config.ddg, far_m=5.0))
     with pytest.raises(UserError, match="ddg.far_m 10.0.*5.0"):
         stage.fit_folder(other, recordings, tmp_path / "other", progress=Progress(quiet=True))
+
+
+def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings, tmp_path):
+    config = dataclasses.replace(
+        CONFIG,
+        ddg=dataclasses.replace(
+            CONFIG.ddg,
+            init_from=str(fitted.directory),
+            sampler="progressive",
+            sample_steps=1,
+            distil_from=4,
+            distil_steps=4,
+        ),
+    )
+    directory = tmp_path / "ddg"
+    stage.fit_folder(config, recordings, directory, progress=Progress(directory, quiet=True))
+    before = artifacts.load_params(fitted.directory / "params.msgpack")
+    plain = Generator.load(directory, "ddim", 50)
+    jax.tree.map(np.testing.assert_array_equal, plain.params, before)
+    assert (plain.config.sampler, plain.config.sample_steps) == ("ddim", 50)
+    one, two = Generator.load(directory), Generator.load(directory, steps=2)
+    assert (one.config.sample_steps, two.config.sample_steps) == (1, 2)
+    weights = [jax.tree.leaves(generator.params) for generator in (plain, one, two)]
+    assert not any(np.array_equal(weights[a][0], weights[b][0]) for a, b in ((0, 1), (1, 2), (0, 2)))
+    depth = np.full((2, 16, 24), 0.9, np.float32)
+    assert generate(jax.random.key(0), one, depth).depth_m.shape == depth.shape
+    with pytest.raises(UserError, match="distilled_4.msgpack.*ddg distil --model"):
+        Generator.load(directory, steps=4)
+    with pytest.raises(UserError, match="Did you mean 'progressive'"):
+        Generator.load(directory, "progresive")
+    # the fitted network, not the distilled one, is where another stage starts
+    again = dataclasses.replace(CONFIG, ddg=dataclasses.replace(CONFIG.ddg, init_from=str(directory)))
+    loaded = stage.fit_folder(
+        again, recordings, tmp_path / "x", progress=Progress(tmp_path / "x", quiet=True)
+    )
+    jax.tree.map(
+        np.testing.assert_array_equal, artifacts.load_params(loaded.directory / "params.msgpack"), before
+    )
+
+
+def test_flicker_is_counted_within_recordings_only():
+    valid = np.array([0, 1, 1, 0, 0], bool)[:, None, None] * np.ones((1, 2, 2), bool)
+    assert stage.flicker_fraction(valid, np.array([0, 0, 0, 1, 1])) == pytest.approx(1 / 3)
+    assert np.isnan(stage.flicker_fraction(valid, np.arange(5)))

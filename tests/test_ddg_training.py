@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from ddg_jax import normalise, sample, train
+from ddg_jax import loop, sample, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
 from ddgrasp.config import DDGConfig
@@ -55,7 +55,7 @@ def test_resume_equals_an_uninterrupted_run(tmp_path):
             raise Stop
 
     with pytest.raises(Stop), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train, "LOG_EVERY", 4)
+        patch.setattr(loop, "LOG_EVERY", 4)
         train.fit(TINY, frames, tmp_path / "resumed", 0, Interrupted(quiet=True))
     assert [p.name for p in (tmp_path / "resumed/checkpoints").iterdir()] == ["4"]
     resumed = train.fit(TINY, frames, tmp_path / "resumed", 0, quiet)
@@ -94,16 +94,13 @@ def test_generator_learns_where_the_sensor_loses_pixels(fitted, scene):
     assert abs(np.median(made.predicted_m[:, :3]) - 2.0) < 0.3
 
 
-def test_generation_does_not_depend_on_batching_and_frames_of_an_episode_agree(fitted, scene):
+def test_generation_does_not_depend_on_batching(fitted, scene):
     key = jax.random.key(3)
     all_at_once = sample.predict(key, fitted, fitted.prior.from_sim(scene, None), episode=2)
     other = dataclasses.replace(fitted, config=dataclasses.replace(fitted.config, sample_batch=3))
     np.testing.assert_allclose(
         sample.predict(key, other, fitted.prior.from_sim(scene, None), episode=2), all_at_once, atol=2e-4
     )
-    streamed = list(sample.generate_episodes(key, fitted, [scene[:2]], first=2))
-    x_limits = normalise.to_depth(all_at_once[:2], 0.25, 10.0, fitted.config.noise_threshold)
-    np.testing.assert_array_equal(streamed[0] == 0, np.asarray(x_limits) == 0)
 
 
 def test_frame_noise_is_standard_normal_with_the_stated_correlation():

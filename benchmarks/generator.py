@@ -1,0 +1,105 @@
+"""Frames per second of the generator with every sampler, from simulated depth to grafted noisy depth.
+
+    python -m benchmarks.generator --preset laptop --batches 4 16
+
+Random parameters (speed does not depend on their values). `x ddim 50` is the speed over that of 50-step DDIM
+at the same batch. Lines alternate, so that other work on the machine slows all of them. DDPM is timed over 50
+of its steps. Below, where a frame's time goes, in milliseconds.
+"""
+
+import argparse
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import compare
+from ddg_jax.prior import make_prior
+from ddg_jax.sample import PROGRESSIVE, Generator, condition, frame_noise, generate, grafted
+from ddg_jax.train import init_params, predict_noise
+from ddgrasp.config import DDGConfig
+from ddgrasp.presets import get_preset
+
+REFERENCE = ("ddim", 50)
+SAMPLERS = (REFERENCE, ("ddim", 10), ("ddim", 5), (PROGRESSIVE, 4), (PROGRESSIVE, 2), (PROGRESSIVE, 1))
+DDPM_STEPS = 50
+
+
+def scenes(config: DDGConfig, count: int) -> np.ndarray:
+    """(count, H, W) metres: a table with a box that moves."""
+    depth = np.full((count, config.height_px, config.width_px), 0.9, np.float32)
+    for i in range(count):
+        depth[i, config.height_px // 3 : config.height_px // 2, 20 + i : 60 + i] = 0.7
+    return depth
+
+
+def make_generator(config: DDGConfig, params: Any, batch: int, sampler: str, steps: int) -> Generator:
+    """The configuration's network with that sampler, `batch` frames at once."""
+    changed = replace(config, sampler=sampler, sample_steps=steps, sample_batch=batch, distil_from=8)
+    return Generator(changed, params, make_prior(changed))
+
+
+def measure(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
+    """Prints one line per sampler."""
+    count = batch * jax.local_device_count()
+    depth, key = scenes(config, count), jax.random.key(0)
+
+    def contender(sampler: str, steps: int, work: float = count) -> compare.Contender:
+        generator = make_generator(config, params, batch, sampler, steps)
+        return compare.Contender(partial(generate, key, generator, depth), work)
+
+    contenders = {f"{sampler} {steps}": contender(sampler, steps) for sampler, steps in SAMPLERS}
+    every_step = config.diffusion_steps
+    timed = min(DDPM_STEPS, every_step)
+    contenders[f"ddpm {every_step}"] = contender("ddpm", timed, count * timed / every_step)
+    rates = compare.measure(contenders, rounds)
+    reference = rates[" ".join(map(str, REFERENCE))]
+    for name, rate in rates.items():
+        line = f"{name:<16}{count:>6}{np.median(rate):>10.3g}{np.median(rate / reference):>12.2f}"
+        print(line, flush=True)
+
+
+def parts(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
+    """Prints what one frame costs in each part of `generate`."""
+    generator = make_generator(config, params, batch, "ddim", 1)
+    depth, number = scenes(config, batch), jnp.arange(batch)
+    c = condition(generator, depth, None, one_episode=True)
+    shape = (config.height_px, config.width_px)
+    network = jax.jit(lambda p, x: predict_noise(config, p, x, x, jnp.full(batch, 500)))
+    noise = jax.jit(partial(frame_noise, shape=shape, correlation=config.frame_correlation))
+    on_device = jax.device_put((params, c))
+    runners = {
+        "prior": lambda: condition(generator, depth, None, one_episode=True),
+        "noise, twice": lambda: [noise(jax.random.key(i), 0, number).block_until_ready() for i in range(2)],
+        "one evaluation": lambda: network(*on_device).block_until_ready(),
+        "grafting": lambda: grafted(config, depth, c),
+    }
+    for run in runners.values():
+        run()
+    for name, taken in compare.seconds_in_turns(runners, rounds).items():
+        print(f"  {name:<16}{1e3 * np.median(taken) / batch:>8.2f}")
+
+
+def main() -> None:
+    """Prints the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--preset", default="laptop")
+    parser.add_argument("--batches", type=int, nargs="+", default=[4, 16], help="frames per device")
+    parser.add_argument("--rounds", type=int, default=5)
+    arguments = parser.parse_args()
+    config = get_preset(arguments.preset).ddg
+    params = init_params(config, jax.random.key(0))
+    print(f"{config.width_px} x {config.height_px}, {jax.local_device_count()} x {jax.default_backend()}")
+    print(f"{'sampler':<16}{'batch':>6}{'frames/s':>10}{'x ddim 50':>12}")
+    for batch in arguments.batches:
+        measure(config, params, batch, arguments.rounds)
+    for batch in arguments.batches:
+        print(f"milliseconds per frame, batch {batch}")
+        parts(config, params, batch, arguments.rounds)
+
+
+if __name__ == "__main__":
+    main()

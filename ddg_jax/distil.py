@@ -1,0 +1,167 @@
+"""Progressive distillation: a sampler of few network evaluations learnt from one of many.
+
+A student of n evaluations learns to do in one DDIM step what its teacher does in two of 2n. The first teacher
+is the fitted network with `DDGConfig.distil_from` evaluations, every further one the student before it, until
+`DDGConfig.sample_steps` are left (Salimans & Ho 2022, algorithm 2). Noise levels are only those that the
+student's sampler visits, so that all of its capacity goes to them.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+from jax.typing import ArrayLike
+
+from ddg_jax import schedule as diffusion
+from ddg_jax.data import Frames, make_batch
+from ddg_jax.loop import Params, TrainState, first_state, run_steps, updated
+from ddg_jax.train import (
+    SNR_LIMITS,
+    config_schedule,
+    make_optimizer,
+    predict_clean,
+    predict_noise,
+    step_keys,
+)
+from ddgrasp import artifacts
+from ddgrasp.config import DDGConfig
+from ddgrasp.progress import Progress
+
+LEARNING_RATE = 0.5
+"""Relative to the fit's."""
+X_LIMIT = 1.0
+"""|x_0| of the diffusion space: the fitted network's predictions are clipped to it. A student's are not: its
+x_0 stands for a whole step of the teacher's and may lie outside."""
+
+
+def params_file(steps: int) -> str:
+    """Name of the file with the student of `steps` network evaluations."""
+    return f"distilled_{steps}.msgpack"
+
+
+def rounds(config: DDGConfig) -> list[int]:
+    """Network evaluations of each student, in the order of training, the last `config.sample_steps`."""
+    counts = [config.sample_steps]
+    while 2 * counts[-1] < config.distil_from:
+        counts.append(2 * counts[-1])
+    return counts[::-1]
+
+
+def distil(
+    config: DDGConfig, fitted: Params, frames: Frames, directory: Path, seed: int, progress: Progress
+) -> Params:
+    """The student of `config.sample_steps` evaluations, averaged parameters.
+
+    Leaves a file and checkpoints per round in `directory`; rounds whose file is there are not repeated, an
+    unfinished one goes on (see `loop.run_steps`).
+    """
+    teacher = fitted
+    for number, count in enumerate(rounds(config)):
+        path = directory / params_file(count)
+        if not path.exists():
+            limit = X_LIMIT if number == 0 else np.inf
+            artifacts.save_params(
+                path, _round(config, teacher, frames, directory, seed, progress, count, limit)
+            )
+        teacher = artifacts.load_params(path, teacher)
+    return teacher
+
+
+def _round(
+    config: DDGConfig,
+    teacher: Params,
+    frames: Frames,
+    directory: Path,
+    seed: int,
+    progress: Progress,
+    count: int,
+    limit: float,
+) -> Params:
+    teacher, made = jax.tree.map(jnp.asarray, teacher), config_schedule(config)
+    key = jax.random.key_data(jax.random.fold_in(jax.random.key(seed), count))
+
+    def step_once(state: TrainState, step: int) -> tuple[TrainState, dict[str, Array]]:
+        # Batches of its own, whatever the fit and the other rounds drew.
+        batch = make_batch(frames, config, seed, config.train_steps + count * config.distil_steps + step)
+        number = np.random.default_rng((seed, count, step)).integers(count, size=config.batch_size)
+        path = teacher_path(made.steps, count, number)
+        return distil_step(config, state, teacher, limit, path, batch.x_0, batch.c)
+
+    state = run_steps(
+        first_state(teacher, make_optimizer(config, config.distil_steps, LEARNING_RATE), key),
+        config.distil_steps,
+        step_once,
+        directory / f"distil_{count}",
+        every=config.checkpoint_every,
+        label=f"distilling to {count}",
+        progress=progress,
+        curve=f"distil_{count}/",
+    )
+    return jax.tree.map(np.asarray, state.ema)
+
+
+@partial(jax.jit, static_argnums=0, donate_argnums=1)
+def distil_step(
+    config: DDGConfig,
+    state: TrainState,
+    teacher: Params,
+    limit: ArrayLike,
+    path: ArrayLike,
+    x_0: Array,
+    c: Array,
+) -> tuple[TrainState, dict[str, Array]]:
+    """One optimiser step of the student on x_0, c (B, H, W). Pure: its noise comes from `train.step_keys`.
+
+    The student's error in x_0 weighs clip(SNR, 1, 5) (eq. 9 there, with a cap).
+
+    Args:
+      limit: the teacher's |x_0| is clipped to it.
+      path: (3, B) int, see `teacher_path`.
+    """
+    eps_key, _, prior_key = step_keys(state)
+    made = config_schedule(config)
+    c = c + config.prior_noise * jax.random.normal(prior_key, c.shape)
+    path = jnp.asarray(path)
+    k, _, end = path
+    x_k = diffusion.q_sample(made, x_0, k, jax.random.normal(eps_key, x_0.shape))
+
+    def teacher_step(x: Array, hop: tuple[Array, Array]) -> tuple[Array, None]:
+        now, then = hop
+        return diffusion.ddim_step(made, x, now, then, predict_noise(config, teacher, x, c, now), limit), None
+
+    x, _ = jax.lax.scan(teacher_step, x_k, (path[:2], path[1:]))
+    target = jax.lax.stop_gradient(one_step_target(made, x_k, k, x, end))
+    weight = jnp.clip(diffusion.signal_to_noise(made, k), *SNR_LIMITS)
+
+    def loss_of(params: Params) -> Array:
+        error = (target - predict_clean(config, params, x_k, c, k)) ** 2
+        return jnp.mean(weight * jnp.mean(error, axis=(1, 2)))
+
+    loss, grads = jax.value_and_grad(loss_of)(state.params)
+    optimizer = make_optimizer(config, config.distil_steps, LEARNING_RATE)
+    state = updated(state, optimizer, grads, config.ema_decay)
+    return state, {"loss": loss, "grad_norm": optax.global_norm(grads)}
+
+
+def teacher_path(steps: int, count: int, number: np.ndarray) -> np.ndarray:
+    """(3, B) int32: where the teacher starts, passes and ends during step `number` (B,) of the student.
+
+    steps: of the forward process; count: the student's, half of the teacher's.
+    """
+    path = np.append(diffusion.timesteps(steps, 2 * count, "trailing"), -1).astype(np.int32)
+    return np.stack([path[2 * number + ahead] for ahead in range(3)])
+
+
+def one_step_target(made: diffusion.Schedule, x_k: Array, k: Array, x_end: Array, end: Array) -> Array:
+    """The x_0 whose DDIM step takes x_k (step k) to x_end (step `end`) (Salimans & Ho 2022, appendix G).
+
+    With r = sqrt((1 - alpha_bar_end) / (1 - alpha_bar_k)):
+    x_0 = (x_end - r x_k) / (sqrt(alpha_bar_end) - r sqrt(alpha_bar_k)).
+    """
+    a, a_end = diffusion.alpha_bar_at(made, k, x_k), diffusion.alpha_bar_at(made, end, x_k)
+    r = jnp.sqrt((1 - a_end) / (1 - a))
+    return (x_end - r * x_k) / (jnp.sqrt(a_end) - r * jnp.sqrt(a))

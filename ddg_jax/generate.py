@@ -1,0 +1,122 @@
+"""A whole set of demos through the generator: a stream in constant memory, resumable, over all devices.
+
+    ddgrasp ddg generate --model runs/a/ddg --demos runs/a/demos --out runs/a
+
+Frames of all episodes form one stream, cut into batches at fixed places, whatever the episodes' lengths: no
+batch but the last is padded, and a job that resumes computes the very batches of an uninterrupted one, so its
+result is the same bit for bit (on the same number of devices; on another one up to rounding).
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from ddg_jax.sample import Generator, batch_size, condition, grafted, predict
+from ddgrasp import artifacts, contract
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from demos.store import EpisodeStore
+
+STAGE = "noisy"
+STORE = "depth.zarr"
+"""`data/depth_mm` with artefacts; episodes and steps of the demo store."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """An episode of clean depth."""
+
+    number: int
+    """Decides its noise."""
+    depth_mm: np.ndarray
+    """(T, H, W) uint16."""
+    rgb: np.ndarray | None = None
+    """(T, h, w, 3) uint8, for priors that need it in simulation."""
+
+
+def noisy_episodes(
+    key: jax.Array,
+    generator: Generator,
+    lengths: Sequence[int],
+    read: Callable[[int], Clip],
+    first: int = 0,
+) -> Iterator[np.ndarray]:
+    """Yields the grafted depth, (T, H, W) uint16 millimetres, of episodes `first`, `first` + 1, ... in order.
+
+    Holds a batch and the episodes that it touches.
+
+    Args:
+      lengths: frames of every episode, those before `first` included: they say where batches are cut.
+      read: episode's position in `lengths` -> its frames.
+    """
+    starts = np.concatenate([[0], np.cumsum(lengths)]).astype(int)
+    size = batch_size(generator.config)
+    used = begin = starts[first] // size * size
+    waiting: deque[tuple[int, Clip]] = deque()
+    made: deque[np.ndarray] = deque()
+
+    def stream() -> Iterator[tuple[np.ndarray, int, int]]:
+        for i in range(int(np.searchsorted(starts, begin, side="right")) - 1, len(lengths)):
+            clip = read(i)
+            waiting.append((i, clip))
+            c = condition(generator, _metres(clip.depth_mm), clip.rgb, one_episode=True)
+            yield from ((c[t], clip.number, t) for t in range(max(0, begin - starts[i]), lengths[i]))
+
+    frames = stream()
+    while batch := list(islice(frames, size)):
+        c, number, frame = (np.stack(values) for values in zip(*batch, strict=True))
+        made.extend(predict(key, generator, c, episode=number, frame=frame))
+        while waiting and len(made) >= starts[waiting[0][0] + 1] - used:
+            i, clip = waiting.popleft()
+            x = np.stack([made.popleft() for _ in range(starts[i + 1] - used)])
+            used = starts[i + 1]
+            if i >= first:
+                depth_m = grafted(generator.config, _metres(clip.depth_mm), x).depth_m
+                yield np.round(depth_m / contract.DEPTH_UNIT_M).astype(np.uint16)
+
+
+def generate_store(model: Path, demos: Path, directory: Path, config: Config, progress: Progress) -> Artifact:
+    """Writes `directory`/depth.zarr: the demos of a finished `demos` stage as the camera would see them.
+
+    Goes on after the episodes that are there. `config.seed` is the noise's.
+    """
+    parents = [artifacts.read_artifact(path) for path in (model, demos)]
+    generator = Generator.load(model)
+    clean = EpisodeStore(demos / "episodes.zarr")
+    noisy = EpisodeStore(directory / STORE, create=True)
+    ends = np.concatenate([[0], clean.ends])
+    if generator.prior.needs_sim_rgb and "rgb" not in clean.fields:
+        raise UserError(
+            f"{clean.path} holds no colour, which the prior needs: ddg.prior_in_sim depth does not."
+        )
+
+    def read(i: int) -> Clip:
+        steps = {name: clean.steps(name, ends[i], ends[i + 1]) for name in _fields(generator)}
+        return Clip(i, steps["depth_mm"], steps.get("rgb"))
+
+    key = jax.random.key(config.seed)
+    with progress.task("artefacts on the demos", len(clean)) as task:
+        task.start_at(len(noisy))
+        for depth_mm in noisy_episodes(key, generator, np.diff(ends).tolist(), read, len(noisy)):
+            noisy.append({"depth_mm": depth_mm}, {"invalid_fraction": np.mean(depth_mm == 0)})
+            task.advance()
+    invalid = np.average(noisy.episodes("invalid_fraction"), weights=np.diff(ends))
+    metrics = {"episodes": len(noisy), "frames": int(ends[-1]), "invalid_fraction": float(invalid)}
+    return artifacts.finish(
+        directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=parents
+    )
+
+
+def _fields(generator: Generator) -> tuple[str, ...]:
+    return ("depth_mm", "rgb") if generator.prior.needs_sim_rgb else ("depth_mm",)
+
+
+def _metres(depth_mm: np.ndarray) -> np.ndarray:
+    return depth_mm.astype(np.float32) * np.float32(contract.DEPTH_UNIT_M)

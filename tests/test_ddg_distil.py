@@ -1,0 +1,145 @@
+"""Progressive distillation: its equations by hand, a student that does what its teacher does, resume."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ddg_jax import distil, sample, train
+from ddg_jax import schedule as diffusion
+from ddg_jax.data import Frames
+from ddg_jax.prior import make_prior
+from ddgrasp import artifacts
+from ddgrasp.config import DDGConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress, read_curves
+
+TINY = DDGConfig(
+    height_px=16,
+    width_px=24,
+    widths=(8, 8),
+    blocks=(0, 1),
+    attention_heads=1,
+    diffusion_steps=100,
+    batch_size=8,
+    checkpoint_every=20,
+    sample_batch=8,
+    prior_noise=0.0,
+    learning_rate=1e-2,
+)
+DISTILLED = dataclasses.replace(TINY, sampler="progressive", sample_steps=1, distil_from=4, distil_steps=60)
+
+
+def pictures(count: int = 32) -> Frames:
+    """Random blocks of holes on a random slope."""
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.5, 2.0, (count, 2, 3)).repeat(8, 1).repeat(8, 2).astype(np.float32)
+    depth[rng.random((count, 4, 6)).repeat(4, 1).repeat(4, 2) < 0.2] = 0
+    c = rng.normal(0, 0.5, depth.shape).astype(np.float16)
+    return Frames(depth, c, np.zeros(count, int))
+
+
+def made_up_teacher():
+    """A network that answers to all of its inputs, whatever they mean."""
+    leaves, tree = jax.tree.flatten(train.init_params(TINY, jax.random.key(0)))
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    pairs = zip(leaves, keys, strict=True)
+    return jax.tree.unflatten(tree, [leaf + 0.1 * jax.random.normal(key, leaf.shape) for leaf, key in pairs])
+
+
+def test_halvings_end_at_the_samplers_evaluations():
+    def rounds(start: int, end: int) -> list[int]:
+        return distil.rounds(dataclasses.replace(DISTILLED, distil_from=start, sample_steps=end))
+
+    assert (rounds(8, 4), rounds(8, 1), rounds(64, 4)) == ([4], [4, 2, 1], [32, 16, 8, 4])
+    for start, end in ((8, 3), (8, 8), (12, 4), (4, 8)):
+        with pytest.raises(UserError, match=f"ddg.distil_from is {start} and ddg.sample_steps {end}"):
+            rounds(start, end)
+
+
+def test_the_teacher_visits_the_students_steps_and_those_between():
+    path = distil.teacher_path(1000, 4, np.array([0, 1, 3]))
+    assert path.tolist() == [[999, 749, 249], [874, 624, 124], [749, 499, -1]]
+    student = diffusion.timesteps(1000, 4)
+    k, _, end = distil.teacher_path(1000, 4, np.arange(4))
+    np.testing.assert_array_equal(k, student)
+    np.testing.assert_array_equal(end, diffusion.previous_steps(student))
+
+
+def test_one_step_to_the_target_ends_where_the_teacher_does():
+    made = diffusion.make_schedule("cosine", 1000)
+    x_k, x_end = jax.random.normal(jax.random.key(0), (2, 3, 4, 5))
+    k, end = jnp.array([899, 499, 249]), jnp.array([749, 249, -1])
+    x_0 = distil.one_step_target(made, x_k, k, x_end, end)
+    eps = diffusion.eps_from_x_0(made, x_k, k, x_0)
+    np.testing.assert_allclose(diffusion.ddim_step(made, x_k, k, end, eps, None), x_end, atol=2e-5)
+    np.testing.assert_allclose(x_0[2], x_end[2], atol=1e-6)  # the last step ends at x_0 itself
+
+
+@pytest.fixture(scope="module")
+def teacher():
+    return jax.tree.map(np.asarray, made_up_teacher())
+
+
+@pytest.fixture(scope="module")
+def directory(teacher, tmp_path_factory):
+    """Where a distillation to one evaluation left its files."""
+    directory = tmp_path_factory.mktemp("distil")
+    progress = Progress(directory, quiet=True)
+    distil.distil(DISTILLED, teacher, pictures(), directory, 0, progress)
+    progress.close()
+    return directory
+
+
+def samples(config: DDGConfig, params, steps: int) -> np.ndarray:
+    generator = sample.Generator(dataclasses.replace(config, sample_steps=steps), params, make_prior(config))
+    return sample.predict(jax.random.key(7), generator, pictures().prior[:8])
+
+
+def test_students_of_few_evaluations_follow_the_teacher_of_many(teacher, directory):
+    wanted = samples(TINY, teacher, 4)
+    for count in (2, 1):
+        student = artifacts.load_params(directory / distil.params_file(count))
+        mine = np.mean((samples(DISTILLED, student, count) - wanted) ** 2)
+        plain = np.mean((samples(TINY, teacher, count) - wanted) ** 2)
+        assert mine < 0.5 * plain, (count, mine, plain)
+
+
+def test_every_round_leaves_a_curve(directory):
+    curves = read_curves(directory)
+    for count in (2, 1):
+        steps, losses = zip(*curves[f"distil_{count}/loss"], strict=True)
+        assert steps == (10, 20, 30, 40, 50, 60)
+        assert np.isfinite(losses).all() and np.mean(losses[-2:]) < losses[0]
+    assert any((directory / "tb").iterdir())
+
+
+def test_resume_equals_an_uninterrupted_distillation(teacher, directory, tmp_path):
+    class Stop(Exception):
+        pass
+
+    class Interrupted(Progress):
+        """Stops in the middle of the second round."""
+
+        def scalars(self, step, **values):
+            if "distil_1/loss" in values and step == 40:
+                raise Stop
+
+    with pytest.raises(Stop):
+        distil.distil(DISTILLED, teacher, pictures(), tmp_path, 0, Interrupted(quiet=True))
+    assert (tmp_path / distil.params_file(2)).exists() and not (tmp_path / distil.params_file(1)).exists()
+    before = (tmp_path / distil.params_file(2)).stat().st_mtime_ns
+    distil.distil(DISTILLED, teacher, pictures(), tmp_path, 0, Progress(quiet=True))
+    assert (tmp_path / distil.params_file(2)).stat().st_mtime_ns == before
+    for count in (2, 1):
+        name = distil.params_file(count)
+        assert (tmp_path / name).read_bytes() == (directory / name).read_bytes()
+
+
+def test_a_student_runs_with_its_own_evaluations_only(directory):
+    student = artifacts.load_params(directory / distil.params_file(1))
+    generator = sample.Generator(DISTILLED, student, make_prior(DISTILLED))
+    with pytest.raises(UserError, match="distilled to 1 evaluations, not 4"):
+        sample.predict(jax.random.key(0), generator, pictures().prior[:2], steps=4)

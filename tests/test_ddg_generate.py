@@ -1,0 +1,242 @@
+"""The batch job over a demo store: equal to episode by episode, after a kill, and on eight devices."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from ddg_jax import generate, sample, train
+from ddg_jax.prior import make_prior
+from ddgrasp import artifacts, contract
+from ddgrasp.config import Config, DDGConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from demos.store import EpisodeStore
+
+ROOT = Path(__file__).parents[1]
+CONFIG = Config(
+    preset="test",
+    ddg=DDGConfig(
+        height_px=16,
+        width_px=24,
+        widths=(8, 8),
+        blocks=(0, 1),
+        attention_heads=1,
+        diffusion_steps=50,
+        sample_steps=2,
+        sample_batch=4,
+        noise_threshold=-0.02,
+    ),
+)
+LENGTHS = 4 * (5, 3, 9, 1, 7, 6, 2, 8)
+"""Frames per episode: none fills the batch of four."""
+
+
+def made_up_params(config: DDGConfig):
+    """Parameters whose output is noise around the threshold, so that holes depend on every input."""
+    params = train.init_params(config, jax.random.key(0))
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    noisy = [leaf + 0.1 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)]
+    return jax.tree.unflatten(tree, noisy)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run directory with a generator and demos, finished."""
+    directory = tmp_path_factory.mktemp("run")
+    artifacts.save_params(directory / "ddg" / sample.PARAMS_FILE, made_up_params(CONFIG.ddg))
+    artifacts.finish(directory / "ddg", "ddg", CONFIG, seconds=1, metrics={})
+    rng = np.random.default_rng(0)
+    store = EpisodeStore(directory / "demos" / "episodes.zarr", create=True)
+    for length in LENGTHS:
+        depth = rng.integers(700, 1500, (length, 32, 48)).astype(np.uint16)
+        store.append({"depth_mm": depth}, {"object": np.int64(0)})
+    artifacts.finish(directory / "demos", "demos", CONFIG, seconds=1, metrics={})
+    return directory
+
+
+def clean_episodes(run) -> list[np.ndarray]:
+    store = EpisodeStore(run / "demos" / "episodes.zarr")
+    return np.split(store.steps("depth_mm"), store.ends[:-1])
+
+
+def noisy_store(directory: Path) -> EpisodeStore:
+    return EpisodeStore(directory / "noisy" / generate.STORE)
+
+
+def job(run: Path, out: Path, *extra: str, devices: int = 1) -> subprocess.Popen:
+    command = [sys.executable, "-m", "ddgrasp.cli", "ddg", "generate", "--out", str(out), "--seed", "3"]
+    command += ["--model", str(run / "ddg"), "--demos", str(run / "demos"), *extra]
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    return subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+    )
+
+
+def finish(process: subprocess.Popen) -> str:
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    return output
+
+
+@pytest.fixture(scope="module")
+def straight(run, tmp_path_factory):
+    """(directory of an uninterrupted job, what it printed)."""
+    out = tmp_path_factory.mktemp("straight")
+    return out, finish(job(run, out))
+
+
+def test_the_stream_equals_one_episode_at_a_time(run, straight):
+    out, printed = straight
+    store, generator = noisy_store(out), sample.Generator.load(run / "ddg")
+    assert np.diff(store.ends, prepend=0).tolist() == list(LENGTHS)
+    made = np.split(store.steps("depth_mm"), store.ends[:-1])
+    differing = 0
+    for number, (noisy, clean) in enumerate(zip(made, clean_episodes(run), strict=True)):
+        alone = sample.generate(
+            jax.random.key(3), generator, clean.astype(np.float32) * np.float32(0.001), episode=number
+        )
+        differing += np.sum(np.round(alone.depth_m * 1000).astype(np.uint16) != noisy)
+        assert np.array_equal(noisy[noisy > 0], clean[noisy > 0])
+    everything = store.steps("depth_mm")
+    assert 0.1 < np.mean(everything == 0) < 0.9
+    assert differing < 1e-3 * everything.size
+    metrics = artifacts.read_manifest(out / "noisy").metrics
+    assert (metrics["episodes"], metrics["frames"]) == (32, 164)
+    assert metrics["invalid_fraction"] == pytest.approx(np.mean(everything == 0))
+    assert printed.startswith("32 episodes, 164 frames, ")
+
+
+def test_a_killed_job_resumes_to_the_same_bits(run, straight, tmp_path):
+    process = job(run, tmp_path)
+    deadline = time.monotonic() + 300
+    while process.poll() is None and not _episodes(tmp_path):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert 0 < _episodes(tmp_path) < len(LENGTHS)
+    finish(job(run, tmp_path, "--resume"))
+    np.testing.assert_array_equal(noisy_store(tmp_path).ends, noisy_store(straight[0]).ends)
+    np.testing.assert_array_equal(
+        noisy_store(tmp_path).steps("depth_mm"), noisy_store(straight[0]).steps("depth_mm")
+    )
+
+
+def _episodes(out: Path) -> int:
+    path = out / "noisy" / generate.STORE
+    return len(EpisodeStore(path)) if (path / "meta" / "zarr.json").exists() else 0
+
+
+def test_resuming_anywhere_computes_the_same_batches(run, straight):
+    generator, clean = sample.Generator.load(run / "ddg"), clean_episodes(run)
+    opened = []
+
+    def read(i: int) -> generate.Clip:
+        opened.append(i)
+        return generate.Clip(i, clean[i])
+
+    store = noisy_store(straight[0])
+    expected = np.split(store.steps("depth_mm"), store.ends[:-1])
+    for first in range(0, len(LENGTHS), 3):
+        opened.clear()
+        made = list(generate.noisy_episodes(jax.random.key(3), generator, LENGTHS, read, first))
+        assert len(made) == len(LENGTHS) - first
+        for got, wanted in zip(made, expected[first:], strict=True):
+            np.testing.assert_array_equal(got, wanted)
+        # only the episodes that share a batch with the first one are computed again
+        assert min(opened) >= max(0, first - generator.config.sample_batch)
+
+
+def test_only_the_episodes_of_one_batch_are_open(run):
+    generator, clean = sample.Generator.load(run / "ddg"), clean_episodes(run)
+    opened = 0
+
+    def read(i: int) -> generate.Clip:
+        nonlocal opened
+        opened += 1
+        return generate.Clip(i, clean[i])
+
+    stream = generate.noisy_episodes(jax.random.key(3), generator, LENGTHS, read)
+    for done in range(len(LENGTHS)):
+        next(stream)
+        assert opened - done <= 1 + generator.config.sample_batch
+
+
+def test_eight_devices_make_what_one_makes(run, straight, tmp_path):
+    finish(job(run, tmp_path, devices=8))
+    one, eight = (noisy_store(d).steps("depth_mm") for d in (straight[0], tmp_path))
+    assert np.mean(one != eight) < 1e-3
+    code = f"""
+import numpy as np, jax
+from ddg_jax import sample
+assert jax.local_device_count() == 8
+generator = sample.Generator.load({str(run / "ddg")!r})
+assert sample.batch_size(generator.config) == 32
+c = np.random.default_rng(0).normal(size=(37, 16, 24)).astype(np.float32)
+x = sample.predict(jax.random.key(0), generator, c, episode=np.arange(37) // 4)
+np.save({str(tmp_path / "x.npy")!r}, x)
+"""
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=8"}
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, check=True)
+    c = np.random.default_rng(0).normal(size=(37, 16, 24)).astype(np.float32)
+    x = sample.predict(jax.random.key(0), sample.Generator.load(run / "ddg"), c, episode=np.arange(37) // 4)
+    np.testing.assert_allclose(np.load(tmp_path / "x.npy"), x, atol=2e-4)
+
+
+class Colours:
+    """A prior that needs colour in simulation: c is its red."""
+
+    name, needs_rgb, needs_sim_rgb, source = "colours", True, True, "test"
+
+    def from_recording(self, depth_m, rgb, rng):
+        raise AssertionError("not a recording")
+
+    def from_sim(self, depth_m, rgb):
+        return rgb[..., 0].astype(np.float32) / 255
+
+
+def test_the_stream_hands_colour_to_a_prior_that_needs_it(run):
+    generator = sample.Generator(CONFIG.ddg, made_up_params(CONFIG.ddg), Colours())
+    rng = np.random.default_rng(1)
+    depth = rng.integers(700, 1500, (2, 5, 16, 24)).astype(np.uint16)
+    rgb = rng.integers(0, 256, (2, 5, 16, 24, 3)).astype(np.uint8)
+    key, lengths = jax.random.key(0), (5, 5)
+
+    def holes(colour):
+        clips = [generate.Clip(i, depth[i], colour[i]) for i in range(2)]
+        return np.concatenate(list(generate.noisy_episodes(key, generator, lengths, clips.__getitem__))) == 0
+
+    assert np.mean(holes(rgb) != holes(255 - rgb)) > 0.01
+    np.testing.assert_array_equal(holes(rgb), holes(rgb))
+
+
+def test_wrong_input_is_refused(run, tmp_path, straight):
+    config = dataclasses.replace(CONFIG, ddg=dataclasses.replace(CONFIG.ddg, prior_in_sim="rgb"))
+    assert make_prior(config.ddg).needs_sim_rgb is False  # the built-in prior needs none
+    with pytest.raises(UserError, match="holds no finished artefact"):
+        generate.generate_store(run / "ddg", tmp_path, tmp_path / "noisy", CONFIG, Progress(quiet=True))
+    old = tmp_path / "demos"
+    artifacts.finish(old, "demos", CONFIG, seconds=1, metrics={})
+    text = (old / artifacts.MANIFEST).read_text()
+    changed = text.replace(f'"contract_version": {contract.CONTRACT_VERSION}', '"contract_version": 99')
+    (old / artifacts.MANIFEST).write_text(changed)
+    process = job(run, tmp_path / "out", "--demos", str(old))
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 2 and "contract version 99" in errors and errors.count("\n") == 1
+    again = job(run, straight[0])
+    _, errors = again.communicate(timeout=300)
+    assert again.returncode == 2 and "continue with --resume" in errors
