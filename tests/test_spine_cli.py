@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ddgrasp.commands import CHECKPOINTS, COMMANDS, check_config_values, parse
+from ddgrasp.commands import COMMANDS, parse
+from ddgrasp.commands.checks import CHECKPOINTS, check_config_values
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 
@@ -198,7 +199,7 @@ def test_the_checkpoints_are_those_the_stages_write():
     [
         ("demos", "episodes"), ("demos", "parallel"), ("record", "trajectories"), ("record", "frames"),
         ("evaluation", "teacher_trials"), ("evaluation", "student_trials"), ("evaluation", "rig_trials"),
-        ("student", "batch_size"), ("teacher", "num_envs"), ("ddg", "sample_steps"),
+        ("student", "batch_size"), ("teacher", "unroll_steps"), ("ddg", "sample_steps"),
         ("export", "latency_runs"), ("world", "episode_steps"),
     ],
 )  # fmt: skip

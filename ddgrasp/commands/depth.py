@@ -1,0 +1,99 @@
+"""ddgrasp demos, record, sensors: depth of every kind."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from ddgrasp import contract
+from ddgrasp.commands.base import OneStage
+from ddgrasp.commands.checks import check_count
+from ddgrasp.config import RecordConfig, StereoConfig
+from ddgrasp.errors import UserError
+
+
+@dataclass(frozen=True)
+class DemosCollect(OneStage):
+    """Collect successful teacher episodes with clean depth."""
+
+    stage = "demos"
+
+
+@dataclass(frozen=True)
+class Record(OneStage):
+    """Record RGB-D from the pseudo-real rig, moved by the teacher."""
+
+    stage = "record"
+
+
+@dataclass(frozen=True)
+class RecordImport:
+    """Turn RealSense .bag files or folders of colour and depth pictures into recordings."""
+
+    source: tyro.conf.Positional[Path]
+    """A .bag, a folder of them, a folder with depth/ and color/ (or rgb/), or a folder of such folders."""
+    out: Path = Path("recordings")
+    """Each source becomes a folder in it."""
+    depth_unit_m: float = 0.0
+    """Metres per unit of depth; 0 takes a .bag's own, 0.001 for integer pictures, 1 for floats."""
+    sensor: str = ""
+    """Camera model, for example D455; a .bag names its own."""
+    fx_px: float = 0.0
+    """Focal length of the depth pictures in pixels; 0 if unknown."""
+    baseline_m: float = 0.0
+    """Distance between the imagers; 0 if unknown."""
+    consecutive: bool = False
+    """The pictures follow each other in time (a .bag's do)."""
+
+    def run(self) -> None:
+        from sensors import importers
+
+        if not 0 <= self.depth_unit_m <= 1:
+            raise UserError(f"--depth-unit-m is {self.depth_unit_m}; expected 0 (known) or up to 1 (metres).")
+        known = {"sensor": self.sensor, "fx_px": self.fx_px, "baseline_m": self.baseline_m}
+        meta = {name: value for name, value in known.items() if value}
+        if self.consecutive:
+            meta["consecutive_frames"] = True
+        sources = importers.find_sources(self.source, self.depth_unit_m, meta)
+        print(importers.summary(*importers.import_all(sources, self.out)))
+
+
+@dataclass(frozen=True)
+class SensorsCompare:
+    """Set the rig's stereo camera beside real D4xx cameras: holes, noise, flicker, as table, JSON and PNG."""
+
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    """The rig's camera."""
+    camera_scale: float = 0.25
+    """Size of its picture relative to 1280 x 720."""
+    real: Path | None = None
+    """A recording of a real camera, or a folder of them; none takes the figures measured before."""
+    out: Path = Path()
+    """Where sensors.json and sensors.png go."""
+    scenes: int = 1
+    """Standing scenes per object."""
+    frames: int = 6
+    """Frames per scene."""
+    seed: int = 0
+    """Of the scenes."""
+
+    def run(self) -> None:
+        from ddgrasp.progress import Progress
+        from sensors import compare
+
+        if not 0.1 <= self.camera_scale <= 1.0:
+            raise UserError(f"--camera-scale is {self.camera_scale}; expected 0.1 to 1.")
+        check_count("--scenes", self.scenes)
+        if self.frames < 2:
+            raise UserError(f"--frames is {self.frames}; expected at least 2, for noise over time.")
+        result = compare.compare(
+            RecordConfig(stereo=self.stereo),
+            contract.D455.scaled(self.camera_scale),
+            self.real,
+            per_object=self.scenes,
+            frames=self.frames,
+            seed=self.seed,
+            progress=Progress(name="sensors compare"),
+        )
+        compare.print_tables(result)
+        print(*compare.write(result, self.out), sep="\n")
