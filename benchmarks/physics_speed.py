@@ -30,7 +30,7 @@ BARE_TARGET = 0.6
 PLAYGROUND_BATCHES = (1, 32)
 """Playground gets the better of the two: a large batch spares it overhead, a small one synchronisation. All
 of a batch start from one reset, which takes XLA a minute to compile on two cores."""
-JAX_BATCH = 64
+JAX_BATCH = 8
 TEACHER = "pretrained/teacher"
 """Policy of the rollout: its states are those that training sees, with grasps among them."""
 _SETTLE_UNROLLS = 3
@@ -48,7 +48,7 @@ def playground_rows(config: Config, rounds: int) -> list[Row]:
     contenders = {}
     for name, world, batch, calls in (
         (cpu, config.world, config.teacher.num_envs, 3),
-        (mjx, jax_world, JAX_BATCH, 2),
+        (mjx, jax_world, JAX_BATCH, 1),
     ):
         env = GraspEnv(world)
         start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), batch))
