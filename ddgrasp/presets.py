@@ -133,7 +133,7 @@ LAPTOP = Config(
     ),
     evaluation=EvalConfig(student_trials=60, rig_trials=60),
 )
-"""Everything trained from nothing on two cores (40 minutes on two AMD EPYC cores, 2026-11-21)."""
+"""Everything trained from nothing on two cores (45 minutes on two busy AMD EPYC cores, 2026-11-21)."""
 
 PAPER = Config(
     preset="paper",
