@@ -18,6 +18,7 @@ import numpy as np
 
 from benchmarks import compare
 from ddg_jax.prior import make_prior
+from ddg_jax.representation import channels
 from ddg_jax.sample import PROGRESSIVE, Generator, condition, frame_noise, generate, grafted
 from ddg_jax.train import init_params, predict_noise
 from ddgrasp.config import DDGConfig
@@ -67,15 +68,16 @@ def parts(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
     generator = make_generator(config, params, batch, "ddim", 1)
     depth, number = scenes(config, batch), jnp.arange(batch)
     c = condition(generator, depth, None, one_episode=True)
-    shape = (config.height_px, config.width_px)
-    network = jax.jit(lambda p, x: predict_noise(config, p, x, x, jnp.full(batch, 500)))
+    shape = (config.height_px, config.width_px, channels(config))
+    x = np.zeros((batch, *shape), np.float32)
+    network = jax.jit(lambda p, x, c: predict_noise(config, p, x, c, jnp.full(batch, 500)))
     noise = jax.jit(partial(frame_noise, shape=shape, correlation=config.frame_correlation))
-    on_device = jax.device_put((params, c))
+    on_device = jax.device_put((params, x, c))
     runners = {
         "prior": lambda: condition(generator, depth, None, one_episode=True),
         "noise, twice": lambda: [noise(jax.random.key(i), 0, number).block_until_ready() for i in range(2)],
         "one evaluation": lambda: network(*on_device).block_until_ready(),
-        "grafting": lambda: grafted(config, depth, c),
+        "grafting": lambda: grafted(config, depth, x),
     }
     for run in runners.values():
         run()

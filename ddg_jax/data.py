@@ -4,14 +4,16 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import numpy as np
 
-from ddg_jax import normalise
-from ddg_jax.prior import Prior
+from ddg_jax.prior import Prior, invert
+from ddg_jax.representation import encode
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from sensors.holes import fill_from_background, smooth_surface
 from sensors.recordings import Recording, find_recordings, is_recording
 
 
@@ -19,11 +21,13 @@ from sensors.recordings import Recording, find_recordings, is_recording
 class Frames:
     """Frames of several recordings, one after the other.
 
-    depth_m (N, H, W) float32, 0 = hole; prior (N, H, W) float16; recording (N,) int: which one a frame is
-    from. What could not be used: frames without a valid pixel or damaged, and whole recordings.
+    depth_m (N, H, W) float32, 0 = hole; surface_m (N, H, W) float32, what it would be without the sensor's
+    artefacts, as far as it shows itself (`surfaces`); prior (N, H, W) float16; recording (N,) int: which
+    one a frame is from. What could not be used: frames without a valid pixel or damaged; whole recordings.
     """
 
     depth_m: np.ndarray
+    surface_m: np.ndarray
     prior: np.ndarray
     recording: np.ndarray
     skipped_frames: int = 0
@@ -35,7 +39,11 @@ class Frames:
     def part(self, chosen: slice | np.ndarray) -> "Frames":
         """The chosen frames."""
         return replace(
-            self, depth_m=self.depth_m[chosen], prior=self.prior[chosen], recording=self.recording[chosen]
+            self,
+            depth_m=self.depth_m[chosen],
+            surface_m=self.surface_m[chosen],
+            prior=self.prior[chosen],
+            recording=self.recording[chosen],
         )
 
     @property
@@ -86,7 +94,18 @@ def load_frames(
         )
     if skipped or refused:
         progress.note(f"left out {skipped} frame(s), and {len(refused)} of {len(folders)} recording(s)")
-    return Frames(np.concatenate(depth), np.concatenate(priors), np.concatenate(index), skipped, len(refused))
+    noisy = np.concatenate(depth)
+    return Frames(
+        noisy, surfaces(noisy), np.concatenate(priors), np.concatenate(index), skipped, len(refused)
+    )
+
+
+def surfaces(depth_m: np.ndarray) -> np.ndarray:
+    """Recorded depth (N, H, W) -> the same with holes filled from the background and noise smoothed away."""
+    filled = np.empty_like(depth_m, np.float32)
+    for i, inverse in enumerate(invert(depth_m)):
+        filled[i] = smooth_surface(fill_from_background(inverse))
+    return invert(filled)
 
 
 def _folders(root: Path) -> list[Path]:
@@ -134,7 +153,7 @@ def resize_nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Batch:
-    """x_0 (B, H, W) in diffusion space, c (B, H, W), float32."""
+    """x_0 (B, H, W, C) (see ddg_jax/representation.py), c (B, H, W), float32."""
 
     x_0: np.ndarray
     c: np.ndarray
@@ -148,13 +167,14 @@ def make_batch(frames: Frames, config: DDGConfig, seed: int, step: int) -> Batch
     """
     rng = np.random.default_rng((seed, step))
     chosen = rng.integers(len(frames), size=config.batch_size)
-    depth_m, c = frames.depth_m[chosen], frames.prior[chosen].astype(np.float32)
     flip = rng.random(config.batch_size) < 0.5
-    depth_m[flip], c[flip] = depth_m[flip, ::-1], c[flip, ::-1]
+    depth_m, surface_m, c = (
+        np.where(flip[:, None, None], values[chosen, ::-1], values[chosen])
+        for values in (frames.depth_m, frames.surface_m, frames.prior)
+    )
     scale, shift = rng.uniform(-config.prior_jitter, config.prior_jitter, (2, config.batch_size, 1, 1))
     c = ((1 + scale) * c + shift).astype(np.float32)
-    return Batch(_to_diffusion(depth_m, config), c)
+    return Batch(np.asarray(_encode(config, depth_m, surface_m)), c)
 
 
-def _to_diffusion(depth_m: np.ndarray, config: DDGConfig) -> np.ndarray:
-    return np.asarray(normalise.to_diffusion(depth_m, config.near_m, config.far_m))
+_encode = jax.jit(encode, static_argnums=0)

@@ -88,7 +88,7 @@ def _round(
         # Batches of its own, whatever the fit and the other rounds drew.
         batch = make_batch(frames, config, seed, config.train_steps + count * config.distil_steps + step)
         number = np.random.default_rng((seed, count, step)).integers(count, size=config.batch_size)
-        path = teacher_path(made.steps, count, number)
+        path = teacher_path(made.steps, count, number, config.sample_spacing)
         return distil_step(config, state, teacher, limit, path, batch.x_0, batch.c)
 
     state = run_steps(
@@ -114,7 +114,9 @@ def distil_step(
     x_0: Array,
     c: Array,
 ) -> tuple[TrainState, dict[str, Array]]:
-    """One optimiser step of the student on x_0, c (B, H, W). Pure: its noise comes from `train.step_keys`.
+    """One optimiser step of the student on x_0 (B, H, W, C), c (B, H, W).
+
+    Pure: its noise comes from `train.step_keys`.
 
     The student's error in x_0 weighs clip(SNR, 1, 5) (eq. 9 there, with a cap).
 
@@ -139,7 +141,7 @@ def distil_step(
 
     def loss_of(params: Params) -> Array:
         error = (target - predict_clean(config, params, x_k, c, k)) ** 2
-        return jnp.mean(weight * jnp.mean(error, axis=(1, 2)))
+        return jnp.mean(weight * jnp.mean(error, axis=(1, 2, 3)))
 
     loss, grads = jax.value_and_grad(loss_of)(state.params)
     optimizer = make_optimizer(config, config.distil_steps, LEARNING_RATE)
@@ -147,12 +149,12 @@ def distil_step(
     return state, {"loss": loss, "grad_norm": optax.global_norm(grads)}
 
 
-def teacher_path(steps: int, count: int, number: np.ndarray) -> np.ndarray:
+def teacher_path(steps: int, count: int, number: np.ndarray, spacing: str) -> np.ndarray:
     """(3, B) int32: where the teacher starts, passes and ends during step `number` (B,) of the student.
 
     steps: of the forward process; count: the student's, half of the teacher's.
     """
-    path = np.append(diffusion.timesteps(steps, 2 * count, "trailing"), -1).astype(np.int32)
+    path = np.append(diffusion.timesteps(steps, 2 * count, spacing), -1).astype(np.int32)
     return np.stack([path[2 * number + ahead] for ahead in range(3)])
 
 

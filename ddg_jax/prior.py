@@ -5,7 +5,8 @@ weights). Any such source fits the `Prior` protocol; the built-in one needs no n
 inverse depth, from simulation directly, from recordings after filling the holes. Filling must not betray
 where the holes were, or the generator would look for traces of filling that clean simulated depth never has.
 Three things hide them: filled pixels take the background's depth of their own row (the true surface behind an
-occlusion shadow), c is blurred, and some frames are filled under decoy holes as well.
+occlusion shadow), c is smoothed (which hides the noise of recorded surfaces too), and some frames are filled
+under decoy holes as well.
 """
 
 from typing import Protocol
@@ -15,7 +16,7 @@ import numpy as np
 
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import unknown_name
-from sensors.holes import fill_from_background
+from sensors.holes import fill_from_background, smooth_surface
 
 C_LIMIT = 2.5
 """|c| never exceeds this."""
@@ -71,16 +72,18 @@ class InverseDepthPrior:
         for t in np.flatnonzero(rng.random(len(inverse)) < self.decoy_share):
             decoy = decoy_holes(holes[rng.integers(len(holes))], rng)
             filled[t] = fill_from_background(np.where(decoy, 0, inverse[t]))
-        return normalise(self._blurred(smooth_in_time(filled)))
+        return normalise(self._smoothed(smooth_in_time(filled)))
 
     def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None = None) -> np.ndarray:
         """See `Prior`."""
-        return normalise(self._blurred(invert(depth_m)))
+        return normalise(self._smoothed(invert(depth_m)))
 
-    def _blurred(self, inverse: np.ndarray) -> np.ndarray:
-        if self.blur_px <= 0:
-            return inverse
-        return np.stack([cv2.GaussianBlur(frame, (0, 0), self.blur_px) for frame in inverse])
+    def _smoothed(self, inverse: np.ndarray) -> np.ndarray:
+        """The surface, blurred. Recorded and simulated depth pass the same filters."""
+        smooth = [smooth_surface(frame) for frame in inverse]
+        if self.blur_px > 0:
+            smooth = [cv2.GaussianBlur(frame, (0, 0), self.blur_px) for frame in smooth]
+        return np.stack(smooth)
 
 
 def make_prior(config: DDGConfig) -> Prior:

@@ -13,12 +13,12 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.typing import ArrayLike
 
-from ddg_jax import normalise
 from ddg_jax import schedule as diffusion
 from ddg_jax.distil import X_LIMIT, params_file
-from ddg_jax.graft import artefact_mask, graft_mask
+from ddg_jax.graft import graft
 from ddg_jax.loop import Params
 from ddg_jax.prior import C_LIMIT, Prior, make_prior
+from ddg_jax.representation import channels, decode
 from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
@@ -82,9 +82,9 @@ def _init_shapes(config: DDGConfig) -> Any:
 
 
 def frame_noise(
-    key: Array, episode: Array, frame: Array, shape: tuple[int, int], correlation: float
+    key: Array, episode: Array, frame: Array, shape: tuple[int, ...], correlation: float
 ) -> Array:
-    """Standard normal noise (B, H, W): sqrt(r) g_episode + sqrt(1 - r) g_frame, r = `correlation`.
+    """Standard normal noise (B, *shape): sqrt(r) g_episode + sqrt(1 - r) g_frame, r = `correlation`.
 
     Frames of one episode share g_episode, so holes stay where they are between frames, as on a camera; every
     frame's noise depends on (key, episode, frame) alone, however the frames are batched.
@@ -110,7 +110,7 @@ def frame_noise(
 def sample(
     config: DDGConfig, key: Array, params: Params, c: Array, episode: Array, frame: Array, *, steps: int
 ) -> Array:
-    """Generated maps in diffusion space (see ddg_jax/normalise.py), (B, H, W) float32.
+    """Generated maps x (see ddg_jax/representation.py), (B, H, W, C) float32.
 
     Args:
       key: the whole data set's key; c: (B, H, W); episode, frame: see `frame_noise`.
@@ -124,16 +124,17 @@ def sample(
             "for those, or sampler ddim."
         )
     made = config_schedule(config)
-    visited = diffusion.timesteps(made.steps, steps, "trailing")
+    visited = diffusion.timesteps(made.steps, steps, config.sample_spacing)
+    size = c.shape[1], c.shape[2]
     noise = partial(
         frame_noise,
         episode=episode,
         frame=frame,
-        shape=(c.shape[1], c.shape[2]),
+        shape=(*size, channels(config)),
         correlation=config.frame_correlation,
     )
     prior_key, start_key, step_key = jax.random.split(key, 3)
-    c = c + config.prior_noise * noise(prior_key)
+    c = c + config.prior_noise * noise(prior_key, shape=size)
 
     def body(x: Array, now: tuple[Array, Array]) -> tuple[Array, None]:
         k, previous = now
@@ -157,11 +158,12 @@ def sample(
 @dataclass(frozen=True)
 class Generated:
     """depth_m: the result, grafted (paper III-B2). predicted_m: the generator's own map. Both (B, H, W)
-    float32.
+    float32, 0 = hole. mask (B, H, W) bool: M, the artefacts that were grafted.
     """
 
     depth_m: np.ndarray
     predicted_m: np.ndarray
+    mask: np.ndarray
 
 
 def generate(
@@ -208,11 +210,16 @@ def condition(
 
 
 def grafted(config: DDGConfig, depth_m: np.ndarray, x: np.ndarray) -> Generated:
-    """Maps x (B, h, w) of `predict` on clean depth_m (B, H, W)."""
-    mask = np.asarray(artefact_mask(x, config.noise_threshold))
-    predicted = np.asarray(normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold))
-    mask, predicted = (_at_size(a, depth_m.shape[1:]) for a in (mask, predicted))
-    return Generated(np.asarray(graft_mask(depth_m, predicted, mask), np.float32), predicted)
+    """Maps x (B, h, w, C) of `predict` on clean depth_m (B, H, W)."""
+    planes = np.moveaxis(x, -1, 0)
+    sized = np.stack([_at_size(plane, depth_m.shape[1:]) for plane in planes], axis=-1)
+    return Generated(*map(np.asarray, _graft(config, np.asarray(depth_m, np.float32), sized)))
+
+
+@partial(jax.jit, static_argnums=0)
+def _graft(config: DDGConfig, depth_m: Array, x: Array) -> tuple[Array, Array, Array]:
+    predicted = decode(config, x, depth_m)
+    return graft(depth_m, predicted.depth_m, predicted.mask), predicted.depth_m, predicted.mask
 
 
 def batch_size(config: DDGConfig) -> int:
@@ -229,7 +236,7 @@ def predict(
     frame: np.ndarray | None = None,
     steps: int | None = None,
 ) -> np.ndarray:
-    """Maps in diffusion space for priors c (B, H, W), in batches of one compiled size, split over this
+    """Maps x (B, H, W, C) for priors c (B, H, W), in batches of one compiled size, split over this
     process's devices. Arguments of `generate`.
     """
     config, size = generator.config, batch_size(generator.config)

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 
 from ddgrasp.errors import UserError, unknown_name
 
-SPACINGS = ("leading", "trailing", "linspace")
+SPACINGS = ("leading", "trailing", "linspace", "quadratic")
 COSINE_OFFSET = 0.008
 """s of Nichol & Dhariwal, eq. 17."""
 MAX_BETA = 0.999
@@ -79,7 +79,8 @@ def timesteps(steps: int, count: int, spacing: str = "trailing") -> np.ndarray:
     """`count` of the steps K-1..0 that a few-step sampler visits, descending, (count,) int32.
 
     "leading" ends at 0 and starts short of K-1; "trailing" starts at K-1, where x is pure noise, and ends
-    short of 0; "linspace" has both ends (Lin et al. 2024, table 2).
+    short of 0; "linspace" has both ends (Lin et al. 2024, table 2). "quadratic" is trailing with steps
+    that grow as a square, so that the last ones are short (Song et al. 2021, appendix D.2).
     """
     if not 1 <= count <= steps:
         raise UserError(f"Sampling steps must lie in 1..{steps} (the schedule's length), not {count}.")
@@ -87,6 +88,9 @@ def timesteps(steps: int, count: int, spacing: str = "trailing") -> np.ndarray:
         visited = (np.arange(count) * (steps // count))[::-1]
     elif spacing == "trailing":
         visited = np.round(steps - np.arange(count) * (steps / count)) - 1
+    elif spacing == "quadratic":
+        left = np.arange(count)[::-1]
+        visited = np.maximum(np.round(steps * ((left + 1) / count) ** 2) - 1, left)
     elif spacing == "linspace":
         visited = np.round(np.linspace(0, steps - 1, count))[::-1]
     else:

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ddg_jax import normalise
-from ddg_jax.graft import artefact_mask, graft_mask
+from ddg_jax.graft import graft
 from ddg_jax.prior import C_LIMIT
+from ddg_jax.representation import decode
 from ddg_jax.sample import Generator, sample
 from ddgrasp.config import SensorConfig
 from ddgrasp.contract import CameraProfile
@@ -69,12 +69,9 @@ def learned(generator: Generator) -> Sense:
         c = jnp.clip(c, -C_LIMIT, C_LIMIT)[None]
         first = jnp.zeros(1, jnp.int32)
         x = sample(config, key, generator.params, c, first[0], first, steps=config.sample_steps)[0]
-        threshold = config.noise_threshold
-        predicted = normalise.to_depth(x, config.near_m, config.far_m, threshold)
-        mask, predicted = (
-            jax.image.resize(a, depth_m.shape, "nearest") for a in (artefact_mask(x, threshold), predicted)
-        )
-        return graft_mask(depth_m, predicted, mask)
+        sized = jax.image.resize(x, (*depth_m.shape, x.shape[-1]), "nearest")
+        predicted = decode(config, sized, depth_m)
+        return graft(depth_m, predicted.depth_m, predicted.mask)
 
     return batched(sense_frame)
 

@@ -8,12 +8,11 @@ import cv2
 import jax
 import numpy as np
 
-from ddg_jax import data, normalise
+from ddg_jax import data
 from ddg_jax.distil import distil
-from ddg_jax.graft import artefact_mask, graft_mask
 from ddg_jax.loop import Params
 from ddg_jax.prior import invert, make_prior
-from ddg_jax.sample import PROGRESSIVE, Generator, predict
+from ddg_jax.sample import PROGRESSIVE, Generator, grafted, predict
 from ddg_jax.train import fit
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
@@ -21,7 +20,6 @@ from ddgrasp.config import Config, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from sensors import stats
-from sensors.holes import fill_from_background
 
 STAGE = "ddg"
 SCORED_FRAMES = 180
@@ -103,8 +101,8 @@ def _loaded(config: DDGConfig) -> Params:
     source = Path(config.init_from)
     generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source, sampler="ddim")
     for name in (
-        "height_px", "width_px", "near_m", "far_m", "prior", "space_to_depth", "widths", "blocks",
-        "attention_heads", "diffusion_steps", "schedule", "log_snr_shift",
+        "height_px", "width_px", "representation", "near_m", "far_m", "prior", "space_to_depth", "widths",
+        "blocks", "attention_heads", "diffusion_steps", "schedule", "log_snr_shift",
     ):  # fmt: skip
         there, here = getattr(generator.config, name), getattr(config, name)
         if there != here:
@@ -124,24 +122,25 @@ def _score(generator: Generator, frames: data.Frames, progress: Progress) -> dic
     if progress.directory is not None:
         _write_png(progress.directory / "samples.png", few)
     return {
-        "recorded": hole_statistics(panels["recorded"], frames.recording),
-        "generated": hole_statistics(panels["generated"], frames.recording),
-        "grafted_error_m": _largest_change(panels["clean"], panels["grafted"]),
+        **{
+            name: {
+                **hole_statistics(panels[name], frames.recording),
+                **deviation_statistics(panels[name], frames.surface_m),
+            }
+            for name in ("recorded", "generated")
+        }
     }
 
 
 def _panels(generator: Generator, frames: data.Frames, seed: int) -> dict[str, np.ndarray]:
     """clean (holes filled), recorded, generated and grafted depth in metres, (N, H, W) each."""
-    config = generator.config
     x = predict(jax.random.key(seed), generator, frames.prior, episode=frames.recording, frame=frames.number)
-    generated = normalise.to_depth(x, config.near_m, config.far_m, config.noise_threshold)
-    clean = np.stack([invert(fill_from_background(f)) for f in invert(frames.depth_m)])
-    grafted = graft_mask(clean, generated, artefact_mask(x, config.noise_threshold))
+    made = grafted(generator.config, frames.surface_m, x)
     return {
-        "clean": clean,
+        "clean": frames.surface_m,
         "recorded": frames.depth_m,
-        "generated": np.asarray(generated),
-        "grafted": np.asarray(grafted),
+        "generated": made.predicted_m,
+        "grafted": made.depth_m,
     }
 
 
@@ -168,9 +167,13 @@ def flicker_fraction(valid: np.ndarray, recording: np.ndarray) -> float:
     return float(np.mean((valid[1:] != valid[:-1])[same])) if same.any() else float("nan")
 
 
-def _largest_change(clean: np.ndarray, grafted: np.ndarray) -> float:
-    """Largest |grafted - clean| in metres where grafted is valid: 0 by construction."""
-    return float(np.max(np.abs(np.where(grafted > 0, grafted - clean, 0))))
+def deviation_statistics(depth_m: np.ndarray, surface_m: np.ndarray) -> dict[str, float]:
+    """Median and 99th percentile of |1/d - 1/d_surface| in 1/m, over valid pixels of (N, H, W) metres."""
+    known = (depth_m > 0) & (surface_m > 0)
+    if not known.any():
+        return {"deviation_median_per_m": float("nan"), "deviation_p99_per_m": float("nan")}
+    median, high = np.quantile(np.abs(invert(depth_m) - invert(surface_m))[known], [0.5, 0.99])
+    return {"deviation_median_per_m": float(median), "deviation_p99_per_m": float(high)}
 
 
 def _write_png(path: Path, panels: dict[str, np.ndarray]) -> None:

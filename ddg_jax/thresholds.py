@@ -8,23 +8,25 @@ was made from.
 
 import io
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from ddg_jax import data, normalise
-from ddg_jax.graft import artefact_mask, graft_mask
-from ddg_jax.prior import invert
-from ddg_jax.sample import Generator, predict
+from ddg_jax import data
+from ddg_jax.representation import DEPTH
+from ddg_jax.sample import Generator, grafted, predict
 from ddg_jax.stage import hole_statistics
 from ddgrasp import artifacts
+from ddgrasp.config import DDGConfig
 from ddgrasp.progress import Progress
-from sensors.holes import fill_from_background
 
 THRESHOLDS = tuple(round(-0.9 + 0.1 * i, 1) for i in range(9))
+"""Between holes (-1) and surfaces (0 to 1, representation depth)."""
+WIDE_THRESHOLDS = tuple(round(-0.8 + 0.2 * i, 1) for i in range(9))
+"""Between holes (-1) and surfaces (1, representation deviation)."""
 FILE = "thresholds"
 
 
@@ -41,23 +43,21 @@ class Masked:
     hole_iou: float
     """Generated and recorded holes: intersection over union."""
     valid_error_mm: float
-    """Mean |d_pred - d_clean| where M = 0: what is kept without grafting."""
+    """Mean |d_pred - d_clean| of pixels that are no holes: the error without grafting."""
     valid_error_p99_mm: float
     grafted_error_mm: float
     """Largest |d_final - d_clean| where M = 0: 0 by the paper's equation."""
 
 
-def masked(
-    x: np.ndarray, frames: data.Frames, clean_m: np.ndarray, threshold: float, near_m: float, far_m: float
-) -> Masked:
-    """Statistics of maps x (N, H, W) in diffusion space on clean_m (N, H, W), the scenes of `frames`."""
-    mask = np.asarray(artefact_mask(x, threshold))
-    predicted = np.asarray(normalise.to_depth(x, near_m, far_m, threshold))
-    final = np.asarray(graft_mask(clean_m, predicted, mask))
+def masked(config: DDGConfig, x: np.ndarray, frames: data.Frames, threshold: float) -> Masked:
+    """Statistics of maps x (N, H, W, C) on the surfaces of `frames`."""
+    clean_m = frames.surface_m
+    made = grafted(replace(config, noise_threshold=threshold), clean_m, x)
+    mask = made.predicted_m == 0
     holes = hole_statistics(np.where(mask, 0.0, 1.0), frames.recording)
     recorded = frames.depth_m == 0
     known = ~mask & (clean_m > 0)
-    error_mm = 1000 * np.abs(predicted - clean_m)[known]
+    error_mm = 1000 * np.abs(made.predicted_m - clean_m)[known] if known.any() else np.array([np.nan])
     return Masked(
         threshold,
         holes["invalid_fraction"],
@@ -66,7 +66,7 @@ def masked(
         float(np.sum(mask & recorded) / max(1, np.sum(mask | recorded))),
         float(np.mean(error_mm)),
         float(np.quantile(error_mm, 0.99)),
-        float(1000 * np.max(np.abs(final - clean_m)[~mask], initial=0.0)),
+        float(1000 * np.max(np.abs(made.depth_m - clean_m)[~made.mask], initial=0.0)),
     )
 
 
@@ -81,8 +81,8 @@ def analyse(
     config = generator.config
     frames = data.load_frames(root, config, generator.prior, seed, progress).part(slice(-count, None))
     x = predict(jax.random.key(seed), generator, frames.prior, episode=frames.recording, frame=frames.number)
-    clean_m = np.stack([invert(fill_from_background(frame)) for frame in invert(frames.depth_m)])
-    rows = [masked(x, frames, clean_m, t, config.near_m, config.far_m) for t in THRESHOLDS]
+    thresholds = THRESHOLDS if config.representation == DEPTH else WIDE_THRESHOLDS
+    rows = [masked(config, x, frames, threshold) for threshold in thresholds]
     recorded = hole_statistics(frames.depth_m, frames.recording)
     value = {"recorded": recorded, "used": config.noise_threshold, "thresholds": [asdict(r) for r in rows]}
     artifacts.atomic_write_json(out / f"{FILE}.json", value)

@@ -14,6 +14,7 @@ from jax.typing import DTypeLike
 from ddg_jax import schedule as diffusion
 from ddg_jax.data import Frames, make_batch
 from ddg_jax.loop import Params, TrainState, first_state, run_steps, updated
+from ddg_jax.representation import channels
 from ddg_jax.unet import UNet
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import unknown_name
@@ -45,8 +46,9 @@ def make_optimizer(config: DDGConfig, steps: int, scale: float = 1.0) -> optax.G
 
 def init_params(config: DDGConfig, key: Array) -> Params:
     """Fresh parameters of the network."""
-    picture = jnp.zeros((1, config.height_px, config.width_px))
-    return make_unet(config).init(key, picture, picture, jnp.zeros((1,), jnp.int32))["params"]
+    c = jnp.zeros((1, config.height_px, config.width_px))
+    x = jnp.zeros((*c.shape, channels(config)))
+    return make_unet(config).init(key, x, c, jnp.zeros((1,), jnp.int32))["params"]
 
 
 @partial(jax.jit, static_argnums=0)
@@ -62,13 +64,13 @@ def config_schedule(config: DDGConfig) -> diffusion.Schedule:
 
 
 def predict_clean(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
-    """The clean map x_0 that the network sees in x_k, all (B, H, W); step (B,) int."""
+    """The clean map x_0 (B, H, W, C) that the network sees in x_k; c (B, H, W), step (B,) int."""
     x_0: Any = make_unet(config).apply({"params": params}, x_k, c, step)
     return x_0
 
 
 def predict_noise(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
-    """eps_theta(d_k (+) c, k), (B, H, W).
+    """eps_theta(d_k (+) c, k), (B, H, W, C).
 
     The U-Net's output enters as the clean map that explains x_k, and eps is what remains: depth given c is
     smooth but for its holes, so a small network can draw it, while white noise at full resolution would have
@@ -93,12 +95,12 @@ def loss_weight(config: DDGConfig, step: Array) -> Array:
 
 
 def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Array, eps: Array) -> Array:
-    """mean w_k |eps - eps_theta(d_k (+) c, k)|^2 (paper eq. 4; w_k: `loss_weight`). x_0, c, eps (B, H, W);
-    step (B,) int.
+    """mean w_k |eps - eps_theta(d_k (+) c, k)|^2 (paper eq. 4; w_k: `loss_weight`). x_0, eps (B, H, W, C);
+    c (B, H, W); step (B,) int.
     """
     made = config_schedule(config)
     x_k = diffusion.q_sample(made, x_0, step, eps)
-    error = jnp.mean((eps - predict_noise(config, params, x_k, c, step)) ** 2, axis=(1, 2))
+    error = jnp.mean((eps - predict_noise(config, params, x_k, c, step)) ** 2, axis=(1, 2, 3))
     return jnp.mean(loss_weight(config, step) * error)
 
 
@@ -111,7 +113,7 @@ def step_keys(state: TrainState) -> Array:
 def train_step(
     config: DDGConfig, state: TrainState, x_0: Array, c: Array
 ) -> tuple[TrainState, dict[str, Array]]:
-    """One optimiser step on x_0, c (B, H, W). Pure: its noise comes from `step_keys`."""
+    """One optimiser step on x_0 (B, H, W, C), c (B, H, W). Pure: its noise comes from `step_keys`."""
     eps_key, step_key, prior_key = step_keys(state)
     eps = jax.random.normal(eps_key, x_0.shape)
     k = jax.random.randint(step_key, x_0.shape[:1], 0, config.diffusion_steps)

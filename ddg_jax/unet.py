@@ -91,9 +91,10 @@ class UNet(nn.Module):
 
     @nn.compact
     def __call__(self, x_k: Array, c: Array, step: Array) -> Array:
-        """x_k (B, H, W), c (B, H, W), step (B,) int -> (B, H, W) float32. Any H, W."""
-        height, width = x_k.shape[1:]
-        folded = space_to_depth(self._padded(jnp.stack([x_k, c], axis=-1)), self.factor).astype(self.dtype)
+        """x_k (B, H, W, C), c (B, H, W), step (B,) int -> (B, H, W, C) float32. Any H, W."""
+        height, width, maps = x_k.shape[1:]
+        both = self._padded(jnp.concatenate([x_k, c[..., None]], axis=-1))
+        folded = space_to_depth(both, self.factor).astype(self.dtype)
         time = self._time_embedding(step)
         h, skips = self._encode(nn.Dense(self.widths[0], dtype=self.dtype)(folded), time)
         h = ResBlock(self.widths[-1], self.dtype)(h, time)
@@ -106,11 +107,12 @@ class UNet(nn.Module):
             nn.Dense(2 * self.widths[0], dtype=self.dtype)(time)[:, None, None], 2, axis=-1
         )
         h = nn.silu(h * (1 + scale) + shift)
-        out = nn.Conv(self.factor**2, (3, 3), dtype=self.dtype, kernel_init=nn.initializers.zeros)(h)
-        out = out + nn.Dense(self.factor**2, dtype=self.dtype, kernel_init=nn.initializers.zeros)(
-            folded[..., 1::2]
+        size = maps * self.factor**2
+        out = nn.Conv(size, (3, 3), dtype=self.dtype, kernel_init=nn.initializers.zeros)(h)
+        out = out + nn.Dense(size, dtype=self.dtype, kernel_init=nn.initializers.zeros)(
+            folded[..., maps :: maps + 1]
         )
-        return depth_to_space(out, self.factor)[:, :height, :width, 0].astype(jnp.float32)
+        return depth_to_space(out, self.factor)[:, :height, :width].astype(jnp.float32)
 
     def _padded(self, x: Array) -> Array:
         """Zeros at the bottom and right up to the next multiple of the total stride."""

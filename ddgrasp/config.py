@@ -346,18 +346,24 @@ class RecordConfig:
 class DDGConfig:
     """Diffusion Depth Generator."""
 
-    # --- depth as the diffusion model sees it (ddg_jax/normalise.py) ---
+    # --- depth as the diffusion model sees it (ddg_jax/representation.py) ---
+    representation: str = "deviation"
+    """What the network draws: deviation (holes, and how far the sensor is off the surface) or depth (the
+    paper's: the depth map itself)."""
     height_px: int = 180
     """Rows of the generated map."""
     width_px: int = 320
     """Columns of the generated map."""
     near_m: float = 0.25
-    """Nearest depth that is told apart."""
+    """Nearest depth that is told apart (depth only)."""
     far_m: float = 10.0
-    """Farthest depth that is told apart."""
-    noise_threshold: float = -0.2
-    """The paper's: below it a generated pixel is a hole (holes are -1, surfaces 0 to 1). Lower
-    ones lose small and unsure holes (docs/generator.md)."""
+    """Farthest depth that is told apart (depth only)."""
+    noise_threshold: float = 0.0
+    """The paper's: below it a generated pixel is a hole. Holes are -1, surfaces 1 (depth: 0 to 1, where -0.2
+    is better; docs/generator.md)."""
+    deviation_threshold: float = 0.0005
+    """Smallest deviation of inverse depth, 1/m, that is an artefact and grafted: 1/32 px of disparity for a
+    D455 (deviation only). inf grafts holes alone."""
     # --- geometric prior c (ddg_jax/prior.py) ---
     prior: str = "inverse_depth"
     """Where c comes from: inverse_depth (built in), video_depth_anything (the paper's) or depth_anything_v2.
@@ -421,6 +427,9 @@ class DDGConfig:
     """ddim, ddpm (ancestral) or progressive (distilled to sample_steps evaluations, ddg_jax/distil.py)."""
     sample_steps: int = 4
     """Network evaluations per map."""
+    sample_spacing: str = "quadratic"
+    """Which diffusion steps they visit: trailing (equal steps) or quadratic (short ones at the end, where the
+    noise on surfaces is decided)."""
     distil_from: int = 8
     """Evaluations of the fitted network's DDIM from which distillation starts; sample_steps times a power of
     two."""

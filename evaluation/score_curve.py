@@ -125,6 +125,7 @@ def _frames(config: Config, run_dir: Path, count: int, extra: Path, progress: Pr
     offsets = np.cumsum([0, recorded])[: len(parts)]
     return Frames(
         np.concatenate([part.depth_m for part in parts]),
+        np.concatenate([part.surface_m for part in parts]),
         np.concatenate([part.prior for part in parts]),
         np.concatenate([part.recording + offset for part, offset in zip(parts, offsets, strict=True)]),
     )

@@ -38,7 +38,7 @@ def pictures(count: int = 32) -> Frames:
     depth = rng.uniform(0.5, 2.0, (count, 2, 3)).repeat(8, 1).repeat(8, 2).astype(np.float32)
     depth[rng.random((count, 4, 6)).repeat(4, 1).repeat(4, 2) < 0.2] = 0
     c = rng.normal(0, 0.5, depth.shape).astype(np.float16)
-    return Frames(depth, c, np.zeros(count, int))
+    return Frames(depth, depth, c, np.zeros(count, int))
 
 
 def made_up_teacher():
@@ -60,12 +60,13 @@ def test_halvings_end_at_the_samplers_evaluations():
 
 
 def test_the_teacher_visits_the_students_steps_and_those_between():
-    path = distil.teacher_path(1000, 4, np.array([0, 1, 3]))
+    path = distil.teacher_path(1000, 4, np.array([0, 1, 3]), "trailing")
     assert path.tolist() == [[999, 749, 249], [874, 624, 124], [749, 499, -1]]
-    student = diffusion.timesteps(1000, 4)
-    k, _, end = distil.teacher_path(1000, 4, np.arange(4))
-    np.testing.assert_array_equal(k, student)
-    np.testing.assert_array_equal(end, diffusion.previous_steps(student))
+    for spacing in ("trailing", "quadratic"):
+        student = diffusion.timesteps(1000, 4, spacing)
+        k, _, end = distil.teacher_path(1000, 4, np.arange(4), spacing)
+        np.testing.assert_array_equal(k, student)
+        np.testing.assert_array_equal(end, diffusion.previous_steps(student))
 
 
 def test_one_step_to_the_target_ends_where_the_teacher_does():

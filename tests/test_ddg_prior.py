@@ -90,7 +90,9 @@ def test_frames_and_batches(recordings):
     one, again, other = (data.make_batch(training, config, 7, step) for step in (3, 3, 4))
     np.testing.assert_array_equal(one.x_0, again.x_0)
     assert not np.array_equal(one.c, other.c)
-    assert (one.x_0[:, :, 0] == -1).all() and one.x_0[:, :, 3:].min() > 0
+    holes, deviation = np.moveaxis(one.x_0, -1, 0)
+    assert (holes[:, :, 0] == -1).all() and (holes[:, :, 3:] == 1).all()
+    assert (deviation[holes == -1] == 0).all() and 0 < np.abs(deviation).max() <= 1
     with pytest.raises(UserError, match="record more"):
         frames.part(slice(0, 1)).split(0.1)
     with pytest.raises(UserError, match="inverse_depth"):

@@ -108,6 +108,8 @@ def test_timestep_spacing():
     assert s.timesteps(1000, 5, "trailing").tolist() == [999, 799, 599, 399, 199]
     assert s.timesteps(1000, 5, "leading").tolist() == [800, 600, 400, 200, 0]
     assert s.timesteps(11, 3, "linspace").tolist() == [10, 5, 0]
+    assert s.timesteps(1000, 4, "quadratic").tolist() == [999, 561, 249, 61]
+    assert s.timesteps(10, 8, "quadratic").tolist() == [9, 7, 5, 4, 3, 2, 1, 0]  # none twice, none below 0
     assert s.previous_steps(np.array([800, 0])).tolist() == [0, -1]
     with pytest.raises(UserError, match="trailing"):
         s.timesteps(10, 2, "trailling")

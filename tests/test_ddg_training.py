@@ -40,7 +40,7 @@ def pictures(count: int = 16) -> Frames:
         noisy[i, row : row + 6, column : column + 6] = 0.8
         noisy[i, row : row + 6, column - 4 : column] = 0
     c = np.stack([make_prior(TINY).from_sim(f[None], None)[0] for f in clean]).astype(np.float16)
-    return Frames(noisy, c, np.zeros(count, int))
+    return Frames(noisy, clean, c, np.zeros(count, int))
 
 
 def test_resume_equals_an_uninterrupted_run(tmp_path):
@@ -89,9 +89,10 @@ def test_generator_learns_where_the_sensor_loses_pixels(fitted, scene):
     shadow[:, 5:11, 7:11] = True
     assert holes[shadow].mean() > 0.8, holes[shadow].mean()
     assert holes[~shadow].mean() < 0.05, holes[~shadow].mean()
-    assert np.array_equal(made.depth_m[~holes], scene[~holes])
+    assert made.depth_m[~made.mask].tobytes() == scene[~made.mask].tobytes()
     np.testing.assert_array_equal(holes, made.predicted_m == 0)
-    assert abs(np.median(made.predicted_m[:, :3]) - 2.0) < 0.3
+    # this sensor loses pixels and errs nowhere else
+    assert np.median(np.abs(1 / made.predicted_m[~holes] - 1 / scene[~holes])) < 0.002
 
 
 def test_generation_does_not_depend_on_batching(fitted, scene):

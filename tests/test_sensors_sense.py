@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ddg_jax.prior import make_prior
+from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator
 from ddg_jax.sensor import SENSORS, learned, make_sensor
 from ddg_jax.train import init_params
@@ -56,9 +57,9 @@ def test_one_api(sensors, name):
     # Invalid stays invalid; what is valid is in metres, and mostly near the truth.
     assert not noisy[depth == 0].any()
     valid = (noisy > 0) & (depth > 0)
-    if name == "learned":  # not fitted: its holes mean nothing; grafting must leave the rest as it was
+    if name == "learned":  # not fitted: its artefacts mean nothing, but what is valid is as metric as any
         assert 0.02 < valid.mean() < 0.96
-        np.testing.assert_array_equal(noisy[valid], depth[valid])
+        assert np.abs(1 / noisy[valid] - 1 / depth[valid]).max() <= LIMIT_PER_M * 1.001
     else:
         assert valid.mean() > 0.6
         assert np.median(np.abs(noisy - depth)[valid]) < 0.02

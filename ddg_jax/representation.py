@@ -1,0 +1,97 @@
+"""Depth maps <-> the arrays x (..., C) in which the diffusion model works (`ddg.representation`).
+
+deviation, C = 2: what the sensor did to the surface that it looked at.
+    x[0] = -1 hole, +1 valid
+    x[1] = asinh(delta / s) / asinh(L / s),  delta = 1/d - 1/d_surface clipped to [-L, L],  0 in holes
+  A stereo camera's errors are alike in disparity, so in inverse depth; asinh spreads the many errors of a
+  thousandth of a pixel and keeps the few large ones at edges. A generated map is metric wherever the surface
+  is, whatever the network does.
+
+depth, C = 1: the depth map itself, as the paper's generator draws it.
+    x = -1                                                        hole (depth 0)
+    x = (1/d - 1/far) / (1/near - 1/far), clipped to [0, 1]       valid: 0 from far_m on, 1 up to near_m
+  The network has to draw the geometry anew from a prior that knows neither scale nor offset.
+
+`noise_threshold` (the paper's, III-B2) separates holes from surfaces in the first channel of either.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from ddgrasp.config import DDGConfig
+from ddgrasp.errors import unknown_name
+
+DEPTH, DEVIATION = REPRESENTATIONS = ("depth", "deviation")
+HOLE, VALID = -1.0, 1.0
+LIMIT_PER_M = 0.06
+"""L: larger deviations of inverse depth (a pixel of disparity for a D455 at 320 px) are clipped."""
+KNEE_PER_M = 0.002
+"""s: up to here asinh is nearly linear (four of a D455's disparity steps)."""
+FARTHEST_M = 50.0
+"""No generated depth is farther: millimetres must fit 16 bits."""
+
+
+class Decoded(NamedTuple):
+    """What x says: depth_m, the generator's own map, 0 in holes; mask M, where that is an artefact."""
+
+    depth_m: Array
+    mask: Array
+
+
+def channels(config: DDGConfig) -> int:
+    """C, the length of x's last axis; UserError for an unknown representation."""
+    if config.representation not in REPRESENTATIONS:
+        raise unknown_name("ddg.representation", config.representation, REPRESENTATIONS)
+    return 2 if config.representation == DEVIATION else 1
+
+
+def encode(config: DDGConfig, depth_m: ArrayLike, surface_m: ArrayLike) -> Array:
+    """Measured planar metres (0 = hole) of surfaces at `surface_m`, same shape -> x (..., C) float32."""
+    depth_m = jnp.asarray(depth_m)
+    if config.representation == DEPTH:
+        return _depth_to_x(depth_m, config)[..., None]
+    valid = depth_m > 0
+    deviation = jnp.where(valid, _inverse(depth_m) - _inverse(surface_m), 0.0)
+    x = jnp.stack([jnp.where(valid, VALID, HOLE), _companded(deviation)], axis=-1)
+    return x.astype(jnp.float32)
+
+
+def decode(config: DDGConfig, x: ArrayLike, surface_m: ArrayLike) -> Decoded:
+    """x (..., C) on surfaces at `surface_m` (...) metres, 0 = nothing there -> depth and artefact mask (...).
+
+    An artefact is a hole or, in `deviation`, a deviation of `deviation_threshold` or more.
+    """
+    x, surface_m = jnp.asarray(x), jnp.asarray(surface_m)
+    hole = x[..., 0] < config.noise_threshold
+    if config.representation == DEPTH:
+        return Decoded(jnp.where(hole, 0.0, _x_to_depth(x[..., 0], config)).astype(jnp.float32), hole)
+    deviation = _expanded(x[..., 1])
+    inverse = jnp.maximum(_inverse(surface_m) + deviation, 1 / FARTHEST_M)
+    depth_m = jnp.where(hole | (surface_m <= 0), 0.0, 1 / inverse).astype(jnp.float32)
+    return Decoded(depth_m, hole | (jnp.abs(deviation) >= config.deviation_threshold))
+
+
+def _inverse(depth_m: ArrayLike) -> Array:
+    return 1 / jnp.maximum(depth_m, 1e-3)
+
+
+def _companded(deviation: Array) -> Array:
+    limited = jnp.clip(deviation, -LIMIT_PER_M, LIMIT_PER_M)
+    return jnp.arcsinh(limited / KNEE_PER_M) / jnp.arcsinh(LIMIT_PER_M / KNEE_PER_M)
+
+
+def _expanded(x: Array) -> Array:
+    return KNEE_PER_M * jnp.sinh(jnp.clip(x, -1, 1) * jnp.arcsinh(LIMIT_PER_M / KNEE_PER_M))
+
+
+def _depth_to_x(depth_m: Array, config: DDGConfig) -> Array:
+    inverse = 1 / jnp.maximum(depth_m, 1e-6)
+    x = (inverse - 1 / config.far_m) / (1 / config.near_m - 1 / config.far_m)
+    return jnp.where(depth_m > 0, jnp.clip(x, 0, 1), HOLE).astype(jnp.float32)
+
+
+def _x_to_depth(x: Array, config: DDGConfig) -> Array:
+    return 1 / (1 / config.far_m + jnp.clip(x, 0, 1) * (1 / config.near_m - 1 / config.far_m))
