@@ -266,6 +266,10 @@ class StereoConfig:
     """Window of that residual."""
     refine_window_px: int = 9
     """Window of the sub-pixel step."""
+    flat_window_px: int = 9
+    """Window of the filter that smooths flat surfaces after it."""
+    flat_noise_px: float = 0.08
+    """Disparity noise that filter takes away, standard deviation: larger relief stays. 0 switches it off."""
     subpixel_steps: int = 32
     """Disparity is reported in 1/32 of a pixel, as D4xx cameras do."""
 

@@ -19,6 +19,7 @@ import numpy as np
 from ddgrasp.config import StereoConfig
 from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
 from mjx_envs.camera import Buffers, Camera
+from sensors import planes
 from sensors.materials import NEAR_INFRARED_RGB, Material
 
 Render = Callable[[Camera], Buffers]
@@ -134,6 +135,7 @@ class ActiveStereo:
         left, right = _without_mean(left), _without_mean(right)
         fine, residual = _refine(left, right, coarse, self.config)
         valid &= (residual < self.config.residual_limit) & (contrast > self.config.contrast_limit)
+        fine = flatten(fine, valid, self.config)
         steps = self.config.subpixel_steps
         return np.where(valid, np.rint(fine * steps) / steps, 0).astype(np.float32)
 
@@ -365,3 +367,19 @@ def _refine(
     energy = 0.5 * cv2.blur(left * left + matched * matched, window) + 1e-3
     residual = np.sqrt(cv2.blur(difference * difference, window) / energy)
     return np.clip(fine, coarse_px - 0.5, coarse_px + 0.5), residual
+
+
+def flatten(fine_px: np.ndarray, valid: np.ndarray, config: StereoConfig) -> np.ndarray:
+    """(H, W) disparity, noise on flat surfaces averaged away over a window, edges and relief kept.
+
+    Lee's filter (1980) about the window's plane instead of its mean: with v the variance of the window from
+    its plane and n that of the noise, a pixel keeps max(0, 1 - n / v) of its distance from the plane. For the
+    fit, small holes are filled with the mean around them; large ones leave v, and so the pixel, as it is.
+    """
+    window = (config.flat_window_px, config.flat_window_px)
+    share = cv2.blur(valid.astype(np.float32), window)
+    around = cv2.blur(np.where(valid, fine_px, 0), window) / np.maximum(share, 1e-3)
+    whole = np.where(valid, fine_px, around)
+    variance, plane = planes.residual_variance(whole, config.flat_window_px)
+    keep = np.maximum(1.0 - config.flat_noise_px**2 / np.maximum(variance, 1e-9), 0.0)
+    return (plane + keep * (whole - plane)).astype(np.float32)
