@@ -262,6 +262,9 @@ class StereoConfig:
     contrast_limit: float = 8.0
     """Smallest local contrast of the left picture, grey levels of 255 (a D4xx's texture threshold): darker
     surfaces have no depth."""
+    dark_limit: float = 12.0
+    """Grey levels of 255: darker surfaces have no signal. Measured over 3 px, so that the bright surroundings
+    of a small dark object do not count, as they do for the contrast."""
     residual_window_px: int = 3
     """Window of that residual."""
     refine_window_px: int = 9

@@ -205,7 +205,10 @@ def temporal_deviation_px(stream: Stream) -> Curve:
 
 def _plane_deviation(disparity_px: np.ndarray) -> np.ndarray:
     """(H, W) standard deviation from the least-squares plane of each window."""
-    variance, _ = planes.residual_variance(np.nan_to_num(disparity_px), PLANE_WINDOW_PX)
+    # The border as in the published figures.
+    variance, _ = planes.residual_variance(
+        np.nan_to_num(disparity_px), PLANE_WINDOW_PX, cv2.BORDER_REFLECT_101
+    )
     count = PLANE_WINDOW_PX**2
     return np.sqrt(variance * count / (count - 3))
 

@@ -14,14 +14,16 @@ def slopes(picture: np.ndarray, window_px: int) -> tuple[tuple[np.ndarray, np.nd
     return (along_u, along_v), cv2.sepFilter2D(picture, -1, flat, flat, borderType=cv2.BORDER_REPLICATE)
 
 
-def residual_variance(picture: np.ndarray, window_px: int) -> tuple[np.ndarray, np.ndarray]:
+def residual_variance(
+    picture: np.ndarray, window_px: int, border: int = cv2.BORDER_REPLICATE
+) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) mean squared distance of each window's pixels from its plane; (H, W) the plane at its centre.
 
-    In double precision: the variance is a small difference of squares. Within half a window of the picture's
-    border it is rough.
+    In double precision: the variance is a small difference of squares. `border` is how OpenCV continues
+    the picture for the squares.
     """
     picture = picture.astype(np.float64)
     (along_u, along_v), mean = slopes(picture, window_px)
-    square = cv2.boxFilter(picture * picture, -1, (window_px, window_px))
+    square = cv2.boxFilter(picture * picture, -1, (window_px, window_px), borderType=border)
     spread = (window_px**2 - 1) / 12.0
     return np.maximum(square - mean**2 - spread * (along_u**2 + along_v**2), 0.0), mean

@@ -99,6 +99,35 @@ def test_dark_surfaces_lose_pixels():
     assert lost(0.5) < 0.1 and lost(0.004) > 0.5
 
 
+def lost_of_a_small_square(material: Material) -> float:
+    """Share without depth of a 3 cm square (about 10 px) on a textured wall, its outline included."""
+    render = wall(0.72, 0.7, half_m=0.015)
+    depth_mm = sense(render, materials={0: Material(0.5, texture=0.35), 1: material})
+    camera = ActiveStereo(StereoConfig(), PROFILE).camera(T_WORLD_CAM)
+    return float(np.mean(depth_mm[render(camera).segmentation == 1] == 0))
+
+
+def test_small_dark_objects_fail_and_bright_ones_do_not():
+    """The bright surroundings within the contrast's window do not stand in for the object's own light."""
+    assert lost_of_a_small_square(Material(0.5)) < 0.05
+    assert lost_of_a_small_square(Material(0.015)) > 0.3
+
+
+def test_translucent_bodies_return_light_without_dots():
+    def picture(translucency: float) -> np.ndarray:
+        camera = ActiveStereo(StereoConfig(), PROFILE)
+        materials = {0: Material(0.5, specular=0.0, translucency=translucency)}
+        left, _ = camera.infrared(wall(0.8), T_WORLD_CAM, np.random.default_rng(0), materials)
+        return left[60:120, 100:220].astype(float)
+
+    def roughness(left: np.ndarray) -> float:
+        return float(np.abs(np.diff(left, axis=1)).mean())
+
+    opaque, clear = picture(0.0), picture(1.0)
+    assert roughness(clear) < 0.4 * roughness(opaque)
+    assert clear.mean() == pytest.approx(opaque.mean(), rel=0.3)
+
+
 def test_out_of_range_is_invalid():
     assert np.mean(sense(wall(0.25)) > 0) < 0.1
     assert not sense(wall(0.8), max_range_m=0.7).any()
@@ -146,7 +175,8 @@ def test_frames_are_reproducible_and_differ_by_seed():
 
 
 def test_rig_is_near_measured_cameras(rig_frames):
-    """A D435 decimated to this size: 8.0 % invalid, 12.8 holes per 10,000 px, 0.027 px (1.0 mm here) at 0.75 m.
+    """A D435 decimated to this size: 8.0 % invalid, 12.8 holes per 10,000 px, 0.027 px
+    (1.0 mm here) at 0.75 m.
 
     More: `ddgrasp sensors compare`, docs/sensors.md.
     """
