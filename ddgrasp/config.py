@@ -262,10 +262,17 @@ class StereoConfig:
     contrast_limit: float = 8.0
     """Smallest local contrast of the left picture, grey levels of 255 (a D4xx's texture threshold): darker
     surfaces have no depth."""
+    dark_limit: float = 12.0
+    """Grey levels of 255: darker surfaces have no signal. Measured over 3 px, so that the bright surroundings
+    of a small dark object do not count, as they do for the contrast."""
     residual_window_px: int = 3
     """Window of that residual."""
     refine_window_px: int = 9
     """Window of the sub-pixel step."""
+    flat_window_px: int = 9
+    """Window of the filter that smooths flat surfaces after it."""
+    flat_noise_px: float = 0.08
+    """Disparity noise that filter takes away, standard deviation: larger relief stays. 0 switches it off."""
     subpixel_steps: int = 32
     """Disparity is reported in 1/32 of a pixel, as D4xx cameras do."""
 

@@ -19,6 +19,7 @@ import numpy as np
 from ddgrasp.config import StereoConfig
 from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
 from mjx_envs.camera import Buffers, Camera
+from sensors import planes
 from sensors.materials import NEAR_INFRARED_RGB, Material
 
 Render = Callable[[Camera], Buffers]
@@ -42,6 +43,12 @@ TEXELS_PER_PX = 3
 """Resolution of the stored pattern."""
 TEXTURE_PX, TEXTURE_PX_PER_M = 512, 400.0
 """Size and scale of the albedo texture that `Material.texture` weighs (a 1.3 m tile)."""
+SPREAD_PX = 9
+"""A translucent body spreads the projector's dots over this width: about two of their distances."""
+DARK_WINDOW_PX = 3
+"""A pixel is too dark if the median over this window is: single dots do not count."""
+TEXTURE_DARKEST = 0.2
+"""The texture's darkest spots keep this share of the albedo."""
 CONTRAST_WINDOW_PX = 9
 """The pictures are compared less their mean over this window."""
 TEXTURE_WINDOW_PX = 7
@@ -131,9 +138,11 @@ class ActiveStereo:
         # The left band has no counterpart in the right picture.
         valid = (coarse > 0) & (columns - coarse >= 0)
         contrast = _contrast(left)
+        valid &= cv2.medianBlur(left, DARK_WINDOW_PX) >= self.config.dark_limit
         left, right = _without_mean(left), _without_mean(right)
         fine, residual = _refine(left, right, coarse, self.config)
         valid &= (residual < self.config.residual_limit) & (contrast > self.config.contrast_limit)
+        fine = flatten(fine, valid, self.config)
         steps = self.config.subpixel_steps
         return np.where(valid, np.rint(fine * steps) / steps, 0).astype(np.float32)
 
@@ -167,14 +176,16 @@ class ActiveStereo:
         lamp = R_world_cam.T @ (
             np.array(LAMP_POSITION_W_M, np.float32) - T_world_imager[:3, 3].astype(np.float32)
         )
-        albedo, specular = self._surface(buffers, x_z, y_z, z, T_world_imager, materials)
+        albedo, specular, translucency = self._surface(buffers, x_z, y_z, z, T_world_imager, materials)
         view = _unit(-x_z, -y_z, -z)[0]
 
         to_projector, range_m = _unit(projector_m - x_z, -y_z, -z)
         dots = self._dots(x_z - projector_m, y_z, z, lit_m)
         dots *= self.config.projector_power / np.maximum(range_m, 0.1) ** 2
         diffuse, highlight = _reflect(normal, to_projector, view)
-        radiance = dots * speckle * (albedo * diffuse + specular * highlight)
+        radiance = dots * speckle * ((1.0 - translucency) * albedo * diffuse + specular * highlight)
+        if translucency.any():
+            radiance += cv2.blur(dots, (SPREAD_PX, SPREAD_PX)) * translucency * albedo * diffuse
 
         to_lamp, _ = _unit(lamp[0] - x_z, lamp[1] - y_z, lamp[2] - z)
         diffuse, highlight = _reflect(normal, to_lamp, view)
@@ -182,26 +193,27 @@ class ActiveStereo:
         radiance += (1.0 - LAMP_SHARE) * albedo
         return np.where(z > 0, radiance, np.float32(0.05)) * self._vignetting
 
-    def _surface(self, buffers, x_z, y_z, z, T_world_imager, materials) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W) albedo and specular strength per pixel."""
+    def _surface(
+        self, buffers, x_z, y_z, z, T_world_imager, materials
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(H, W) albedo, specular strength and translucency per pixel."""
         rgb = buffers.rgb
         default = Material.from_rgb((0.5, 0.5, 0.5))
         ids = buffers.segmentation
         count = max(int(ids.max()), max(materials or (0,))) + 2
-        table = np.tile(np.array([-1.0, default.specular, 0.0], np.float32), (count, 1))
+        table = np.tile(np.array([-1.0, default.specular, 0.0, 0.0], np.float32), (count, 1))
         for geom, material in (materials or {}).items():
-            table[geom + 1] = material.albedo, material.specular, material.texture
-        albedo, specular, texture = (column[ids + 1] for column in table.T.copy())
+            table[geom + 1] = material.albedo, material.specular, material.texture, material.translucency
+        albedo, specular, texture, translucency = (column[ids + 1] for column in table.T.copy())
         unknown = albedo < 0
         if unknown.any():
             albedo[unknown] = 0.05 + 0.9 * (rgb[unknown] @ np.array(NEAR_INFRARED_RGB, np.float32))
         if table[:, 2].any():
             T = (T_world_imager * TEXTURE_PX_PER_M).astype(np.float32)
             u, v = (T[i, 0] * x_z + T[i, 1] * y_z + T[i, 2] * z + T[i, 3] for i in (0, 1))
-            albedo *= 1.0 + texture * cv2.remap(
-                self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
-            )
-        return np.clip(albedo, 0.0, 1.0), specular
+            noise = cv2.remap(self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+            albedo *= np.maximum(1.0 + texture * noise, np.float32(TEXTURE_DARKEST))
+        return np.clip(albedo, 0.0, 1.0), specular, translucency
 
     def _dots(self, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, lit_m: np.ndarray) -> np.ndarray:
         """(H, W) brightness of the pattern on points given in the projector's frame; 0 in shadow."""
@@ -365,3 +377,19 @@ def _refine(
     energy = 0.5 * cv2.blur(left * left + matched * matched, window) + 1e-3
     residual = np.sqrt(cv2.blur(difference * difference, window) / energy)
     return np.clip(fine, coarse_px - 0.5, coarse_px + 0.5), residual
+
+
+def flatten(fine_px: np.ndarray, valid: np.ndarray, config: StereoConfig) -> np.ndarray:
+    """(H, W) disparity, noise on flat surfaces averaged away over a window, edges and relief kept.
+
+    Lee's filter (1980) about the window's plane instead of its mean: with v the variance of the window from
+    its plane and n that of the noise, a pixel keeps max(0, 1 - n / v) of its distance from the plane. For the
+    fit, small holes are filled with the mean around them; large ones leave v, and so the pixel, as it is.
+    """
+    window = (config.flat_window_px, config.flat_window_px)
+    share = cv2.blur(valid.astype(np.float32), window)
+    around = cv2.blur(np.where(valid, fine_px, 0), window) / np.maximum(share, 1e-3)
+    whole = np.where(valid, fine_px, around)
+    variance, plane = planes.residual_variance(whole, config.flat_window_px)
+    keep = np.maximum(1.0 - config.flat_noise_px**2 / np.maximum(variance, 1e-9), 0.0)
+    return (plane + keep * (whole - plane)).astype(np.float32)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sensors import planes
 from sensors.holes import fill_from_background
 from sensors.stats import STEADY_FRACTION, hole_sizes_px
 
@@ -116,23 +117,13 @@ def _edge_distance_px(inverse: np.ndarray) -> np.ndarray:
 
 def _incidence_deg(inverse: np.ndarray, fx_px: float) -> np.ndarray:
     """Inverse depth is affine in the picture of a plane n . X = 1: n = (f w_u, f w_v, w - w_u u - w_v v)."""
-    (w_u, w_v), w = _slopes(inverse, NORMAL_WINDOW_PX)
+    (w_u, w_v), w = planes.slopes(inverse, NORMAL_WINDOW_PX)
     height, width = inverse.shape
     u = (np.arange(width, dtype=np.float32) + 0.5 - width / 2)[None, :]
     v = (np.arange(height, dtype=np.float32) + 0.5 - height / 2)[:, None]
     normal = np.sqrt((fx_px * w_u) ** 2 + (fx_px * w_v) ** 2 + (w - w_u * u - w_v * v) ** 2)
     ray = np.sqrt(1.0 + (u / fx_px) ** 2 + (v / fx_px) ** 2)
     return np.degrees(np.arccos(np.clip(np.abs(w) / (normal * ray), 0.0, 1.0)))
-
-
-def _slopes(picture: np.ndarray, window_px: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Least-squares plane in every window: ((slope along u, along v), mean), (H, W) each."""
-    offset = np.arange(window_px, dtype=np.float32) - (window_px - 1) / 2
-    ramp = offset / np.sum(offset**2)
-    flat = np.full(window_px, 1.0 / window_px, np.float32)
-    along_u = cv2.sepFilter2D(picture, -1, ramp, flat, borderType=cv2.BORDER_REPLICATE)
-    along_v = cv2.sepFilter2D(picture, -1, flat, ramp, borderType=cv2.BORDER_REPLICATE)
-    return (along_u, along_v), cv2.sepFilter2D(picture, -1, flat, flat, borderType=cv2.BORDER_REPLICATE)
 
 
 # --- invalid pixels --------------------------------------------------------------------------------
@@ -214,13 +205,12 @@ def temporal_deviation_px(stream: Stream) -> Curve:
 
 def _plane_deviation(disparity_px: np.ndarray) -> np.ndarray:
     """(H, W) standard deviation from the least-squares plane of each window."""
-    d = np.nan_to_num(disparity_px).astype(np.float64)
-    (along_u, along_v), mean = _slopes(d, PLANE_WINDOW_PX)
-    square = cv2.boxFilter(d * d, -1, (PLANE_WINDOW_PX, PLANE_WINDOW_PX))
+    # The border as in the published figures.
+    variance, _ = planes.residual_variance(
+        np.nan_to_num(disparity_px), PLANE_WINDOW_PX, cv2.BORDER_REFLECT_101
+    )
     count = PLANE_WINDOW_PX**2
-    spread = (PLANE_WINDOW_PX**2 - 1) / 12.0
-    variance = square - mean**2 - spread * (along_u**2 + along_v**2)
-    return np.sqrt(np.maximum(variance, 0.0) * count / (count - 3))
+    return np.sqrt(variance * count / (count - 3))
 
 
 def flicker(stream: Stream) -> float:

@@ -2,7 +2,8 @@
 
 Colour says little there: pigments of fruit and most dyes are transparent at 850 nm, carbon black is not, and
 what a smooth skin or bare metal mirrors decides whether the matcher sees the projector's dots. So objects
-fail differently, as real ones do: dark rubber has too little contrast, metal and wax glare.
+fail differently, as real ones do: dark rubber and bare metal send too little back, watery flesh sends it back
+without the dots.
 """
 
 from collections.abc import Mapping
@@ -24,6 +25,9 @@ class Material:
     """Strength of the highlight relative to a white diffuse surface."""
     texture: float = 0.0
     """Relative contrast of its albedo texture (for geoms that do not move)."""
+
+    translucency: float = 0.0
+    """Share of the projector's light that comes back from within, spread and without its dots, 0 to 1."""
 
     @classmethod
     def from_rgb(cls, rgb, specular: float = 0.05, texture: float = 0.0) -> "Material":
@@ -58,13 +62,15 @@ OBJECT_MATERIALS: dict[str, ObjectMaterial] = {
     "block": ObjectMaterial(Material(0.45, 0.01), "matt foam; " + _ESTIMATE),
     "persimmon": ObjectMaterial(Material(0.50, 0.80), "smooth, waxy; " + _FRUIT, {"slot_box": _STALK}),
     "starfruit": ObjectMaterial(
-        Material(0.30, 0.90), "waxy and translucent, thin ribs: light scatters away inside; " + _ESTIMATE
+        Material(0.06, 0.40, translucency=0.95),
+        "waxy; watery flesh and thin ribs let light through, little returns and not where it entered; "
+        + _ESTIMATE,
     ),
     "lemon": ObjectMaterial(Material(0.50, 0.35), "dimpled, oily; " + _FRUIT),
     "can": ObjectMaterial(
         Material(0.45, 0.80),
         "varnished paper label, bare steel lid that mirrors and hardly scatters; " + _ESTIMATE,
-        {"slot_cylinder1": Material(0.06, 4.0)},
+        {"slot_cylinder1": Material(0.02, 4.0)},
     ),
     "wheel": ObjectMaterial(
         Material(0.03, 0.05),

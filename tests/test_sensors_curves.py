@@ -13,6 +13,7 @@ from ddgrasp.progress import Progress
 from sensors import compare, curves, figures
 from sensors.curves import Stream
 from sensors.recordings import RecordingWriter
+from sensors.rig_scenes import StandingScene, standing_scenes
 
 FX_PX, FB_PX_M = 170.0, 16.0
 SIZE = (90, 160)
@@ -129,6 +130,25 @@ def test_real_recordings_without_a_focal_length_are_left_out_by_name(tmp_path):
     assert len(skipped) == 1 and "add fx_px and baseline_m" in skipped[0]
     with pytest.raises(UserError, match="none of its recordings can be compared"):
         compare.measure_real(tmp_path / "b", D455.scaled(0.125), Progress(quiet=True))
+
+
+def test_losses_count_the_objects_own_pixels():
+    depth = np.full((2, *SIZE), 1000, np.uint16)
+    depth[:, :10] = 0  # not the object
+    depth[0, 40, 50:53] = 0
+    mask = np.zeros(SIZE, bool)
+    mask[40, 50:60] = True
+    loss = compare.object_losses([StandingScene("cube", depth, mask)])["cube"]
+    assert loss == pytest.approx({"pixels": 10, "invalid_fraction": 0.15, "flicker_fraction": 0.3})
+
+
+def test_objects_fail_by_their_materials():
+    names = ("wheel", "can", "starfruit", "banana", "bread", "apple")
+    scenes = list(standing_scenes(RecordConfig(), D455.scaled(0.25), names, 2, 2, seed=0))
+    lost = {name: loss["invalid_fraction"] for name, loss in compare.object_losses(scenes).items()}
+    assert min(lost[name] for name in ("wheel", "can", "starfruit")) > 0.07
+    assert max(lost[name] for name in ("banana", "bread", "apple")) < 0.07
+    assert max(lost.values()) < 0.5
 
 
 def test_compare_writes_table_json_and_picture(tmp_path, capsys):
