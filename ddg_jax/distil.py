@@ -1,7 +1,7 @@
 """Progressive distillation: a sampler of few network evaluations learnt from one of many.
 
 A student of n evaluations learns to do in one DDIM step what its teacher does in two of 2n. The first teacher
-is the fitted network with `DDGConfig.distil_from` evaluations, every further one the student before it, until
+is the fitted network with `DDGConfig.distil_from` evaluations, the second step of every two of second order, every further one the student before it, until
 `DDGConfig.sample_steps` are left (Salimans & Ho 2022, algorithm 2). Noise levels are only those that the
 student's sampler visits, so that all of its capacity goes to them.
 """
@@ -24,7 +24,6 @@ from ddg_jax.train import (
     config_schedule,
     make_optimizer,
     predict_clean,
-    predict_noise,
     step_keys,
 )
 from ddgrasp import artifacts
@@ -118,7 +117,7 @@ def distil_step(
 
     Pure: its noise comes from `train.step_keys`.
 
-    The student's error in x_0 weighs clip(SNR, 1, 5) (eq. 9 there, with a cap).
+    The student's error in x_0 weighs SNR within SNR_LIMITS (eq. 9 there, with a cap).
 
     Args:
       limit: the teacher's |x_0| is clipped to it.
@@ -131,11 +130,16 @@ def distil_step(
     k, _, end = path
     x_k = diffusion.q_sample(made, x_0, k, jax.random.normal(eps_key, x_0.shape))
 
-    def teacher_step(x: Array, hop: tuple[Array, Array]) -> tuple[Array, None]:
-        now, then = hop
-        return diffusion.ddim_step(made, x, now, then, predict_noise(config, teacher, x, c, now), limit), None
+    def teacher_step(
+        last: tuple[Array, Array], hop: tuple[Array, Array, Array]
+    ) -> tuple[tuple[Array, Array], None]:
+        (x, x_0_before), (before, now, then) = last, hop
+        x_0 = jnp.clip(predict_clean(config, teacher, x, c, now), -jnp.asarray(limit), limit)
+        return (diffusion.dpm_solver_step(made, x, now, then, x_0, before, x_0_before), x_0), None
 
-    x, _ = jax.lax.scan(teacher_step, x_k, (path[:2], path[1:]))
+    # Only the fitted network's x_0 is one that the second order can be taken from.
+    before = jnp.stack([k, jnp.where(jnp.isfinite(limit), k, path[1])])
+    (x, _), _ = jax.lax.scan(teacher_step, (x_k, x_k), (before, path[:2], path[1:]))
     target = jax.lax.stop_gradient(one_step_target(made, x_k, k, x, end))
     weight = jnp.clip(diffusion.signal_to_noise(made, k), *SNR_LIMITS)
 

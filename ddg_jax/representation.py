@@ -28,8 +28,8 @@ DEPTH, DEVIATION = REPRESENTATIONS = ("depth", "deviation")
 HOLE, VALID = -1.0, 1.0
 LIMIT_PER_M = 0.06
 """L: larger deviations of inverse depth (a pixel of disparity for a D455 at 320 px) are clipped."""
-KNEE_PER_M = 0.002
-"""s: up to here asinh is nearly linear (four of a D455's disparity steps)."""
+KNEE_PER_M = 0.0005
+"""s: up to here asinh is nearly linear (a D455's disparity step, 1/32 px of its own)."""
 FARTHEST_M = 50.0
 """No generated depth is farther: millimetres must fit 16 bits."""
 

@@ -26,7 +26,8 @@ from ddgrasp.errors import UserError, unknown_name
 
 PARAMS_FILE = "params.msgpack"
 PROGRESSIVE = "progressive"
-SAMPLERS = ("ddim", "ddpm", PROGRESSIVE)
+DPM_SOLVER = "dpm_solver"
+SAMPLERS = ("ddim", DPM_SOLVER, "ddpm", PROGRESSIVE)
 SHARED = 2**31 - 1
 """Stands for the frame number in the key of the noise that an episode's frames share."""
 _ASPECT_TOLERANCE = 0.02
@@ -136,19 +137,25 @@ def sample(
     prior_key, start_key, step_key = jax.random.split(key, 3)
     c = c + config.prior_noise * noise(prior_key, shape=size)
 
-    def body(x: Array, now: tuple[Array, Array]) -> tuple[Array, None]:
-        k, previous = now
+    def body(last: tuple[Array, Array], now: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
+        (x, x_0_before), (before, k, previous) = last, now
         eps = predict_noise(config, params, x, c, jnp.full(x.shape[:1], k))
         fresh = partial(noise, jax.random.fold_in(step_key, k))
-        if config.sampler == "ddpm":
-            return diffusion.ddpm_step(made, x, k, previous, eps, fresh(), X_LIMIT), None
-        if config.sampler == PROGRESSIVE:
-            return diffusion.ddim_step(made, x, k, previous, eps, None), None
-        extra = fresh() if config.eta else 0.0
-        return diffusion.ddim_step(made, x, k, previous, eps, X_LIMIT, config.eta, extra), None
+        x_0 = jnp.clip(diffusion.predict_x_0(made, x, k, eps), -X_LIMIT, X_LIMIT)
+        if config.sampler == DPM_SOLVER:
+            x = diffusion.dpm_solver_step(made, x, k, previous, x_0, before, x_0_before)
+        elif config.sampler == "ddpm":
+            x = diffusion.ddpm_step(made, x, k, previous, eps, fresh(), X_LIMIT)
+        elif config.sampler == PROGRESSIVE:
+            x = diffusion.ddim_step(made, x, k, previous, eps, None)
+        else:
+            extra = fresh() if config.eta else 0.0
+            x = diffusion.ddim_step(made, x, k, previous, eps, X_LIMIT, config.eta, extra)
+        return (x, x_0), None
 
-    path = (jnp.asarray(visited), jnp.asarray(diffusion.previous_steps(visited)))
-    x, _ = jax.lax.scan(body, noise(start_key), path)
+    start = noise(start_key)
+    path = np.append(visited[:1], visited), visited, diffusion.previous_steps(visited)
+    (x, _), _ = jax.lax.scan(body, (start, start), (path[0][:-1], *path[1:]))
     return x
 
 

@@ -1,11 +1,11 @@
-"""Discrete diffusion: noise schedules and the forward, DDPM and DDIM equations.
+"""Discrete diffusion: noise schedules and the forward, DDPM, DDIM and DPM-Solver++ equations.
 
 One equation, one function; noise is always an argument. Everything is generic over the shape of x, so the
 student's action head uses this module too. Notation: step k in 0..K-1, beta_k, alpha_bar_k = prod (1 - beta),
 x_k the noised sample, eps the noise; `previous` = -1 stands for the clean sample (alpha_bar = 1).
 
 Sources: Ho et al. 2020 (DDPM), Song et al. 2021 (DDIM), Nichol & Dhariwal 2021 (cosine schedule),
-Lin et al. 2024 (trailing steps), Hoogeboom et al. 2023 (shifted schedule).
+Lu et al. 2022 (DPM-Solver++), Lin et al. 2024 (trailing steps), Hoogeboom et al. 2023 (shifted schedule).
 """
 
 import math
@@ -195,3 +195,34 @@ def ddim_step(
     # A step from pure noise has sigma^2 = 1 - alpha_bar_previous, and rounding may push the rest below 0.
     remainder = jnp.maximum(1 - a_prev - sigma**2, 0.0)
     return jnp.sqrt(a_prev) * x_0 + jnp.sqrt(remainder) * eps + sigma * noise
+
+
+def log_snr_half(schedule: Schedule, step: ArrayLike, x: ArrayLike) -> Array:
+    """lambda = log(sqrt(alpha_bar) / sqrt(1 - alpha_bar)) at `step`, broadcast against x; inf at -1."""
+    a = alpha_bar_at(schedule, step, x)
+    return 0.5 * (jnp.log(a) - jnp.log1p(-a))
+
+
+def dpm_solver_step(
+    schedule: Schedule,
+    x_k: ArrayLike,
+    step: ArrayLike,
+    previous: ArrayLike,
+    x_0: ArrayLike,
+    before: ArrayLike,
+    x_0_before: ArrayLike,
+) -> Array:
+    """One step of DPM-Solver++(2M), x_k -> x_previous, second order (Lu et al. 2022, algorithm 2).
+
+    x_0 is the prediction at `step`, x_0_before the one at `before`, the step visited before it; where
+    `before` equals `step` there was none, and the step is DDIM's, as the one to the clean sample (-1) is.
+    """
+    a, a_next = alpha_bar_at(schedule, step, x_k), alpha_bar_at(schedule, previous, x_k)
+    now = log_snr_half(schedule, step, x_k)
+    ahead = log_snr_half(schedule, previous, x_k) - now
+    behind = now - log_snr_half(schedule, before, x_k)
+    plain = (behind <= 0) | jnp.isinf(ahead)
+    slope = jnp.where(plain, 0.0, ahead / (2 * jnp.where(plain, 1.0, behind)))
+    x_0 = x_0 + slope * (jnp.asarray(x_0) - x_0_before)
+    scale = jnp.sqrt((1 - a_next) / (1 - a))
+    return scale * x_k + (jnp.sqrt(a_next) - scale * jnp.sqrt(a)) * x_0

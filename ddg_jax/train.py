@@ -24,7 +24,9 @@ WARMUP_STEPS = 50
 FINAL_LEARNING_RATE = 0.05
 """Share of the learning rate left at the end."""
 MAX_GRAD_NORM = 1.0
-SNR_LIMITS = (1.0, 5.0)
+SNR_LIMITS = (1.0, 25.0)
+"""Weights of an error in x_0. Up to the upper one slight noise counts, where holes of a pixel and the noise on
+surfaces are decided; the lower one keeps the layout of holes, which is decided in strong noise."""
 CHECKPOINTS = "checkpoints"
 
 
@@ -83,8 +85,8 @@ def predict_noise(config: DDGConfig, params: Params, x_k: Array, c: Array, step:
 def loss_weight(config: DDGConfig, step: Array) -> Array:
     """Weight of each step's noise error, (B,).
 
-    "uniform" is the paper's 1. "truncated" is clip(SNR, 1, 5) / SNR: per unit of error in x_0 no step weighs
-    less than the others' floor (Salimans & Ho 2022, section 4) nor more than a cap (Hang et al. 2023).
+    "uniform" is the paper's 1. "truncated" is clip(SNR, *SNR_LIMITS) / SNR: per unit of error in x_0 no step
+    weighs less than the floor (Salimans & Ho 2022, section 4) nor more than a cap (Hang et al. 2023).
     """
     if config.loss_weight == "uniform":
         return jnp.ones(step.shape)

@@ -396,7 +396,7 @@ class DDGConfig:
     # --- U-Net (ddg_jax/unet.py) ---
     space_to_depth: int = 4
     """Pixels per side folded into channels before the U-Net."""
-    widths: tuple[int, ...] = (32, 48, 96)
+    widths: tuple[int, ...] = (64, 64, 96)
     """Channels per level; every level halves height and width."""
     blocks: tuple[int, ...] = (0, 1, 0)
     """Residual blocks per level, in the encoder and again in the decoder; two more sit in the middle."""
@@ -430,17 +430,18 @@ class DDGConfig:
     init_from: str = ""
     """Folder with a fitted generator to use instead of fitting one; empty fits."""
     # --- sampling (ddg_jax/sample.py) ---
-    sampler: str = "ddim"
-    """ddim, ddpm (ancestral) or progressive (distilled to sample_steps evaluations, ddg_jax/distil.py)."""
+    sampler: str = "dpm_solver"
+    """dpm_solver (second order), ddim, ddpm (ancestral) or progressive (distilled to sample_steps evaluations,
+    ddg_jax/distil.py)."""
     sample_steps: int = 4
     """Network evaluations per map."""
     sample_spacing: str = "quadratic"
     """Which diffusion steps they visit: trailing (equal steps) or quadratic (short ones at the end, where the
     noise on surfaces is decided)."""
-    distil_from: int = 8
-    """Evaluations of the fitted network's DDIM from which distillation starts; sample_steps times a power of
+    distil_from: int = 16
+    """Evaluations of the fitted network from which distillation starts; sample_steps times a power of
     two."""
-    distil_steps: int = 100
+    distil_steps: int = 150
     """Optimiser steps per halving of the evaluations (sampler progressive only)."""
     eta: float = 0.0
     """Fresh noise in DDIM: 0 none, 1 as much as DDPM."""

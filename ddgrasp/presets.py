@@ -121,8 +121,8 @@ LAPTOP = Config(
     preset="laptop",
     teacher=TeacherConfig(total_steps=500_000, eval_every=10),
     demos=DemosConfig(episodes=240),
-    record=RecordConfig(trajectories=36),
-    ddg=DDGConfig(train_steps=1200),
+    record=RecordConfig(trajectories=80),
+    ddg=DDGConfig(train_steps=1200, sampler="progressive"),
     student=StudentConfig(
         train_steps=1500,
         dagger_rounds=2,

@@ -115,3 +115,30 @@ def test_timestep_spacing():
         s.timesteps(10, 2, "trailling")
     with pytest.raises(UserError, match="11"):
         s.timesteps(10, 11)
+
+
+def test_dpm_solver_is_of_second_order_on_a_gaussian():
+    """For x_0 ~ N(0, s^2) both the best prediction and the exact end of the reverse process are known."""
+    made, spread = s.make_schedule("cosine", 1000), 0.3
+    x_start = jnp.array([[1.3]])
+
+    def best(x, k):
+        a = s.alpha_bar_at(made, k, x)
+        return jnp.sqrt(a) * spread**2 * x / (a * spread**2 + 1 - a)
+
+    def error(count: int, second_order: bool) -> float:
+        visited = s.timesteps(1000, count, "quadratic")
+        x, before, x_0_before = x_start, jnp.array([visited[0]]), x_start
+        for k, previous in zip(visited, s.previous_steps(visited), strict=True):
+            k, previous = jnp.array([k]), jnp.array([previous])
+            x_0 = best(x, k)
+            if second_order:
+                x = s.dpm_solver_step(made, x, k, previous, x_0, before, x_0_before)
+            else:
+                x = s.ddim_step(made, x, k, previous, s.eps_from_x_0(made, x, k, x_0), None)
+            before, x_0_before = k, x_0
+        return abs(float(x[0, 0]) - 1.3 * spread)
+
+    assert error(1, True) == pytest.approx(error(1, False), abs=1e-5)
+    for count in (8, 16, 32):
+        assert error(count, True) < 0.4 * error(count, False), count
