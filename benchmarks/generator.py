@@ -19,13 +19,16 @@ import numpy as np
 from benchmarks import compare
 from ddg_jax.prior import make_prior
 from ddg_jax.representation import channels
-from ddg_jax.sample import PROGRESSIVE, Generator, condition, frame_noise, generate, grafted
+from ddg_jax.sample import DPM_SOLVER, PROGRESSIVE, Generator, condition, frame_noise, generate, grafted
 from ddg_jax.train import init_params, predict_noise
 from ddgrasp.config import DDGConfig
 from ddgrasp.presets import get_preset
 
 REFERENCE = ("ddim", 50)
-SAMPLERS = (REFERENCE, ("ddim", 10), ("ddim", 5), (PROGRESSIVE, 4), (PROGRESSIVE, 2), (PROGRESSIVE, 1))
+SAMPLERS = (
+    REFERENCE, ("ddim", 10), (DPM_SOLVER, 8), (DPM_SOLVER, 4),
+    (PROGRESSIVE, 4), (PROGRESSIVE, 2), (PROGRESSIVE, 1),
+)  # fmt: skip
 DDPM_STEPS = 50
 
 
@@ -39,7 +42,7 @@ def scenes(config: DDGConfig, count: int) -> np.ndarray:
 
 def make_generator(config: DDGConfig, params: Any, batch: int, sampler: str, steps: int) -> Generator:
     """The configuration's network with that sampler, `batch` frames at once."""
-    changed = replace(config, sampler=sampler, sample_steps=steps, sample_batch=batch, distil_from=8)
+    changed = replace(config, sampler=sampler, sample_steps=steps, sample_batch=batch, distil_from=16)
     return Generator(changed, params, make_prior(changed))
 
 

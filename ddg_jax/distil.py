@@ -1,9 +1,10 @@
 """Progressive distillation: a sampler of few network evaluations learnt from one of many.
 
 A student of n evaluations learns to do in one DDIM step what its teacher does in two of 2n. The first teacher
-is the fitted network with `DDGConfig.distil_from` evaluations, the second step of every two of second order, every further one the student before it, until
-`DDGConfig.sample_steps` are left (Salimans & Ho 2022, algorithm 2). Noise levels are only those that the
-student's sampler visits, so that all of its capacity goes to them.
+is the fitted network with `DDGConfig.distil_from` evaluations, the second step of every two of second order.
+Every further one is the student before it, until `DDGConfig.sample_steps` are left (Salimans & Ho 2022,
+algorithm 2). Noise levels are only those that the student's sampler visits, so that all of its capacity goes
+to them.
 """
 
 from functools import partial

@@ -1,6 +1,7 @@
 """Stage `ddg`: recordings -> a fitted generator, its statistics and its pictures."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +47,7 @@ def fit_folder(
     prior = make_prior(config.ddg)
     frames = data.load_frames(root, config.ddg, prior, config.seed, progress)
     training, held_out = frames.split(config.ddg.holdout_fraction)
-    params = _fitted(config, training, directory, progress)
-    Generator(config.ddg, params, prior).save(directory)
-    if config.ddg.sampler == PROGRESSIVE:
-        params = distil(config.ddg, params, training, directory, config.seed, progress)
-    generator = Generator(config.ddg, params, prior)
+    generator = fitted_generator(config.ddg, training, directory, config.seed, progress)
     scored = held_out.part(slice(-SCORED_FRAMES, None))
     metrics = {
         "prior": prior.name,
@@ -89,11 +86,18 @@ def sample_folder(directory: Path, root: Path, out: Path, *, seed: int, count: i
     return path
 
 
-def _fitted(config: Config, training: data.Frames, directory: Path, progress: Progress) -> Params:
-    """Parameters of a network fitted on `training`, or of the one that `ddg.init_from` names."""
-    if config.ddg.init_from:
-        return _loaded(config.ddg)
-    return fit(config.ddg, training, directory, config.seed, progress)
+def fitted_generator(
+    config: DDGConfig, frames: data.Frames, directory: Path, seed: int, progress: Progress
+) -> Generator:
+    """A generator fitted on all of `frames`, or the one that `config.init_from` names; distilled if its
+    sampler is. Parameters and checkpoints go to `directory`, whence it continues.
+    """
+    fitted = _loaded(config) if config.init_from else fit(config, frames, directory, seed, progress)
+    generator = Generator(config, fitted, make_prior(config))
+    generator.save(directory)
+    if config.sampler != PROGRESSIVE:
+        return generator
+    return replace(generator, params=distil(config, fitted, frames, directory, seed, progress))
 
 
 def _loaded(config: DDGConfig) -> Params:

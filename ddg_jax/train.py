@@ -25,8 +25,8 @@ FINAL_LEARNING_RATE = 0.05
 """Share of the learning rate left at the end."""
 MAX_GRAD_NORM = 1.0
 SNR_LIMITS = (1.0, 25.0)
-"""Weights of an error in x_0. Up to the upper one slight noise counts, where holes of a pixel and the noise on
-surfaces are decided; the lower one keeps the layout of holes, which is decided in strong noise."""
+"""Weights of an error in x_0. Up to the upper one slight noise counts, where single-pixel holes and roughness
+of surfaces are decided; the lower one keeps the layout of holes, which is decided in strong noise."""
 CHECKPOINTS = "checkpoints"
 
 

@@ -40,6 +40,7 @@ STAGE_FIELDS: dict[str, tuple[str, ...]] = {
     "score": ("seed", "world", "record", "ddg", "score"),
     "score_real": ("seed", "ddg", "score"),
     "curve": ("seed", "world", "record", "ddg", "score"),
+    "samplers": ("seed", "world", "record", "ddg", "score"),
 }  # fmt: skip
 """The parts of `Config` that a stage's result depends on: these are hashed, and must match on --resume."""
 

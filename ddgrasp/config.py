@@ -431,16 +431,15 @@ class DDGConfig:
     """Folder with a fitted generator to use instead of fitting one; empty fits."""
     # --- sampling (ddg_jax/sample.py) ---
     sampler: str = "dpm_solver"
-    """dpm_solver (second order), ddim, ddpm (ancestral) or progressive (distilled to sample_steps evaluations,
-    ddg_jax/distil.py)."""
+    """dpm_solver (second order), ddim, ddpm (ancestral) or progressive (distilled to sample_steps
+    evaluations, ddg_jax/distil.py)."""
     sample_steps: int = 4
     """Network evaluations per map."""
     sample_spacing: str = "quadratic"
     """Which diffusion steps they visit: trailing (equal steps) or quadratic (short ones at the end, where the
     noise on surfaces is decided)."""
     distil_from: int = 16
-    """Evaluations of the fitted network from which distillation starts; sample_steps times a power of
-    two."""
+    """Evaluations of the fitted network from which distillation starts; sample_steps times a power of two."""
     distil_steps: int = 150
     """Optimiser steps per halving of the evaluations (sampler progressive only)."""
     eta: float = 0.0

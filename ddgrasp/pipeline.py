@@ -62,8 +62,9 @@ ON_REQUEST = (
     Stage("score", "evaluation", ("teacher", "ddg"), "generated depth against the rig's: Table I"),
     Stage("score_real", "evaluation", (), "generated depth against a real camera's"),
     Stage("curve", "evaluation", ("teacher", "record", "ddg"), "score against recorded trajectories"),
+    Stage("samplers", "evaluation", ("teacher", "ddg"), "score against network evaluations"),
 )
-"""Stages that `run` leaves out; each has a command of its own (`ddgrasp ddg score`, `ddg curve`)."""
+"""Stages that `run` leaves out; each has a command of its own (`ddgrasp ddg score`, `curve`, `samplers`)."""
 
 
 def run(

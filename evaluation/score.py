@@ -93,13 +93,12 @@ def _fit_real(
     from ddg_jax.data import load_frames
     from ddg_jax.prior import make_prior
     from ddg_jax.sample import Generator
-    from ddg_jax.train import fit
+    from ddg_jax.stage import fitted_generator
 
     if not artifacts.is_finished(directory):
         prior = make_prior(config.ddg)
         frames = load_frames(root, config.ddg, prior, config.seed, progress, max_frames=fit_frames)
-        params = fit(config.ddg, frames, directory, config.seed, progress)
-        Generator(config.ddg, params, prior).save(directory)
+        fitted_generator(config.ddg, frames, directory, config.seed, progress)
         metrics = {"frames": {"training": len(frames)}}
         artifacts.finish(directory, "ddg", config, seconds=progress.seconds, metrics=metrics)
     return Generator.load(directory)

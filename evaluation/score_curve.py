@@ -1,7 +1,8 @@
 """Stage `curve`: how many recorded trajectories the generator needs. Behind `ddgrasp ddg curve`.
 
 A generator per size is fitted on the first n trajectories, all for as many steps, and scored on the same
-frames. Points are finished one by one: a stopped curve goes on inside the point it stopped in.
+frames, by the same sampler. Points are finished one by one: a stopped curve goes on inside the point it
+stopped in.
 """
 
 from collections.abc import Sequence
@@ -29,6 +30,8 @@ STAGE = "curve"
 JSON = "curve.json"
 POINT = "point.json"
 COLUMNS = ("sim_gt", "ddg_no_graft", "ddg")
+EVALUATIONS = 8
+"""Of the second-order sampler: what is compared is the fit, so no point is distilled."""
 
 
 def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Artifact:
@@ -101,14 +104,14 @@ def _point(
 
 def _fitted(config: Config, frames: "Frames", folder: Path, progress: Progress) -> "Generator":
     """A generator fitted on `frames`, from its checkpoints if there are any."""
-    from ddg_jax.prior import make_prior
-    from ddg_jax.sample import Generator
-    from ddg_jax.train import fit
+    from ddg_jax.sample import DPM_SOLVER
+    from ddg_jax.stage import fitted_generator
 
     steps = config.score.curve_steps or config.ddg.train_steps
-    settings = replace(config.ddg, train_steps=steps, init_from="")
-    params = fit(settings, frames, folder, config.seed, progress)
-    return Generator(settings, params, make_prior(settings))
+    settings = replace(
+        config.ddg, train_steps=steps, init_from="", sampler=DPM_SOLVER, sample_steps=EVALUATIONS
+    )
+    return fitted_generator(settings, frames, folder, config.seed, progress)
 
 
 def _frames(config: Config, run_dir: Path, count: int, extra: Path, progress: Progress) -> "Frames":

@@ -41,7 +41,7 @@ CONFIG = Config(
         widths=(8, 8),
         blocks=(0, 1),
         attention_heads=1,
-        diffusion_steps=20,
+        diffusion_steps=50,
         train_steps=4,
         batch_size=2,
         sample_steps=2,
@@ -175,6 +175,17 @@ def test_the_curve_fits_and_scores_every_size_and_keeps_finished_points(run_dir,
     assert json.loads((tmp_path / "curve" / "curve.json").read_text()) == result
     png = draw_efficiency(result["points"], result["points"][0]["floor"], 1.0)
     assert png.startswith(b"\x89PNG")
+
+
+def test_samplers_are_scored_on_the_same_episodes(run_dir, tmp_path, capsys):
+    command = ["ddg", "samplers", *SIZES, "--out", str(tmp_path), "--run-dir", str(run_dir)]
+    assert cli.main(command) == 0
+    result = json.loads((tmp_path / "samplers" / "samplers.json").read_text())
+    rows = result["samplers"]
+    assert list(rows) == ["ddim 50", "ddim 10", "ddim 4", "dpm_solver 8", "dpm_solver 4"]
+    assert rows["ddim 50"]["over_reference"] == 1.0 and rows["ddim 4"]["over_reference"] != 1.0
+    assert all(row["frames_per_s"] > 0 and 0 < row["holes"]["invalid_share"] < 1 for row in rows.values())
+    assert "at most 4 evaluations" in capsys.readouterr().out
 
 
 def test_unknown_columns_and_extractors_are_refused_at_once(capsys, tmp_path):

@@ -16,7 +16,7 @@ from ddgrasp.commands.checks import check_config_values, check_devices
 from ddgrasp.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from ddgrasp.commands.depth import DemosCollect, Record, RecordImport, SensorsCompare
 from ddgrasp.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
-from ddgrasp.commands.score import DDGCurve, DDGFeatures, DDGScore, Scoring
+from ddgrasp.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from ddgrasp.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
 from ddgrasp.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
 from ddgrasp.presets import get_preset
@@ -48,6 +48,7 @@ COMMANDS: dict[str, type] = {
     "ddg sample": DDGSample,
     "ddg score": DDGScore,
     "ddg curve": DDGCurve,
+    "ddg samplers": DDGSamplers,
     "ddg features": DDGFeatures,
     "ddg distil": DDGDistil,
     "ddg generate": DDGGenerate,

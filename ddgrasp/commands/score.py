@@ -1,4 +1,4 @@
-"""ddgrasp ddg score, curve, features: how real generated depth is."""
+"""ddgrasp ddg score, curve, samplers, features: how real generated depth is."""
 
 import json
 from collections.abc import Callable
@@ -84,6 +84,20 @@ class DDGCurve(Scoring):
 
         self._make("curve", lambda config, source, p: score_curve.run(config, source, self.out, progress=p))
         print_result(self.out / "curve")
+
+
+@dataclass(frozen=True)
+class DDGSamplers(Scoring):
+    """Score every sampler of the generator: what fewer network evaluations cost, and frames per second."""
+
+    def run(self) -> None:
+        from evaluation import score_samplers
+        from evaluation.score_page import print_result
+
+        self._make(
+            "samplers", lambda config, source, p: score_samplers.run(config, source, self.out, progress=p)
+        )
+        print_result(self.out / "samplers")
 
 
 @dataclass(frozen=True)

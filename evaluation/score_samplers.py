@@ -1,0 +1,125 @@
+"""Stage `samplers`: what fewer network evaluations cost. Behind `ddgrasp ddg samplers`.
+
+One fitted generator, every sampler it has, the same simulated episodes: distance to recorded depth, holes,
+and frames per second from clean to grafted depth (meant for a machine that does nothing else). Samplers are
+scored one by one and episode by episode: what was finished is kept.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.progress import Progress
+from evaluation import holes, score_data, score_features, score_table
+from evaluation.score_domains import FLOOR, RAW, Methods
+from evaluation.score_episodes import Load, Scored, collect, score_episodes
+
+if TYPE_CHECKING:
+    from ddg_jax.sample import Generator
+
+STAGE = "samplers"
+JSON = "samplers.json"
+REFERENCE = ("ddim", 50)
+PLAIN = (REFERENCE, ("ddim", 10), ("ddim", 4), ("dpm_solver", 8), ("dpm_solver", 4))
+TARGET = 1.1
+"""FID of a sampler of at most 4 evaluations over that of REFERENCE."""
+TIMED_FRAMES = 64
+_DDG = "sim_ddg"
+
+
+def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Artifact:
+    """Scores every sampler of the generator in `run_dir`/ddg; works in `out`/samplers."""
+    directory = out / STAGE
+    config = replace(config, score=replace(config.score, columns=("sim_gt", "ddg")))
+    generators = dict(_generators(run_dir / "ddg"))
+    start = Methods(config.score, config.seed, generators["ddim 50"])
+    files = score_data.record_rig(config, run_dir, directory / "data", start.needs_rgb, progress)
+    loads = [partial(score_data.load_episode, file) for file in files]
+    extractor = score_features.load(config.score.features[0])
+    known = score_episodes(start, [extractor], loads, [RAW, FLOOR, "sim_gt"], directory / "known", progress)
+    common, simulated = collect(known), loads[len(loads) // 2 :]
+    rows = {}
+    for name, generator in generators.items():
+        progress.note(name)
+        methods = Methods(config.score, config.seed, generator)
+        folder = directory / name.replace(" ", "_")
+        made = collect(score_episodes(methods, [extractor], simulated, [_DDG], folder, progress, label=name))
+        rows[name] = _row(common, made, extractor.name, config)
+        rows[name]["frames_per_s"] = _frames_per_s(generator, simulated)
+    for row in rows.values():
+        row["over_reference"] = row["fid"]["value"] / rows["ddim 50"]["fid"]["value"]
+    recorded = holes.figures(holes.added(common.sums[FLOOR]))
+    result = {"features": {extractor.name: extractor.source}, "recorded": recorded, "samplers": rows}
+    artifacts.atomic_write_json(directory / JSON, result)
+    parents = [artifacts.read_artifact(run_dir / name) for name in ("teacher", "ddg")]
+    metrics = {"samplers": table(rows), "targets": [_target(rows)]}
+    return artifacts.finish(
+        directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=parents
+    )
+
+
+def _generators(directory: Path) -> Iterator[tuple[str, "Generator"]]:
+    """Name -> the fitted generator with that sampler; distilled ones as far as they were made."""
+    from ddg_jax.sample import PROGRESSIVE, Generator
+
+    for sampler, steps in PLAIN:
+        yield f"{sampler} {steps}", Generator.load(directory, sampler, steps)
+    for file in sorted(directory.glob("distilled_*.msgpack"), reverse=True):
+        steps = int(file.stem.split("_")[1])
+        yield f"{PROGRESSIVE} {steps}", Generator.load(directory, PROGRESSIVE, steps)
+
+
+def _row(common: Scored, made: Scored, extractor: str, config: Config) -> dict[str, Any]:
+    samples = {**common.features[extractor], **made.features[extractor]}
+    figures = score_table.make_table(samples, config.score, config.seed)["ddg"]
+    figures.pop("resampled_fid")
+    return {**figures, "holes": holes.figures(holes.added(made.sums[_DDG]))}
+
+
+def _frames_per_s(generator: "Generator", loads: Sequence[Load]) -> float:
+    """Of `ddg_jax.sample.generate` on TIMED_FRAMES frames, compiled before."""
+    from ddg_jax.sample import generate
+
+    episodes = [load() for load in loads[: TIMED_FRAMES // len(loads[0]().clean_mm) + 1]]
+    depth_m = score_data.metres(np.concatenate([e.clean_mm for e in episodes])[:TIMED_FRAMES])
+    colours = [e.rgb for e in episodes if e.rgb is not None]
+    rgb = np.concatenate(colours)[:TIMED_FRAMES] if colours else None
+    generate(jax.random.key(0), generator, depth_m, rgb)
+    begun = time.perf_counter()
+    generate(jax.random.key(1), generator, depth_m, rgb)
+    return len(depth_m) / (time.perf_counter() - begun)
+
+
+def table(rows: dict[str, Any]) -> list[dict[str, str]]:
+    """The rows as text."""
+    return [
+        {
+            "sampler": name, "FID": score_table.describe(row["fid"]),
+            "FID / Sim GT's": score_table.describe(row["fid_ratio"]),
+            "over ddim 50": f"{row['over_reference']:.2f}",
+            "hole regions per frame": f"{row['holes']['components_per_frame']:.1f}",
+            "invalid pixels": f"{100 * row['holes']['invalid_share']:.2f} %",
+            "flicker": f"{100 * row['holes']['flicker']:.2f} %",
+            "frames/s": f"{row['frames_per_s']:.1f}",
+        }
+        for name, row in rows.items()
+    ]  # fmt: skip
+
+
+def _target(rows: dict[str, Any]) -> dict[str, str]:
+    few = {name: row["over_reference"] for name, row in rows.items() if int(name.split()[1]) <= 4}
+    best = min(few, key=lambda name: few[name])
+    return {
+        "target": f"at most 4 evaluations: FID <= {TARGET} of 50 steps'",
+        "measured": f"{best}: {few[best]:.2f}",
+        "met": "met" if few[best] <= TARGET else "not met",
+    }
