@@ -154,8 +154,9 @@ def sample(
         return (x, x_0), None
 
     start = noise(start_key)
-    path = np.append(visited[:1], visited), visited, diffusion.previous_steps(visited)
-    (x, _), _ = jax.lax.scan(body, (start, start), (path[0][:-1], *path[1:]))
+    before = np.append(visited[:1], visited[:-1])
+    path = jnp.asarray(before), jnp.asarray(visited), jnp.asarray(diffusion.previous_steps(visited))
+    (x, _), _ = jax.lax.scan(body, (start, start), path)
     return x
 
 
