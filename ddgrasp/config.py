@@ -365,7 +365,7 @@ class DDGConfig:
     """Nearest depth that is told apart (depth only)."""
     far_m: float = 10.0
     """Farthest depth that is told apart (depth only)."""
-    noise_threshold: float = 0.0
+    noise_threshold: float = 0.4
     """The paper's: below it a generated pixel is a hole. Holes are -1, surfaces 1 (depth: 0 to 1, where -0.2
     is better; docs/generator.md)."""
     deviation_threshold: float = 0.0005
@@ -444,7 +444,7 @@ class DDGConfig:
     """Optimiser steps per halving of the evaluations (sampler progressive only)."""
     eta: float = 0.0
     """Fresh noise in DDIM: 0 none, 1 as much as DDPM."""
-    frame_correlation: float = 0.6
+    frame_correlation: float = 0.8
     """Share of the initial noise's variance that the frames of an episode have in common: decides the flicker
     (docs/generator.md)."""
     sample_batch: int = 16
