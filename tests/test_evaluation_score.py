@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ddg_jax import stage as ddg_stage
+from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator
 from ddgrasp import artifacts, cli
 from ddgrasp.config import Config, DDGConfig, RecordConfig, ScoreConfig
@@ -48,6 +49,7 @@ CONFIG = Config(
         sample_batch=4,
         checkpoint_every=2,
         prior_input_px=28,
+        noise_threshold=0.0,
     ),
 )
 SIZES = [
@@ -115,7 +117,9 @@ def test_the_score_has_every_column_the_floor_and_the_targets(scored):
 def test_hole_figures_say_what_must_be_so(scored):
     holes = json.loads((scored / "score" / "score.json").read_text())["holes"]
     value = {name: {k: v["value"] for k, v in item["figures"].items()} for name, item in holes.items()}
-    assert value["sim_gt"]["rmse_mm"] == value["sim_ddg"]["rmse_mm"] == 0  # grafted: exact where valid
+    assert value["sim_gt"]["rmse_mm"] == value[LIMIT]["rmse_mm"] == 0  # exact where valid
+    # an unfitted network errs at random, but no farther than a deviation can be
+    assert 0 <= value["sim_ddg"]["rmse_mm"] < 1000 * LIMIT_PER_M * 3.0**2
     assert value["real_inpaint"]["invalid_share"] == 0
     assert value["real_raw"]["invalid_share"] > 0.05 and value["real_raw"]["gap_depth_m"] == 0
     assert 0 < value["sim_sensed"]["repeat_iou"] < 1
@@ -225,7 +229,8 @@ def test_domains_belong_to_one_side_and_depend_on_seed_and_episode_alone(run_dir
     again = sense(methods, episode("sim"), ["sim_ddg"])["sim_ddg"]
     np.testing.assert_array_equal(again, sim["sim_ddg"])
     kept = sim["sim_ddg"] > 0
-    np.testing.assert_array_equal(sim["sim_ddg"][kept], sim["sim_gt"][kept])
+    off_per_m = np.abs(1000 / sim["sim_ddg"][kept] - 1000 / sim["sim_gt"][kept])
+    assert off_per_m.max() <= LIMIT_PER_M + 0.002  # and half a millimetre of rounding
     other = sense(replace(methods, seed=1), episode("sim"), ["sim_ddg", "sim_rand_noise"])
     assert any((other[name] != sim[name]).any() for name in other)
 
