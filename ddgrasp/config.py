@@ -370,7 +370,7 @@ class DDGConfig:
     is better; docs/generator.md)."""
     deviation_threshold: float = 0.0005
     """Smallest deviation of inverse depth, 1/m, that is an artefact and grafted: 1/32 px of disparity for a
-    D455 (deviation only). inf grafts holes alone."""
+    D455 (deviation only). 1 grafts holes alone."""
     # --- geometric prior c (ddg_jax/prior.py) ---
     prior: str = "inverse_depth"
     """Where c comes from: inverse_depth (built in), video_depth_anything (the paper's) or depth_anything_v2.
@@ -455,6 +455,11 @@ class DDGConfig:
             "ddg", self, "diffusion_steps", "batch_size", "checkpoint_every", "sample_steps", "sample_batch",
             "distil_steps",
         )  # fmt: skip
+        if not 0 <= self.deviation_threshold < float("inf"):
+            raise UserError(
+                f"ddg.deviation_threshold is {self.deviation_threshold}; expected 0 or more in 1/m, and 1 to "
+                "graft holes alone."
+            )
         halvings, rest = divmod(self.distil_from, self.sample_steps)
         if self.sampler == "progressive" and (rest or halvings < 2 or halvings & (halvings - 1)):
             raise UserError(

@@ -67,12 +67,18 @@ def test_deviations_are_metric_on_any_surface_and_limited():
     # the same deviation is the same disparity at half the distance
     closer = decode(config, x[2:3], jnp.array([0.5])).depth_m
     np.testing.assert_allclose(closer, 1 / (2 + 0.01), rtol=1e-5)
-    assert not decode(replace(config, deviation_threshold=np.inf), x[:5], surface[:5]).mask.any()
+    assert not decode(replace(config, deviation_threshold=1.0), x[:5], surface[:5]).mask.any()
 
 
 def test_an_unknown_representation_is_named():
     with pytest.raises(UserError, match="ddg.representation 'disparity'"):
         channels(DDGConfig(representation="disparity"))
+
+
+@pytest.mark.parametrize("threshold", [-0.1, float("inf"), float("nan")])
+def test_a_threshold_that_no_deviation_has_is_refused(threshold):
+    with pytest.raises(UserError, match=f"ddg.deviation_threshold is {threshold}"):
+        DDGConfig(deviation_threshold=threshold)
 
 
 @pytest.mark.parametrize("representation", ["depth", "deviation"])

@@ -51,6 +51,8 @@ class DDGScore(Scoring):
     """Frames that --real is fitted on."""
     score_frames: int = 40
     """Frames that --real is scored on."""
+    deviation_threshold: float | None = None
+    """For --real: ddg.deviation_threshold instead of the preset's; 1 grafts holes alone."""
 
     def run(self) -> None:
         from evaluation import score
@@ -62,6 +64,8 @@ class DDGScore(Scoring):
             return
         check_count("--fit-frames", self.fit_frames)
         config = replace(get_preset(self.preset), score=self.score, seed=self.seed)
+        if self.deviation_threshold is not None:
+            config = replace(config, ddg=replace(config.ddg, deviation_threshold=self.deviation_threshold))
         root, stage = self.real, pipeline.get_stage("score_real")
 
         def work(progress):
