@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from ddgrasp import artifacts
@@ -87,6 +86,8 @@ def _row(common: Scored, made: Scored, extractor: str, config: Config) -> dict[s
 
 def _frames_per_s(generator: "Generator", loads: Sequence[Load]) -> float:
     """Of `ddg_jax.sample.generate` on TIMED_FRAMES frames, compiled before."""
+    import jax
+
     from ddg_jax.sample import generate
 
     episodes = [load() for load in loads[: TIMED_FRAMES // len(loads[0]().clean_mm) + 1]]

@@ -30,6 +30,7 @@ CONFIG = Config(
         sample_steps=2,
         sample_batch=4,
         holdout_fraction=0.25,
+        noise_threshold=0.0,
     ),
 )
 
