@@ -102,10 +102,7 @@ def load_frames(
 
 def surfaces(depth_m: np.ndarray) -> np.ndarray:
     """Recorded depth (N, H, W) -> the same with holes filled from the background and noise smoothed away."""
-    filled = np.empty_like(depth_m, np.float32)
-    for i, inverse in enumerate(invert(depth_m)):
-        filled[i] = smooth_surface(fill_from_background(inverse))
-    return invert(filled)
+    return np.stack([invert(smooth_surface(fill_from_background(invert(frame)))) for frame in depth_m])
 
 
 def _folders(root: Path) -> list[Path]:

@@ -12,7 +12,7 @@ import numpy as np
 from ddg_jax import data
 from ddg_jax.distil import distil
 from ddg_jax.loop import Params
-from ddg_jax.prior import invert, make_prior
+from ddg_jax.prior import Prior, invert, make_prior
 from ddg_jax.sample import PROGRESSIVE, Generator, grafted, predict
 from ddg_jax.train import fit
 from ddgrasp import artifacts
@@ -47,7 +47,7 @@ def fit_folder(
     prior = make_prior(config.ddg)
     frames = data.load_frames(root, config.ddg, prior, config.seed, progress)
     training, held_out = frames.split(config.ddg.holdout_fraction)
-    generator = fitted_generator(config.ddg, training, directory, config.seed, progress)
+    generator = fitted_generator(config.ddg, prior, training, directory, config.seed, progress)
     scored = held_out.part(slice(-SCORED_FRAMES, None))
     metrics = {
         "prior": prior.name,
@@ -87,13 +87,13 @@ def sample_folder(directory: Path, root: Path, out: Path, *, seed: int, count: i
 
 
 def fitted_generator(
-    config: DDGConfig, frames: data.Frames, directory: Path, seed: int, progress: Progress
+    config: DDGConfig, prior: Prior, frames: data.Frames, directory: Path, seed: int, progress: Progress
 ) -> Generator:
     """A generator fitted on all of `frames`, or the one that `config.init_from` names; distilled if its
     sampler is. Parameters and checkpoints go to `directory`, whence it continues.
     """
     fitted = _loaded(config) if config.init_from else fit(config, frames, directory, seed, progress)
-    generator = Generator(config, fitted, make_prior(config))
+    generator = Generator(config, fitted, prior)
     generator.save(directory)
     if config.sampler != PROGRESSIVE:
         return generator

@@ -366,8 +366,8 @@ class DDGConfig:
     far_m: float = 10.0
     """Farthest depth that is told apart (depth only)."""
     noise_threshold: float = 0.4
-    """The paper's: below it a generated pixel is a hole. Holes are -1, surfaces 1 (depth: 0 to 1, where -0.2
-    is better; docs/generator.md)."""
+    """The paper's: below it a generated pixel is a hole. Holes are -1, surfaces 1 (depth: 0 to 1, which
+    needs a negative one, for example -0.2; docs/generator.md)."""
     deviation_threshold: float = 0.0005
     """Smallest deviation of inverse depth, 1/m, that is an artefact and grafted: 1/32 px of disparity for a
     D455 (deviation only). 1 grafts holes alone."""
@@ -459,6 +459,11 @@ class DDGConfig:
             raise UserError(
                 f"ddg.deviation_threshold is {self.deviation_threshold}; expected 0 or more in 1/m, and 1 to "
                 "graft holes alone."
+            )
+        if self.representation == "depth" and self.noise_threshold > 0:
+            raise UserError(
+                f"ddg.noise_threshold is {self.noise_threshold}; with ddg.representation depth surfaces are "
+                "0 to 1 and would be holes: expected 0 or less, for example -0.2."
             )
         halvings, rest = divmod(self.distil_from, self.sample_steps)
         if self.sampler == "progressive" and (rest or halvings < 2 or halvings & (halvings - 1)):

@@ -133,7 +133,8 @@ LAPTOP = Config(
     ),
     evaluation=EvalConfig(student_trials=60, rig_trials=60),
 )
-"""Everything trained from nothing on two cores (45 minutes on two busy AMD EPYC cores, 2026-11-21)."""
+"""Everything trained from nothing on two cores (73 minutes of stage time on two AMD EPYC cores
+that two to four other jobs shared, 2026-11-21)."""
 
 PAPER = Config(
     preset="paper",

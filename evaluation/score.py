@@ -98,7 +98,7 @@ def _fit_real(
     if not artifacts.is_finished(directory):
         prior = make_prior(config.ddg)
         frames = load_frames(root, config.ddg, prior, config.seed, progress, max_frames=fit_frames)
-        fitted_generator(config.ddg, frames, directory, config.seed, progress)
+        fitted_generator(config.ddg, prior, frames, directory, config.seed, progress)
         metrics = {"frames": {"training": len(frames)}}
         artifacts.finish(directory, "ddg", config, seconds=progress.seconds, metrics=metrics)
     return Generator.load(directory)

@@ -104,6 +104,7 @@ def _point(
 
 def _fitted(config: Config, frames: "Frames", folder: Path, progress: Progress) -> "Generator":
     """A generator fitted on `frames`, from its checkpoints if there are any."""
+    from ddg_jax.prior import make_prior
     from ddg_jax.sample import DPM_SOLVER
     from ddg_jax.stage import fitted_generator
 
@@ -111,7 +112,7 @@ def _fitted(config: Config, frames: "Frames", folder: Path, progress: Progress) 
     settings = replace(
         config.ddg, train_steps=steps, init_from="", sampler=DPM_SOLVER, sample_steps=EVALUATIONS
     )
-    return fitted_generator(settings, frames, folder, config.seed, progress)
+    return fitted_generator(settings, make_prior(settings), frames, folder, config.seed, progress)
 
 
 def _frames(config: Config, run_dir: Path, count: int, extra: Path, progress: Progress) -> "Frames":

@@ -40,7 +40,7 @@ def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Arti
     directory = out / STAGE
     config = replace(config, score=replace(config.score, columns=("sim_gt", "ddg")))
     generators = dict(_generators(run_dir / "ddg"))
-    start = Methods(config.score, config.seed, generators["ddim 50"])
+    start = Methods(config.score, config.seed, generators[_name(*REFERENCE)])
     files = score_data.record_rig(config, run_dir, directory / "data", start.needs_rgb, progress)
     loads = [partial(score_data.load_episode, file) for file in files]
     extractor = score_features.load(config.score.features[0])
@@ -55,7 +55,7 @@ def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Arti
         rows[name] = _row(common, made, extractor.name, config)
         rows[name]["frames_per_s"] = _frames_per_s(generator, simulated)
     for row in rows.values():
-        row["over_reference"] = row["fid"]["value"] / rows["ddim 50"]["fid"]["value"]
+        row["over_reference"] = row["fid"]["value"] / rows[_name(*REFERENCE)]["fid"]["value"]
     recorded = holes.figures(holes.added(common.sums[FLOOR]))
     result = {"features": {extractor.name: extractor.source}, "recorded": recorded, "samplers": rows}
     artifacts.atomic_write_json(directory / JSON, result)
@@ -71,10 +71,14 @@ def _generators(directory: Path) -> Iterator[tuple[str, "Generator"]]:
     from ddg_jax.sample import PROGRESSIVE, Generator
 
     for sampler, steps in PLAIN:
-        yield f"{sampler} {steps}", Generator.load(directory, sampler, steps)
+        yield _name(sampler, steps), Generator.load(directory, sampler, steps)
     for file in sorted(directory.glob("distilled_*.msgpack"), reverse=True):
         steps = int(file.stem.split("_")[1])
-        yield f"{PROGRESSIVE} {steps}", Generator.load(directory, PROGRESSIVE, steps)
+        yield _name(PROGRESSIVE, steps), Generator.load(directory, PROGRESSIVE, steps)
+
+
+def _name(sampler: str, steps: int) -> str:
+    return f"{sampler} {steps}"
 
 
 def _row(common: Scored, made: Scored, extractor: str, config: Config) -> dict[str, Any]:
@@ -106,7 +110,7 @@ def table(rows: dict[str, Any]) -> list[dict[str, str]]:
         {
             "sampler": name, "FID": score_table.describe(row["fid"]),
             "FID / Sim GT's": score_table.describe(row["fid_ratio"]),
-            "over ddim 50": f"{row['over_reference']:.2f}",
+            f"over {_name(*REFERENCE)}": f"{row['over_reference']:.2f}",
             "hole regions per frame": f"{row['holes']['components_per_frame']:.1f}",
             "invalid pixels": f"{100 * row['holes']['invalid_share']:.2f} %",
             "flicker": f"{100 * row['holes']['flicker']:.2f} %",

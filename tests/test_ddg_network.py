@@ -75,6 +75,11 @@ def test_an_unknown_representation_is_named():
         channels(DDGConfig(representation="disparity"))
 
 
+def test_a_threshold_among_the_surfaces_is_refused():
+    with pytest.raises(UserError, match=r"ddg.noise_threshold is 0.4.*-0.2"):
+        DDGConfig(representation="depth")
+
+
 @pytest.mark.parametrize("threshold", [-0.1, float("inf"), float("nan")])
 def test_a_threshold_that_no_deviation_has_is_refused(threshold):
     with pytest.raises(UserError, match=f"ddg.deviation_threshold is {threshold}"):

@@ -19,7 +19,7 @@ from ddgrasp.progress import Progress
 from sensors.recordings import RecordingWriter
 
 CONFIG = DDGConfig(height_px=16, width_px=24, widths=(8, 8), blocks=(0, 1), attention_heads=1, sample_steps=2)
-DEPTH = replace(CONFIG, representation="depth")
+DEPTH = replace(CONFIG, representation="depth", noise_threshold=-0.2)
 
 
 def test_a_hole_is_the_same_at_every_threshold_of_the_empty_band():

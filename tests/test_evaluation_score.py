@@ -118,8 +118,8 @@ def test_hole_figures_say_what_must_be_so(scored):
     holes = json.loads((scored / "score" / "score.json").read_text())["holes"]
     value = {name: {k: v["value"] for k, v in item["figures"].items()} for name, item in holes.items()}
     assert value["sim_gt"]["rmse_mm"] == value[LIMIT]["rmse_mm"] == 0  # exact where valid
-    # an unfitted network errs at random, but no farther than a deviation can be
-    assert 0 <= value["sim_ddg"]["rmse_mm"] < 1000 * LIMIT_PER_M * 3.0**2
+    # grafting takes small deviations back and adds none; the rest is rounding to millimetres
+    assert value["sim_ddg"]["rmse_mm"] <= value["sim_ddg_no_graft"]["rmse_mm"] + 0.5
     assert value["real_inpaint"]["invalid_share"] == 0
     assert value["real_raw"]["invalid_share"] > 0.05 and value["real_raw"]["gap_depth_m"] == 0
     assert 0 < value["sim_sensed"]["repeat_iou"] < 1

@@ -12,6 +12,7 @@ from ddgrasp import artifacts, pipeline
 from ddgrasp.commands.base import load_config
 from ddgrasp.commands.checks import check_count
 from ddgrasp.config import Config, DepthFeatureConfig, ScoreConfig
+from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 
 
@@ -59,6 +60,11 @@ class DDGScore(Scoring):
         from evaluation.score_page import print_result
 
         if self.real is None:
+            if self.deviation_threshold is not None:
+                raise UserError(
+                    "--deviation-threshold goes with --real; the rig's generator brings its own: make one "
+                    "with `ddgrasp ddg fit --ddg.deviation-threshold`."
+                )
             self._make("score", lambda config, source, p: score.run(config, source, self.out, progress=p))
             print_result(self.out / "score")
             return
