@@ -34,9 +34,9 @@ RIG_SETTING = (
 )
 REAL_SETTING = (
     "{root}: fitted on the first {fit} frames, scored on the last {score}. Nobody modelled that room: its "
-    "geometry is the recorded depth itself with holes filled from the background, smoothed, of the odd "
-    "frames; recorded depth is the even frames, a frame earlier. So the layout is the same on both sides, "
-    "Sim GT keeps part of the camera's noise, and errors of valid pixels are relative to that stand-in."
+    "geometry is the recorded depth of the odd frames, holes filled, made piecewise smooth "
+    "(evaluation/stand_in.py); recorded depth is the even frames, a frame earlier. So the layout is the same "
+    "on both sides, and errors of valid pixels are relative to that stand-in."
 )
 
 

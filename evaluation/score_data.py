@@ -199,27 +199,15 @@ def _baseline_m(recording: Recording) -> float:
     return float(recording.meta.get("baseline_m", contract.D455.baseline_m))
 
 
-def completed(depth_mm: np.ndarray) -> np.ndarray:
-    """What stands in for simulation where nobody modelled the room: recorded depth (T, H, W) millimetres,
-    holes filled from the background, averaged over neighbouring frames, 5 x 5 median.
-
-    It keeps the room's layout and loses holes and most noise; it is not the room's true depth.
-    """
-    from ddg_jax.prior import invert, smooth_in_time
-    from sensors.holes import fill_from_background
-
-    filled = np.stack([fill_from_background(frame) for frame in invert(metres(depth_mm))])
-    smooth = np.stack([cv2.medianBlur(frame, 5) for frame in smooth_in_time(filled)])
-    return millimetres(invert(smooth))
-
-
 def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
     """The frames as episodes: even ones are the real side, odd ones give the geometry.
 
     Both sides see the same room, a frame apart: the distance between them is the sensor's alone.
     """
+    from evaluation.stand_in import stand_in
+
     depth, rgb = frames.depth_mm, frames.rgb
-    clean = completed(depth)
+    clean = millimetres(stand_in(metres(depth)))
     episodes = []
     for parity, side in enumerate(SIDES):
         for block in range(len(depth) // (2 * BLOCK_FRAMES)):

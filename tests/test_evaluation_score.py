@@ -257,10 +257,3 @@ def test_the_monocular_column_uses_the_users_weights(run_dir, tmp_path):
     with pytest.raises(UserError, match="holds no converted weights"):
         _ = Methods(ScoreConfig(monocular_weights=str(tmp_path / "absent")), 0, generator).monocular
     assert not Methods(ScoreConfig(), 0, generator).needs_rgb
-
-
-def test_completed_depth_has_no_holes_and_keeps_the_surfaces():
-    frames = episode("real")
-    completed = score_data.completed(frames.sensed_mm)
-    assert (completed > 0).all()
-    assert np.abs(completed.astype(int) - frames.clean_mm)[:, 3:-3, 3:-3].max() <= 50

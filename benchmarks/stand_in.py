@@ -1,0 +1,89 @@
+"""How near is the stand-in geometry of real-camera scores to the truth? Measured where the truth is known.
+
+    python -m benchmarks.stand_in runs/laptop/score/data --trajectories 8
+
+The folder holds what `ddgrasp ddg score` recorded of the rig: sensed depth beside the simulator's own. Each
+line makes geometry of the sensed depth. FIDs are relative to Sim GT's (recorded against true geometry). `to
+truth` is the distance of made to true geometry, 0 at best; `Sim GT` and `Inpaint` are those columns with made
+geometry in place of the true one, which the first line has. `error`: mean |1/d - 1/d_true| in 1/m.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ddg_jax.prior import invert, smooth_in_time
+from evaluation import score_features
+from evaluation.distances import fid
+from evaluation.score_data import REAL, SIM, Episode, load_episode, metres, millimetres
+from evaluation.score_domains import inpainted
+from evaluation.stand_in import stand_in
+from sensors.holes import fill_from_background
+
+Make = Callable[[np.ndarray], np.ndarray]
+"""Sensed depth (T, H, W) metres -> geometry, the same."""
+INPAINT_RADIUS_PX = 3.0
+
+
+def filtered(depth_m: np.ndarray) -> np.ndarray:
+    """Holes filled from the background, mean over neighbouring frames, 5 x 5 median."""
+    filled = np.stack([fill_from_background(frame) for frame in invert(depth_m)])
+    return invert(np.stack([cv2.medianBlur(frame, 5) for frame in smooth_in_time(filled)]))
+
+
+def telea(depth_m: np.ndarray) -> np.ndarray:
+    """Inpainted."""
+    return metres(inpainted(millimetres(depth_m), INPAINT_RADIUS_PX))
+
+
+WAYS: dict[str, Make] = {
+    "inpainted": telea,
+    "filled, 5 x 5 median": filtered,
+    "stand_in": stand_in,
+}
+
+
+def measure(real: Sequence[Episode], sim: Sequence[Episode]) -> None:
+    """Prints one line per way."""
+    features = score_features.load("depthfeat-v1")
+
+    def of(maps_m: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate([features(metres(millimetres(depth_m))) for depth_m in maps_m])
+
+    sensed, truth_m = [metres(e.sensed_mm) for e in sim], [metres(e.clean_mm) for e in sim]
+    recorded, truth = of([metres(e.sensed_mm) for e in real]), of(truth_m)
+    whole = of([telea(metres(e.sensed_mm)) for e in real])
+    unit = fid(recorded, truth)
+    print(f"{'':24}{'to truth':>10}{'Sim GT':>10}{'Inpaint':>10}{'error':>10}")
+    print(f"{'truth':24}{0:10.4f}{1:10.3f}{fid(whole, truth) / unit:10.4f}{0:10.5f}")
+    for name, make in WAYS.items():
+        made_m = [make(depth_m) for depth_m in sensed]
+        made = of(made_m)
+        error = np.mean([np.abs(invert(m) - invert(t)).mean() for m, t in zip(made_m, truth_m, strict=True)])
+        print(
+            f"{name:24}{fid(made, truth) / unit:10.4f}{fid(recorded, made) / unit:10.3f}"
+            f"{fid(whole, made) / unit:10.4f}{error:10.5f}",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("data", type=Path, help="RUN/score/data")
+    parser.add_argument("--trajectories", type=int, default=8, help="per side")
+    options = parser.parse_args()
+    real, sim = (
+        [load_episode(file) for file in sorted(options.data.glob(f"{side}_*.npz"))[: options.trajectories]]
+        for side in (REAL, SIM)
+    )
+    if not real or not sim:
+        parser.error(f"{options.data} has no trajectories: run `ddgrasp ddg score` and give its score/data.")
+    measure(real, sim)
+
+
+if __name__ == "__main__":
+    main()
