@@ -21,7 +21,6 @@ from ddg_jax import schedule as diffusion
 from ddg_jax.data import Frames, make_batch
 from ddg_jax.loop import Params, TrainState, first_state, run_steps, updated
 from ddg_jax.train import (
-    SNR_LIMITS,
     config_schedule,
     make_optimizer,
     predict_clean,
@@ -118,7 +117,7 @@ def distil_step(
 
     Pure: its noise comes from `train.step_keys`.
 
-    The student's error in x_0 weighs SNR within SNR_LIMITS (eq. 9 there, with a cap).
+    The student's error in x_0 weighs SNR within `config.snr_limits` (eq. 9 there, with a cap).
 
     Args:
       limit: the teacher's |x_0| is clipped to it.
@@ -142,7 +141,7 @@ def distil_step(
     before = jnp.stack([k, jnp.where(jnp.isfinite(limit), k, path[1])])
     (x, _), _ = jax.lax.scan(teacher_step, (x_k, x_k), (before, path[:2], path[1:]))
     target = jax.lax.stop_gradient(one_step_target(made, x_k, k, x, end))
-    weight = jnp.clip(diffusion.signal_to_noise(made, k), *SNR_LIMITS)
+    weight = jnp.clip(diffusion.signal_to_noise(made, k), *config.snr_limits)
 
     def loss_of(params: Params) -> Array:
         error = (target - predict_clean(config, params, x_k, c, k)) ** 2

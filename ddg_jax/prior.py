@@ -72,11 +72,14 @@ class InverseDepthPrior:
         for t in np.flatnonzero(rng.random(len(inverse)) < self.decoy_share):
             decoy = decoy_holes(holes[rng.integers(len(holes))], rng)
             filled[t] = fill_from_background(np.where(decoy, 0, inverse[t]))
-        return normalise(self._smoothed(smooth_in_time(filled)))
+        return self._scaled(self._smoothed(smooth_in_time(filled)))
 
     def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None = None) -> np.ndarray:
         """See `Prior`."""
-        return normalise(self._smoothed(invert(depth_m)))
+        return self._scaled(self._smoothed(invert(depth_m)))
+
+    def _scaled(self, inverse: np.ndarray) -> np.ndarray:
+        return normalise(inverse)
 
     def _smoothed(self, inverse: np.ndarray) -> np.ndarray:
         """The surface, blurred. Recorded and simulated depth pass the same filters."""
@@ -86,15 +89,32 @@ class InverseDepthPrior:
         return np.stack(smooth)
 
 
+class MetricInverseDepthPrior(InverseDepthPrior):
+    """c = 2 m / d - 2: what lies one metre away is 0, whatever else the sequence shows.
+
+    A stereo camera's noise, range and shadows depend on metric depth. Normalised by its own sequence, the
+    same surface gets another c in every room, which matters to cameras that move.
+    """
+
+    name = "metric_inverse_depth"
+
+    def _scaled(self, inverse: np.ndarray) -> np.ndarray:
+        return 2 * inverse - 2
+
+
+_BUILT_IN = (InverseDepthPrior, MetricInverseDepthPrior)
+
+
 def make_prior(config: DDGConfig) -> Prior:
     """The prior that the configuration names; UserError for another name, or weights that are not there."""
     from ddg_jax.depth_prior import NETWORKS, DepthNetworkPrior
 
     if config.prior in NETWORKS:
         return DepthNetworkPrior(config)
-    if config.prior != InverseDepthPrior.name:
-        raise unknown_name("prior", config.prior, (InverseDepthPrior.name, *NETWORKS))
-    return InverseDepthPrior(config.prior_blur_px, config.decoy_holes)
+    for kind in _BUILT_IN:
+        if config.prior == kind.name:
+            return kind(config.prior_blur_px, config.decoy_holes)
+    raise unknown_name("prior", config.prior, (*(kind.name for kind in _BUILT_IN), *NETWORKS))
 
 
 def invert(depth_m: np.ndarray) -> np.ndarray:

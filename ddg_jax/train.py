@@ -24,9 +24,6 @@ WARMUP_STEPS = 50
 FINAL_LEARNING_RATE = 0.05
 """Share of the learning rate left at the end."""
 MAX_GRAD_NORM = 1.0
-SNR_LIMITS = (1.0, 25.0)
-"""Weights of an error in x_0. Up to the upper one slight noise counts, where single-pixel holes and roughness
-of surfaces are decided; the lower one keeps the layout of holes, which is decided in strong noise."""
 CHECKPOINTS = "checkpoints"
 
 
@@ -85,14 +82,14 @@ def predict_noise(config: DDGConfig, params: Params, x_k: Array, c: Array, step:
 def loss_weight(config: DDGConfig, step: Array) -> Array:
     """Weight of each step's noise error, (B,).
 
-    "uniform" is the paper's 1. "truncated" is clip(SNR, *SNR_LIMITS) / SNR: per unit of error in x_0 no step
-    weighs less than the floor (Salimans & Ho 2022, section 4) nor more than a cap (Hang et al. 2023).
+    "uniform" is the paper's 1. "truncated" is clip(SNR, *config.snr_limits) / SNR: per unit of error in x_0
+    no step weighs less than the floor (Salimans & Ho 2022, section 4) nor more than a cap (Hang et al. 2023).
     """
     if config.loss_weight == "uniform":
         return jnp.ones(step.shape)
     if config.loss_weight == "truncated":
         snr = diffusion.signal_to_noise(config_schedule(config), step)
-        return jnp.clip(snr, *SNR_LIMITS) / snr
+        return jnp.clip(snr, *config.snr_limits) / snr
     raise unknown_name("loss weight", config.loss_weight, ("uniform", "truncated"))
 
 

@@ -373,8 +373,8 @@ class DDGConfig:
     D455 (deviation only). 1 grafts holes alone."""
     # --- geometric prior c (ddg_jax/prior.py) ---
     prior: str = "inverse_depth"
-    """Where c comes from: inverse_depth (built in), video_depth_anything (the paper's) or depth_anything_v2.
-    """
+    """Where c comes from: inverse_depth (normalised, built in), metric_inverse_depth (not normalised: for
+    cameras that move), video_depth_anything (the paper's) or depth_anything_v2."""
     prior_weights: str = ""
     """Folder of the network's converted weights; empty takes weights/<prior>_small."""
     prior_in_sim: str = "depth"
@@ -421,6 +421,9 @@ class DDGConfig:
     loss_weight: str = "truncated"
     """Weight of a diffusion step's error: uniform (the paper's) or truncated (more weight on noisy steps,
     which few-step sampling needs)."""
+    snr_limits: tuple[float, float] = (1.0, 25.0)
+    """Least and greatest weight of an error in the clean map (truncated only). The upper one counts in slight
+    noise, where single pixels and roughness are decided; the layout of holes is decided in strong noise."""
     ema_decay: float = 0.995
     """Decay of the averaged parameters, which are the ones used."""
     checkpoint_every: int = 250
@@ -459,6 +462,10 @@ class DDGConfig:
             raise UserError(
                 f"ddg.deviation_threshold is {self.deviation_threshold}; expected 0 or more in 1/m, and 1 to "
                 "graft holes alone."
+            )
+        if not 0 < self.snr_limits[0] <= self.snr_limits[1] < float("inf"):
+            raise UserError(
+                f"ddg.snr_limits is {self.snr_limits}; expected two numbers above 0, the smaller one first."
             )
         if self.representation == "depth" and self.noise_threshold > 0:
             raise UserError(

@@ -42,6 +42,17 @@ def test_prior_ignores_affine_changes_of_inverse_depth():
     assert abs(np.median(c)) < 0.02 and abs(np.mean(np.abs(c)) - 0.5) < 0.02
 
 
+def test_the_metric_prior_says_how_far_a_surface_is_whatever_else_is_seen():
+    made = prior.make_prior(DDGConfig(prior="metric_inverse_depth"))
+    near, far = np.full((1, 24, 32), 1.0, np.float32), np.full((1, 24, 32), 4.0, np.float32)
+    mixed = np.concatenate([near[:, :12], far[:, :12]], axis=1)
+    np.testing.assert_allclose(made.from_sim(near), 0, atol=1e-6)
+    np.testing.assert_allclose(made.from_sim(mixed)[0, 2], 0, atol=1e-6)
+    np.testing.assert_allclose(made.from_sim(mixed)[0, -2], made.from_sim(far)[0, -2], atol=1e-6)
+    rng = np.random.default_rng(0)
+    np.testing.assert_allclose(made.from_recording(mixed, None, rng), made.from_sim(mixed), atol=1e-6)
+
+
 def test_recording_and_simulation_of_one_scene_give_the_same_prior():
     clean = np.full((3, 24, 32), 1.5, np.float32)
     clean[:, 8:16, 12:22] = 0.8

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from ddg_jax import loop, sample, train
+from ddg_jax import loop, sample, schedule, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
 from ddgrasp.config import DDGConfig
@@ -41,6 +41,16 @@ def pictures(count: int = 16) -> Frames:
         noisy[i, row : row + 6, column - 4 : column] = 0
     c = np.stack([make_prior(TINY).from_sim(f[None], None)[0] for f in clean]).astype(np.float16)
     return Frames(noisy, clean, c, np.zeros(count, int))
+
+
+def test_an_error_in_the_clean_map_weighs_snr_within_its_limits():
+    config = dataclasses.replace(TINY, snr_limits=(0.5, 3.0))
+    step = np.arange(config.diffusion_steps)
+    snr = np.asarray(schedule.signal_to_noise(train.config_schedule(config), step))
+    assert snr.min() < 0.5 and snr.max() > 3.0
+    # An error e in x_0 is sqrt(SNR) e in eps.
+    per_x_0 = np.asarray(train.loss_weight(config, step)) * snr
+    np.testing.assert_allclose(per_x_0, np.clip(snr, 0.5, 3.0), rtol=1e-5)
 
 
 def test_resume_equals_an_uninterrupted_run(tmp_path):

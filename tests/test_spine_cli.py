@@ -163,6 +163,7 @@ def _with(section: str, **values):
         ("teacher", {"init_from": "pretrained/student"}, "holds no policy.msgpack: run it from the rep"),
         ("ddg", {"init_from": "runs/no"}, "ddg.init_from is 'runs/no', which does not exist"),
         ("ddg", {"prior": "inverse_dept"}, "Unknown prior 'inverse_dept'. Did you mean 'inverse_depth'"),
+        ("ddg", {"snr_limits": (5.0, 1.0)}, r"snr_limits is \(5.0, 1.0\); expected two numbers above"),
         ("ddg", {"prior_in_sim": "deph"}, "Unknown ddg.prior_in_sim 'deph'. Did you mean 'depth'"),
         ("ddg", {"prior": "depth_anything_v2", "prior_weights": "no"}, "no holds no converted weights"),
         ("export", {"depth_dtype": "uint8"}, "'uint8'; expected one of uint16_mm, float32_m"),
