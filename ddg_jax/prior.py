@@ -9,15 +9,19 @@ occlusion shadow), c is smoothed (which hides the noise of recorded surfaces too
 under decoy holes as well.
 """
 
+from collections.abc import Iterable
 from typing import Protocol
 
 import cv2
 import numpy as np
 
+from ddg_jax.piecewise import piecewise_smooth
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import unknown_name
 from sensors.holes import fill_from_background, smooth_surface
 
+FILTERED, PIECEWISE = SURFACES = ("filtered", "piecewise")
+"""Where the surface under recorded depth comes from: sensors/holes.py, ddg_jax/piecewise.py."""
 C_LIMIT = 2.5
 """|c| never exceeds this."""
 SAME_SURFACE = 0.05
@@ -58,9 +62,10 @@ class InverseDepthPrior:
     needs_rgb = needs_sim_rgb = False
     source: str | dict[str, str] = "built-in"
 
-    def __init__(self, blur_px: float, decoy_share: float = 0.0):
+    def __init__(self, blur_px: float, decoy_share: float = 0.0, surface: str = FILTERED):
         self.blur_px = blur_px
         self.decoy_share = decoy_share
+        self.surface = surface
 
     def from_recording(
         self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator
@@ -68,25 +73,27 @@ class InverseDepthPrior:
         """See `Prior`; `rng` chooses the frames filled under decoy holes and their shapes."""
         inverse = invert(depth_m)
         holes = inverse == 0
-        filled = np.stack([fill_from_background(frame) for frame in inverse])
         for t in np.flatnonzero(rng.random(len(inverse)) < self.decoy_share):
-            decoy = decoy_holes(holes[rng.integers(len(holes))], rng)
-            filled[t] = fill_from_background(np.where(decoy, 0, inverse[t]))
-        return self._scaled(self._smoothed(smooth_in_time(filled)))
+            inverse[t][decoy_holes(holes[rng.integers(len(holes))], rng)] = 0
+        if self.surface == PIECEWISE:
+            return self._scaled(self._blurred([piecewise_smooth(frame) for frame in inverse]))
+        filled = np.stack([fill_from_background(frame) for frame in inverse])
+        return self._scaled(self._blurred(map(smooth_surface, smooth_in_time(filled))))
 
     def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None = None) -> np.ndarray:
         """See `Prior`."""
-        return self._scaled(self._smoothed(invert(depth_m)))
+        inverse = invert(depth_m)
+        # Filters that edges do not survive whole are passed by both sides.
+        seen = inverse if self.surface == PIECEWISE else map(smooth_surface, inverse)
+        return self._scaled(self._blurred(seen))
 
     def _scaled(self, inverse: np.ndarray) -> np.ndarray:
         return normalise(inverse)
 
-    def _smoothed(self, inverse: np.ndarray) -> np.ndarray:
-        """The surface, blurred. Recorded and simulated depth pass the same filters."""
-        smooth = [smooth_surface(frame) for frame in inverse]
+    def _blurred(self, inverse: Iterable[np.ndarray]) -> np.ndarray:
         if self.blur_px > 0:
-            smooth = [cv2.GaussianBlur(frame, (0, 0), self.blur_px) for frame in smooth]
-        return np.stack(smooth)
+            inverse = (cv2.GaussianBlur(frame, (0, 0), self.blur_px) for frame in inverse)
+        return np.stack(list(inverse))
 
 
 class MetricInverseDepthPrior(InverseDepthPrior):
@@ -109,11 +116,13 @@ def make_prior(config: DDGConfig) -> Prior:
     """The prior that the configuration names; UserError for another name, or weights that are not there."""
     from ddg_jax.depth_prior import NETWORKS, DepthNetworkPrior
 
+    if config.surface not in SURFACES:
+        raise unknown_name("ddg.surface", config.surface, SURFACES)
     if config.prior in NETWORKS:
         return DepthNetworkPrior(config)
     for kind in _BUILT_IN:
         if config.prior == kind.name:
-            return kind(config.prior_blur_px, config.decoy_holes)
+            return kind(config.prior_blur_px, config.decoy_holes, config.surface)
     raise unknown_name("prior", config.prior, (*(kind.name for kind in _BUILT_IN), *NETWORKS))
 
 

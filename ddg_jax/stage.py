@@ -105,8 +105,9 @@ def _loaded(config: DDGConfig) -> Params:
     source = Path(config.init_from)
     generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source, sampler="ddim")
     for name in (
-        "height_px", "width_px", "representation", "near_m", "far_m", "prior", "space_to_depth", "widths",
-        "blocks", "attention_heads", "diffusion_steps", "schedule", "log_snr_shift",
+        "height_px", "width_px", "representation", "surface", "near_m", "far_m", "prior",
+        "space_to_depth", "widths", "blocks", "attention_heads", "diffusion_steps", "schedule",
+        "log_snr_shift",
     ):  # fmt: skip
         there, here = getattr(generator.config, name), getattr(config, name)
         if there != here:

@@ -371,6 +371,9 @@ class DDGConfig:
     deviation_threshold: float = 0.0005
     """Smallest deviation of inverse depth, 1/m, that is an artefact and grafted: 1/32 px of disparity for a
     D455 (deviation only). 1 grafts holes alone."""
+    surface: str = "filtered"
+    """The surface that recorded depth deviates from: filtered (fast), or piecewise (planes with sharp edges;
+    nearer to the truth, a third of a second a frame; ddg_jax/piecewise.py)."""
     # --- geometric prior c (ddg_jax/prior.py) ---
     prior: str = "inverse_depth"
     """Where c comes from: inverse_depth (normalised, built in), metric_inverse_depth (not normalised: for

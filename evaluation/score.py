@@ -35,7 +35,7 @@ RIG_SETTING = (
 REAL_SETTING = (
     "{root}: fitted on the first {fit} frames, scored on the last {score}. Nobody modelled that room: its "
     "geometry is the recorded depth of the odd frames, holes filled, made piecewise smooth "
-    "(evaluation/stand_in.py); recorded depth is the even frames, a frame earlier. So the layout is the same "
+    "(ddg_jax/piecewise.py); recorded depth is the even frames, a frame earlier. So the layout is the same "
     "on both sides, and errors of valid pixels are relative to that stand-in."
 )
 

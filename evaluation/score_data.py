@@ -204,10 +204,10 @@ def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
 
     Both sides see the same room, a frame apart: the distance between them is the sensor's alone.
     """
-    from evaluation.stand_in import stand_in
+    from ddg_jax.data import PIECEWISE, surfaces
 
     depth, rgb = frames.depth_mm, frames.rgb
-    clean = millimetres(stand_in(metres(depth)))
+    clean = millimetres(surfaces(metres(depth), PIECEWISE))
     episodes = []
     for parity, side in enumerate(SIDES):
         for block in range(len(depth) // (2 * BLOCK_FRAMES)):

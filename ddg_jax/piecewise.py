@@ -1,9 +1,9 @@
-"""Geometry of rooms that nobody modelled: a camera's own depth, made whole and piecewise smooth.
+"""Recorded depth made whole and piecewise smooth: the geometry of rooms that nobody modelled.
 
 Simulated depth has no holes, no noise, and surfaces that end at sharp edges. Recorded depth gets there by the
 total generalised variation of inverse depth, in which planes cost nothing (Bredies, Kunisch & Pock 2010),
 with edge weights as in depth upsampling (Ferstl et al. 2013). How near that comes to the true geometry is
-measured where it is known, on the rig: `benchmarks/stand_in.py`.
+measured where it is known, on the rig: `benchmarks/surfaces.py`.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ddg_jax.prior import invert
 from sensors.holes import fill_from_background
 
 FIDELITY = 0.5
@@ -32,16 +31,8 @@ _STEP = 12**-0.5
 """Primal and dual step: the operator's squared norm is at most 12."""
 
 
-def stand_in(depth_m: np.ndarray) -> np.ndarray:
-    """Recorded depth (T, H, W) metres, 0 = invalid -> every pixel measured or filled, surfaces smooth.
-
-    Frame by frame: neighbours of a moving camera see the room from elsewhere.
-    """
-    return np.stack([invert(_piecewise_smooth(frame)) for frame in invert(depth_m)])
-
-
-def _piecewise_smooth(inverse: np.ndarray) -> np.ndarray:
-    """(H, W) inverse depth in 1/m, 0 = unknown -> without unknowns, noise and blurred edges."""
+def piecewise_smooth(inverse: np.ndarray) -> np.ndarray:
+    """(H, W) inverse depth in 1/m, 0 = unknown -> without unknowns, noise and blurred edges; 0 if all are."""
     start = fill_from_background(inverse)
     fidelity = FIDELITY * (inverse > 0).astype(np.float32)
     solved = _minimise(jnp.asarray(start) / _UNIT_PER_M, jnp.asarray(fidelity), jnp.asarray(_edges(start)))

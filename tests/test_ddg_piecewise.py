@@ -1,9 +1,13 @@
-"""The geometry that stands in for simulation in scores of real cameras."""
+"""Recorded depth made whole and piecewise smooth."""
 
 import numpy as np
 import pytest
 
-from evaluation.stand_in import stand_in
+from ddg_jax.data import surfaces
+from ddg_jax.piecewise import piecewise_smooth
+from ddg_jax.prior import PIECEWISE, invert, make_prior
+from ddgrasp.config import DDGConfig
+from ddgrasp.errors import UserError
 
 HEIGHT, WIDTH = 60, 80
 NOISE_PER_M = 0.004
@@ -25,7 +29,7 @@ def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_every_pixel_has_depth_and_noise_is_gone(scene):
     truth, recorded, _ = scene
     known = recorded > 0
-    made = 1 / stand_in(np.divide(1, recorded, out=np.zeros_like(recorded), where=known)[None])[0]
+    made = piecewise_smooth(recorded)
     assert np.isfinite(made).all() and (made > 0).all()
     assert np.abs(recorded - truth)[known].mean() > 0.7 * NOISE_PER_M
     assert np.median(np.abs(made - truth)) < 0.25 * NOISE_PER_M
@@ -34,17 +38,22 @@ def test_every_pixel_has_depth_and_noise_is_gone(scene):
 def test_edges_stay_sharp(scene):
     """Hardly a pixel between the surfaces (the box's corners, which a median rounds)."""
     truth, recorded, box = scene
-    made = 1 / stand_in(np.divide(1, recorded, out=np.zeros_like(recorded), where=recorded > 0)[None])[0]
+    made = piecewise_smooth(recorded)
     for surface in (box, ~box):
         assert np.mean(np.abs(made - truth)[surface] > 0.1) < 0.03
 
 
-def test_frames_are_made_one_by_one(scene):
-    _, recorded, _ = scene
-    depth_m = np.divide(1, recorded, out=np.zeros_like(recorded), where=recorded > 0)
-    both = stand_in(np.stack([depth_m, depth_m[::-1]]))
-    np.testing.assert_array_equal(both[0], stand_in(depth_m[None])[0])
-
-
 def test_a_frame_without_any_depth_stays_empty():
-    assert not stand_in(np.zeros((1, HEIGHT, WIDTH), np.float32)).any()
+    assert not piecewise_smooth(np.zeros((HEIGHT, WIDTH), np.float32)).any()
+
+
+def test_prior_and_surface_of_the_generator_take_it(scene):
+    """The prior of a recording is that of simulation, but for the camera's noise."""
+    truth, recorded, _ = scene
+    depth_m = invert(recorded[None])
+    made = make_prior(DDGConfig(prior="metric_inverse_depth", surface=PIECEWISE, decoy_holes=0.0))
+    np.testing.assert_allclose(surfaces(depth_m, PIECEWISE)[0], 1 / piecewise_smooth(recorded), rtol=1e-3)
+    c = made.from_recording(depth_m, None, np.random.default_rng(0))
+    assert np.median(np.abs(c - made.from_sim(invert(truth[None]), None))) < 2 * 0.25 * NOISE_PER_M
+    with pytest.raises(UserError, match="Unknown ddg.surface 'piecewice'. Did you mean 'piecewise'"):
+        make_prior(DDGConfig(surface="piecewice"))

@@ -1,6 +1,6 @@
-"""How near is the stand-in geometry of real-camera scores to the truth? Measured where the truth is known.
+"""How near are surfaces made of recorded depth to the truth? Measured where the truth is known.
 
-    python -m benchmarks.stand_in runs/laptop/score/data --trajectories 8
+    python -m benchmarks.surfaces runs/laptop/score/data --trajectories 8
 
 The folder holds what `ddgrasp ddg score` recorded of the rig: sensed depth beside the simulator's own. Each
 line makes geometry of the sensed depth. FIDs are relative to Sim GT's (recorded against true geometry). `to
@@ -10,28 +10,21 @@ geometry in place of the true one, which the first line has. `error`: mean |1/d 
 
 import argparse
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from ddg_jax.prior import invert, smooth_in_time
+from ddg_jax.data import surfaces
+from ddg_jax.prior import SURFACES, invert
 from evaluation import score_features
 from evaluation.distances import fid
 from evaluation.score_data import REAL, SIM, Episode, load_episode, metres, millimetres
 from evaluation.score_domains import inpainted
-from evaluation.stand_in import stand_in
-from sensors.holes import fill_from_background
 
 Make = Callable[[np.ndarray], np.ndarray]
 """Sensed depth (T, H, W) metres -> geometry, the same."""
 INPAINT_RADIUS_PX = 3.0
-
-
-def filtered(depth_m: np.ndarray) -> np.ndarray:
-    """Holes filled from the background, mean over neighbouring frames, 5 x 5 median."""
-    filled = np.stack([fill_from_background(frame) for frame in invert(depth_m)])
-    return invert(np.stack([cv2.medianBlur(frame, 5) for frame in smooth_in_time(filled)]))
 
 
 def telea(depth_m: np.ndarray) -> np.ndarray:
@@ -41,8 +34,7 @@ def telea(depth_m: np.ndarray) -> np.ndarray:
 
 WAYS: dict[str, Make] = {
     "inpainted": telea,
-    "filled, 5 x 5 median": filtered,
-    "stand_in": stand_in,
+    **{kind: partial(surfaces, kind=kind) for kind in SURFACES},
 }
 
 
