@@ -1,4 +1,6 @@
-"""The four named configurations. Presets are values: nothing branches on a preset's name."""
+"""The named configurations. Presets are values: nothing branches on a preset's name."""
+
+from dataclasses import replace
 
 from ddgrasp.config import (
     Config,
@@ -136,6 +138,21 @@ LAPTOP = Config(
 """Everything trained from nothing on two cores (73 minutes of stage time on two AMD EPYC cores
 that two to four other jobs shared, 2026-11-21)."""
 
+CAMERA = replace(
+    LAPTOP,
+    preset="camera",
+    ddg=DDGConfig(
+        surface="piecewise",
+        prior="metric_inverse_depth",
+        snr_limits=(1.0, 3.0),
+        noise_threshold=-0.2,
+        blocks=(1, 1, 1),
+        train_steps=300,
+    ),
+)
+"""`laptop` with a generator for short recordings of a real camera that moves: about 80 frames
+(docs/score.md); longer recordings bear more steps."""
+
 PAPER = Config(
     preset="paper",
     world=WorldConfig(backend="jax", camera_scale=0.5),
@@ -156,7 +173,7 @@ PAPER = Config(
 )  # fmt: skip
 """The paper's sizes, for one GPU. Not run yet."""
 
-PRESETS = {config.preset: config for config in (DEBUG, DEMO, LAPTOP, PAPER)}
+PRESETS = {config.preset: config for config in (DEBUG, DEMO, LAPTOP, CAMERA, PAPER)}
 
 
 def get_preset(name: str) -> Config:

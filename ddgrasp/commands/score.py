@@ -12,7 +12,6 @@ from ddgrasp import artifacts, pipeline
 from ddgrasp.commands.base import load_config
 from ddgrasp.commands.checks import check_count
 from ddgrasp.config import Config, DepthFeatureConfig, ScoreConfig
-from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 
 
@@ -52,26 +51,17 @@ class DDGScore(Scoring):
     """Frames that --real is fitted on."""
     score_frames: int = 40
     """Frames that --real is scored on."""
-    deviation_threshold: float | None = None
-    """For --real: ddg.deviation_threshold instead of the preset's; 1 grafts holes alone."""
 
     def run(self) -> None:
         from evaluation import score
         from evaluation.score_page import print_result
 
         if self.real is None:
-            if self.deviation_threshold is not None:
-                raise UserError(
-                    "--deviation-threshold goes with --real; the rig's generator brings its own: make one "
-                    "with `ddgrasp ddg fit --ddg.deviation-threshold`."
-                )
             self._make("score", lambda config, source, p: score.run(config, source, self.out, progress=p))
             print_result(self.out / "score")
             return
         check_count("--fit-frames", self.fit_frames)
         config = replace(get_preset(self.preset), score=self.score, seed=self.seed)
-        if self.deviation_threshold is not None:
-            config = replace(config, ddg=replace(config.ddg, deviation_threshold=self.deviation_threshold))
         root, stage = self.real, pipeline.get_stage("score_real")
 
         def work(progress):
