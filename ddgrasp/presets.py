@@ -145,7 +145,6 @@ CAMERA = replace(
         surface="piecewise",
         prior="metric_inverse_depth",
         snr_limits=(1.0, 3.0),
-        noise_threshold=-0.2,
         blocks=(1, 1, 1),
         train_steps=300,
     ),
