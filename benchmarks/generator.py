@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks import compare
 from ddg_jax.prior import make_prior
-from ddg_jax.representation import channels
+from ddg_jax.representation import channels, correlations
 from ddg_jax.sample import DPM_SOLVER, PROGRESSIVE, Generator, condition, frame_noise, generate, grafted
 from ddg_jax.train import init_params, predict_noise
 from ddgrasp.config import DDGConfig
@@ -74,7 +74,7 @@ def parts(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
     shape = (config.height_px, config.width_px, channels(config))
     x = np.zeros((batch, *shape), np.float32)
     network = jax.jit(lambda p, x, c: predict_noise(config, p, x, c, jnp.full(batch, 500)))
-    noise = jax.jit(partial(frame_noise, shape=shape, correlation=config.frame_correlation))
+    noise = jax.jit(partial(frame_noise, shape=shape, correlation=correlations(config)))
     on_device = jax.device_put((params, x, c))
     runners = {
         "prior": lambda: condition(generator, depth, None, one_episode=True),

@@ -48,6 +48,11 @@ def channels(config: DDGConfig) -> int:
     return 2 if config.representation == DEVIATION else 1
 
 
+def correlations(config: DDGConfig) -> tuple[float, ...]:
+    """Per channel of x: share of its initial noise that an episode's frames have in common."""
+    return (config.frame_correlation, config.deviation_correlation)[: channels(config)]
+
+
 def encode(config: DDGConfig, depth_m: ArrayLike, surface_m: ArrayLike) -> Array:
     """Measured planar metres (0 = hole) of surfaces at `surface_m`, same shape -> x (..., C) float32."""
     depth_m = jnp.asarray(depth_m)

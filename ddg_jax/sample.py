@@ -18,7 +18,7 @@ from ddg_jax.distil import X_LIMIT, params_file
 from ddg_jax.graft import graft
 from ddg_jax.loop import Params
 from ddg_jax.prior import C_LIMIT, Prior, make_prior
-from ddg_jax.representation import channels, decode
+from ddg_jax.representation import channels, correlations, decode
 from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
@@ -83,7 +83,7 @@ def _init_shapes(config: DDGConfig) -> Any:
 
 
 def frame_noise(
-    key: Array, episode: Array, frame: Array, shape: tuple[int, ...], correlation: float
+    key: Array, episode: Array, frame: Array, shape: tuple[int, ...], correlation: float | tuple[float, ...]
 ) -> Array:
     """Standard normal noise (B, *shape): sqrt(r) g_episode + sqrt(1 - r) g_frame, r = `correlation`.
 
@@ -93,7 +93,9 @@ def frame_noise(
     Args:
       episode: its number, a scalar if all frames are of one episode (cheaper), else (B,).
       frame: (B,) int, numbers within the episode.
+      correlation: r, or one for each entry of the last axis.
     """
+    r = jnp.asarray(correlation)
 
     def own(e: Array, t: ArrayLike) -> Array:
         return jax.random.normal(jax.random.fold_in(jax.random.fold_in(key, e), t), shape)
@@ -101,7 +103,7 @@ def frame_noise(
     over_episodes = None if jnp.ndim(episode) == 0 else 0
     shared = own(episode, SHARED) if over_episodes is None else jax.vmap(own, (0, None))(episode, SHARED)
     single = jax.vmap(own, (over_episodes, 0))(episode, frame)
-    return jnp.sqrt(correlation) * shared + jnp.sqrt(1 - correlation) * single
+    return jnp.sqrt(r) * shared + jnp.sqrt(1 - r) * single
 
 
 # --- the reverse process --------------------------------------------------------------------------
@@ -127,15 +129,10 @@ def sample(
     made = config_schedule(config)
     visited = diffusion.timesteps(made.steps, steps, config.sample_spacing)
     size = c.shape[1], c.shape[2]
-    noise = partial(
-        frame_noise,
-        episode=episode,
-        frame=frame,
-        shape=(*size, channels(config)),
-        correlation=config.frame_correlation,
-    )
+    numbered = partial(frame_noise, episode=episode, frame=frame)
+    noise = partial(numbered, shape=(*size, channels(config)), correlation=correlations(config))
     prior_key, start_key, step_key = jax.random.split(key, 3)
-    c = c + config.prior_noise * noise(prior_key, shape=size)
+    c = c + config.prior_noise * numbered(prior_key, shape=size, correlation=config.frame_correlation)
 
     def body(last: tuple[Array, Array], now: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
         (x, x_0_before), (before, k, previous) = last, now

@@ -452,7 +452,10 @@ class DDGConfig:
     """Fresh noise in DDIM: 0 none, 1 as much as DDPM."""
     frame_correlation: float = 0.8
     """Share of the initial noise's variance that the frames of an episode have in common: decides the flicker
-    (docs/generator.md)."""
+    of holes (docs/generator.md)."""
+    deviation_correlation: float = 0.0
+    """The same for the noise that deviations come from: decides how surfaces change in time (representation
+    deviation only)."""
     sample_batch: int = 16
     """Frames generated together on each device."""
 

@@ -9,6 +9,7 @@ import pytest
 from ddg_jax import loop, sample, schedule, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
+from ddg_jax.representation import correlations
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
@@ -123,6 +124,31 @@ def test_frame_noise_is_standard_normal_with_the_stated_correlation():
     assert abs(correlation[0, 1] - 0.9) < 0.01 and abs(correlation[0, 2]) < 0.02
     mixed = sample.frame_noise(key, np.array([1, 0]), frame, (200, 200), 0.9)
     np.testing.assert_allclose(mixed, [other[0], one[1]], atol=1e-6)
+
+
+def test_every_channel_has_its_own_correlation(fitted):
+    config = dataclasses.replace(fitted.config, frame_correlation=0.9, deviation_correlation=0.2)
+    assert correlations(config) == (0.9, 0.2)
+    assert correlations(dataclasses.replace(config, representation="depth", noise_threshold=-0.2)) == (0.9,)
+    noise = sample.frame_noise(
+        jax.random.key(0), 3, np.array([0, 1]), (200, 200, 2), correlations(config)
+    )  # fmt: skip
+    for channel, expected in enumerate(correlations(config)):
+        one, other = np.asarray(noise[..., channel]).reshape(2, -1)
+        assert abs(np.corrcoef(one, other)[0, 1] - expected) < 0.02
+
+
+def test_surfaces_change_in_time_with_the_noise_of_deviations(fitted, scene):
+    """A still scene sensed again: less in common, more change."""
+
+    def change(correlation: float) -> float:
+        config = dataclasses.replace(fitted.config, deviation_correlation=correlation)
+        generator = dataclasses.replace(fitted, config=config)
+        x = sample.predict(jax.random.key(1), generator, fitted.prior.from_sim(scene, None), episode=0)
+        deviation = np.asarray(x)[..., 1]
+        return float(np.mean(np.abs(deviation[1:] - deviation[:-1])))
+
+    assert change(0.0) > 1.2 * change(0.95)
 
 
 def test_batch_of_environments_equals_their_episodes(fitted, scene):
