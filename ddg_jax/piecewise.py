@@ -49,8 +49,6 @@ def _edges(inverse: np.ndarray) -> np.ndarray:
 
 # --- the solver ----------------------------------------------------------------------------------
 # min over u and its slope v:  sum f |u - u_0| + w |Du - v| + b |Ev|,  E the symmetrised derivative
-
-
 # Vectors are tuples of (H, W): stacked, XLA would copy them at every step instead of fusing.
 
 

@@ -6,7 +6,8 @@ inverse depth, from simulation directly, from recordings after filling the holes
 where the holes were, or the generator would look for traces of filling that clean simulated depth never has.
 Three things hide them: filled pixels take the background's depth of their own row (the true surface behind an
 occlusion shadow), c is smoothed (which hides the noise of recorded surfaces too), and some frames are filled
-under decoy holes as well.
+under decoy holes as well. With `surface` piecewise, planes with sharp edges take the place of filling and
+smoothing.
 """
 
 from collections.abc import Iterable

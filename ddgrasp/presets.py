@@ -147,6 +147,7 @@ CAMERA = replace(
         snr_limits=(1.0, 3.0),
         blocks=(1, 1, 1),
         train_steps=300,
+        sample_steps=8,
     ),
 )
 """`laptop` with a generator for short recordings of a real camera that moves: about 80 frames

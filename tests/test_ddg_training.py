@@ -130,9 +130,8 @@ def test_every_channel_has_its_own_correlation(fitted):
     config = dataclasses.replace(fitted.config, frame_correlation=0.9, deviation_correlation=0.2)
     assert correlations(config) == (0.9, 0.2)
     assert correlations(dataclasses.replace(config, representation="depth", noise_threshold=-0.2)) == (0.9,)
-    noise = sample.frame_noise(
-        jax.random.key(0), 3, np.array([0, 1]), (200, 200, 2), correlations(config)
-    )  # fmt: skip
+    shape = (200, 200, 2)
+    noise = sample.frame_noise(jax.random.key(0), 3, np.array([0, 1]), shape, correlations(config))
     for channel, expected in enumerate(correlations(config)):
         one, other = np.asarray(noise[..., channel]).reshape(2, -1)
         assert abs(np.corrcoef(one, other)[0, 1] - expected) < 0.02
