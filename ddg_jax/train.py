@@ -1,4 +1,14 @@
-"""DDPM training of the generator (paper III-B1): a pure step on x_0 and c; ddg_jax/loop.py repeats it."""
+"""DDPM training of the generator (paper III-B1): a pure step on x_0 and c; ddg_jax/loop.py repeats it.
+
+What the network's first channel is depends on `ddg.hole_loss`:
+
+squared, the paper's equation 4: the clean value, trained by its squared error like every other channel.
+
+cross_entropy, for representation deviation, whose first channel is -1 (hole) or +1 (valid): log odds. A
+pixel's own noisy value says something exact about them (`valid_log_odds`), so the network need not carry
+single pixels past its bottlenecks, only what neighbours and c say. Squared errors of confident mistakes have
+no gradient left; cross-entropy, with the same minimum, has.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -16,7 +26,7 @@ from ddg_jax.data import Frames, make_batch
 from ddg_jax.loop import Params, TrainState, first_state, run_steps, updated
 from ddg_jax.representation import channels
 from ddg_jax.unet import UNet
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import CROSS_ENTROPY, SQUARED, DDGConfig
 from ddgrasp.errors import unknown_name
 from ddgrasp.progress import Progress
 
@@ -24,6 +34,8 @@ WARMUP_STEPS = 50
 FINAL_LEARNING_RATE = 0.05
 """Share of the learning rate left at the end."""
 MAX_GRAD_NORM = 1.0
+LOG_ODDS_PER_OUTPUT = 4.0
+"""The network's outputs are of the order of 1, log odds of what it is sure of 10."""
 CHECKPOINTS = "checkpoints"
 
 
@@ -64,8 +76,27 @@ def config_schedule(config: DDGConfig) -> diffusion.Schedule:
 
 def predict_clean(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
     """The clean map x_0 (B, H, W, C) that the network sees in x_k; c (B, H, W), step (B,) int."""
-    x_0: Any = make_unet(config).apply({"params": params}, x_k, c, step)
-    return x_0
+    out = _output(config, params, x_k, c, step)
+    if config.hole_loss == SQUARED:
+        return out
+    valid = jnp.tanh(valid_log_odds(config, out, x_k, step) / 2)  # E[x_0]: 2 sigmoid(log odds) - 1
+    return jnp.concatenate([valid[..., None], out[..., 1:]], axis=-1)
+
+
+def _output(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
+    out: Any = make_unet(config).apply({"params": params}, x_k, c, step)
+    return out
+
+
+def valid_log_odds(config: DDGConfig, output: Array, x_k: Array, step: Array) -> Array:
+    """log P(valid | x_k, c) - log P(hole | x_k, c), (B, H, W); output, x_k (B, H, W, C), step (B,) int.
+
+    Bayes' rule: what the network makes of the neighbours and c, plus the pixel's own likelihood ratio,
+    log N(x_k; a, 1 - a^2) - log N(x_k; -a, 1 - a^2) = 2 a x_k / (1 - a^2) with a^2 = alpha_bar_k.
+    """
+    alpha_bar = diffusion.alpha_bar_at(config_schedule(config), step, x_k)[..., 0]
+    own = 2 * jnp.sqrt(alpha_bar) / (1 - alpha_bar) * x_k[..., 0]
+    return LOG_ODDS_PER_OUTPUT * output[..., 0] + own
 
 
 def predict_noise(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
@@ -96,11 +127,19 @@ def loss_weight(config: DDGConfig, step: Array) -> Array:
 def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Array, eps: Array) -> Array:
     """mean w_k |eps - eps_theta(d_k (+) c, k)|^2 (paper eq. 4; w_k: `loss_weight`). x_0, eps (B, H, W, C);
     c (B, H, W); step (B,) int.
+
+    |eps - eps_theta|^2 is SNR times the squared error in x_0. With `hole_loss` cross_entropy twice the
+    cross-entropy takes that error's place in the first channel.
     """
     made = config_schedule(config)
     x_k = diffusion.q_sample(made, x_0, step, eps)
-    error = jnp.mean((eps - predict_noise(config, params, x_k, c, step)) ** 2, axis=(1, 2, 3))
-    return jnp.mean(loss_weight(config, step) * error)
+    out = _output(config, params, x_k, c, step)
+    error = (x_0 - out) ** 2
+    if config.hole_loss == CROSS_ENTROPY:
+        wrong = -jnp.sign(x_0[..., 0]) * valid_log_odds(config, out, x_k, step)
+        error = error.at[..., 0].set(2 * jax.nn.softplus(wrong))
+    weight = loss_weight(config, step) * diffusion.signal_to_noise(made, step)
+    return jnp.mean(weight * jnp.mean(error, axis=(1, 2, 3)))
 
 
 def step_keys(state: TrainState) -> Array:

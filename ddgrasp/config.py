@@ -6,6 +6,8 @@ from typing import Any
 from ddgrasp import contract
 from ddgrasp.errors import UserError, unknown_name
 
+SQUARED, CROSS_ENTROPY = HOLE_LOSSES = ("squared", "cross_entropy")
+
 
 def _check_counts(section: str, config: Any, *names: str) -> None:
     for name in names:
@@ -421,6 +423,9 @@ class DDGConfig:
     """AdamW's step size after the warm-up; falls to a twentieth along a cosine."""
     weight_decay: float = 1e-4
     """AdamW's weight decay."""
+    hole_loss: str = "squared"
+    """What the hole channel is trained by: squared error (the paper's, as all channels) or cross_entropy (of
+    log odds: sharper layouts from more and smaller steps, ddg_jax/train.py; deviation only)."""
     loss_weight: str = "truncated"
     """Weight of a diffusion step's error: uniform (the paper's) or truncated (more weight on noisy steps,
     which few-step sampling needs)."""
@@ -468,6 +473,13 @@ class DDGConfig:
             raise UserError(
                 f"ddg.deviation_threshold is {self.deviation_threshold}; expected 0 or more in 1/m, and 1 to "
                 "graft holes alone."
+            )
+        if self.hole_loss not in HOLE_LOSSES:
+            raise unknown_name("ddg.hole_loss", self.hole_loss, HOLE_LOSSES)
+        if self.hole_loss == CROSS_ENTROPY and self.representation != "deviation":
+            raise UserError(
+                f"ddg.hole_loss {CROSS_ENTROPY} needs holes in a channel of their own: ddg.representation is "
+                f"{self.representation}; take deviation, or hole_loss {SQUARED}."
             )
         if not 0 < self.snr_limits[0] <= self.snr_limits[1] < float("inf"):
             raise UserError(

@@ -1,6 +1,7 @@
 """Training, resume and sampling on pictures small enough for seconds."""
 
 import dataclasses
+from functools import cache
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from ddg_jax import loop, sample, schedule, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
 from ddg_jax.representation import correlations
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import CROSS_ENTROPY, HOLE_LOSSES, SQUARED, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 
@@ -54,6 +55,47 @@ def test_an_error_in_the_clean_map_weighs_snr_within_its_limits():
     np.testing.assert_allclose(per_x_0, np.clip(snr, 0.5, 3.0), rtol=1e-5)
 
 
+def test_log_odds_are_those_of_bayes_rule():
+    config, k = dataclasses.replace(TINY, hole_loss=CROSS_ENTROPY), np.array([5, 50, 90])
+    alpha_bar = train.config_schedule(config).alpha_bars[k].astype(np.float64)[:, None, None]
+    rng = np.random.default_rng(0)
+    x_k, output = rng.normal(0, 0.3, (2, 3, 4, 5, 2))
+
+    def log_density(x_0):
+        return -((x_k[..., 0] - np.sqrt(alpha_bar) * x_0) ** 2) / (2 * (1 - alpha_bar))
+
+    prior = train.LOG_ODDS_PER_OUTPUT * output[..., 0]
+    expected = prior + log_density(1.0) - log_density(-1.0)
+    made = train.valid_log_odds(config, *map(np.float32, (output, x_k)), k)
+    np.testing.assert_allclose(made, expected, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("hole_loss", HOLE_LOSSES)
+def test_the_loss_weighs_errors_of_the_clean_map(hole_loss):
+    config = dataclasses.replace(TINY, hole_loss=hole_loss, snr_limits=(0.5, 3.0))
+    rng = np.random.default_rng(0)
+    x_0 = np.stack([rng.choice([-1.0, 1.0], (4, 16, 24)), rng.normal(0, 0.2, (4, 16, 24))], -1)
+    x_0, eps, c = (np.float32(v) for v in (x_0, rng.normal(size=x_0.shape), rng.normal(size=(4, 16, 24))))
+    k, made = np.array([3, 40, 70, 95]), train.config_schedule(config)
+    params = train.init_params(config, jax.random.key(0))
+    x_k = schedule.q_sample(made, x_0, k, eps)
+    clean = np.asarray(train.predict_clean(config, params, x_k, c, k), np.float64)
+    error = (clean - x_0) ** 2
+    if hole_loss == CROSS_ENTROPY:
+        right = np.clip((1 + clean * x_0)[..., 0] / 2, 1e-12, 1)  # probability of what is there
+        error[..., 0] = -2 * np.log(right)
+    weight = np.clip(np.asarray(schedule.signal_to_noise(made, k)), 0.5, 3.0)
+    expected = np.mean(weight * error.mean((1, 2, 3)))
+    np.testing.assert_allclose(train.noise_loss(config, params, x_0, c, k, eps), expected, rtol=2e-3)
+
+
+def test_cross_entropy_needs_holes_of_their_own_channel():
+    with pytest.raises(UserError, match="hole_loss cross_entropy needs holes in a channel"):
+        DDGConfig(hole_loss=CROSS_ENTROPY, representation="depth", noise_threshold=-0.2)
+    with pytest.raises(UserError, match="crossentropy"):
+        DDGConfig(hole_loss="crossentropy")
+
+
 def test_resume_equals_an_uninterrupted_run(tmp_path):
     frames, quiet = pictures(), Progress(quiet=True)
     straight = train.fit(TINY, frames, tmp_path / "straight", 0, quiet)
@@ -79,10 +121,23 @@ def test_resume_equals_an_uninterrupted_run(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory):
-    config = dataclasses.replace(TINY, train_steps=300, batch_size=16, checkpoint_every=1000)
-    params = train.fit(config, pictures(64), tmp_path_factory.mktemp("ddg"), 0, Progress(quiet=True))
-    return sample.Generator(config, params, make_prior(config))
+def fit_by(tmp_path_factory):
+    """hole_loss -> generator fitted with it, once."""
+
+    @cache
+    def fitted_generator(hole_loss: str) -> sample.Generator:
+        config = dataclasses.replace(
+            TINY, train_steps=300, batch_size=16, checkpoint_every=1000, hole_loss=hole_loss
+        )
+        params = train.fit(config, pictures(64), tmp_path_factory.mktemp("ddg"), 0, Progress(quiet=True))
+        return sample.Generator(config, params, make_prior(config))
+
+    return fitted_generator
+
+
+@pytest.fixture(scope="module")
+def fitted(fit_by):
+    return fit_by(SQUARED)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +148,9 @@ def scene():
     return depth
 
 
-def test_generator_learns_where_the_sensor_loses_pixels(fitted, scene):
+@pytest.mark.parametrize("hole_loss", HOLE_LOSSES)
+def test_generator_learns_where_the_sensor_loses_pixels(fit_by, scene, hole_loss):
+    fitted = fit_by(hole_loss)
     made = sample.generate(jax.random.key(0), fitted, scene)
     holes = made.depth_m == 0
     shadow = np.zeros_like(holes)
