@@ -146,12 +146,14 @@ CAMERA = replace(
         prior="metric_inverse_depth",
         snr_limits=(1.0, 3.0),
         blocks=(1, 1, 1),
-        train_steps=300,
-        sample_steps=8,
+        hole_loss="cross_entropy",
+        batch_size=4,
+        train_steps=2400,
+        sampler="ddim",
+        eta=1.0,
     ),
 )
-"""`laptop` with a generator for short recordings of a real camera that moves: about 80 frames
-(docs/score.md); longer recordings bear more steps."""
+"""`laptop` with a generator for a real camera that moves, chosen on 80 of its frames (docs/generator.md)."""
 
 PAPER = Config(
     preset="paper",
