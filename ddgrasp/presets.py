@@ -148,7 +148,7 @@ CAMERA = replace(
         blocks=(1, 1, 1),
         hole_loss="cross_entropy",
         batch_size=4,
-        train_steps=2400,
+        train_steps=4000,
         sampler="ddim",
         eta=1.0,
     ),
