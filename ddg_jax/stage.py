@@ -105,7 +105,7 @@ def _loaded(config: DDGConfig) -> Params:
     source = Path(config.init_from)
     generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source, sampler="ddim")
     for name in (
-        "height_px", "width_px", "representation", "surface", "near_m", "far_m", "prior",
+        "height_px", "width_px", "representation", "hole_loss", "surface", "near_m", "far_m", "prior",
         "space_to_depth", "widths", "blocks", "attention_heads", "diffusion_steps", "schedule",
         "log_snr_shift",
     ):  # fmt: skip

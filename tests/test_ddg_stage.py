@@ -101,9 +101,13 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
     assert loaded.manifest.origin == "loaded"
     before, after = (artifacts.load_params(a.directory / "params.msgpack") for a in (fitted, loaded))
     jax.tree.map(np.testing.assert_array_equal, before, after)
-    other = dataclasses.replace(config, ddg=dataclasses.replace(config.ddg, far_m=5.0))
-    with pytest.raises(UserError, match="ddg.far_m 10.0.*5.0"):
-        stage.fit_folder(other, recordings, tmp_path / "other", progress=Progress(quiet=True))
+    for change, message in (
+        ({"far_m": 5.0}, "ddg.far_m 10.0.*5.0"),
+        ({"hole_loss": "cross_entropy"}, "ddg.hole_loss 'squared'.*'cross_entropy'"),
+    ):
+        other = dataclasses.replace(config, ddg=dataclasses.replace(config.ddg, **change))
+        with pytest.raises(UserError, match=message):
+            stage.fit_folder(other, recordings, tmp_path / "other", progress=Progress(quiet=True))
 
 
 def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings, tmp_path):
