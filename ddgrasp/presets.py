@@ -116,7 +116,7 @@ DEMO = Config(
     evaluation=EvalConfig(student_trials=60),
     score=ScoreConfig(trajectories=24, kid_subset_size=150, tsne_maps=3000),
 )
-"""For two cores within 45 minutes (24 on two AMD EPYC cores, 2026-11-21); the student starts from the
+"""For two cores within 45 minutes (23 on two AMD EPYC cores, 2026-11-22); the student starts from the
 pretrained one."""
 
 LAPTOP = Config(
