@@ -23,8 +23,11 @@ from sensors.holes import fill_from_background, smooth_surface
 
 FILTERED, PIECEWISE = SURFACES = ("filtered", "piecewise")
 """Where the surface under recorded depth comes from: sensors/holes.py, ddg_jax/piecewise.py."""
-C_LIMIT = 2.5
-"""|c| never exceeds this."""
+NORMALISED_LIMIT = 2.5
+"""|c| of normalised priors never exceeds this."""
+NEAREST_M = 0.15
+"""Closer than any reading of the D435 that the metric prior was tried on (0.23 m): c stays the same from here
+on."""
 SAME_SURFACE = 0.05
 """Relative inverse-depth difference below which two frames see the same surface (temporal smoothing)."""
 _STATISTICS_STRIDE = 7
@@ -107,7 +110,7 @@ class MetricInverseDepthPrior(InverseDepthPrior):
     name = "metric_inverse_depth"
 
     def _scaled(self, inverse: np.ndarray) -> np.ndarray:
-        return 2 * inverse - 2
+        return 2 * np.minimum(inverse, 1 / NEAREST_M) - 2
 
 
 _BUILT_IN = (InverseDepthPrior, MetricInverseDepthPrior)
@@ -137,7 +140,7 @@ def normalise(inverse: np.ndarray) -> np.ndarray:
     sample = inverse.reshape(-1)[::_STATISTICS_STRIDE]
     shift = np.median(sample)
     scale = 2 * np.mean(np.abs(sample - shift)) + 1e-6
-    return np.clip((inverse - shift) / scale, -C_LIMIT, C_LIMIT).astype(np.float32)
+    return np.clip((inverse - shift) / scale, -NORMALISED_LIMIT, NORMALISED_LIMIT).astype(np.float32)
 
 
 def decoy_holes(holes: np.ndarray, rng: np.random.Generator) -> np.ndarray:

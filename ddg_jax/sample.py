@@ -17,7 +17,7 @@ from ddg_jax import schedule as diffusion
 from ddg_jax.distil import X_LIMIT, params_file
 from ddg_jax.graft import graft
 from ddg_jax.loop import Params
-from ddg_jax.prior import C_LIMIT, Prior, make_prior
+from ddg_jax.prior import Prior, make_prior
 from ddg_jax.representation import channels, correlations, decode
 from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
@@ -257,7 +257,7 @@ def predict(
             config,
             key,
             params,
-            jax.device_put(np.clip(_filled_up(c[now], size), -C_LIMIT, C_LIMIT), split),
+            jax.device_put(_filled_up(c[now], size), split),
             jnp.asarray(number) if number.ndim == 0 else jax.device_put(_filled_up(number[now], size), split),
             jax.device_put(_filled_up(frame[now], size), split),
             steps=steps or config.sample_steps,

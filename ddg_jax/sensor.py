@@ -8,7 +8,6 @@ import numpy as np
 from jax import Array
 
 from ddg_jax.graft import graft
-from ddg_jax.prior import C_LIMIT
 from ddg_jax.representation import decode
 from ddg_jax.sample import Generator, sample
 from ddgrasp.config import SensorConfig
@@ -65,8 +64,7 @@ def learned(generator: Generator) -> Sense:
         _check_aspect(depth_m.shape, size)
         clean = jax.image.resize(depth_m, size, "nearest")
         shape = jax.ShapeDtypeStruct(size, jnp.float32)
-        c = jax.pure_callback(prior_on_host, shape, clean, vmap_method="broadcast_all")
-        c = jnp.clip(c, -C_LIMIT, C_LIMIT)[None]
+        c = jax.pure_callback(prior_on_host, shape, clean, vmap_method="broadcast_all")[None]
         first = jnp.zeros(1, jnp.int32)
         x = sample(config, key, generator.params, c, first[0], first, steps=config.sample_steps)[0]
         sized = jax.image.resize(x, (*depth_m.shape, x.shape[-1]), "nearest")

@@ -51,6 +51,10 @@ def test_the_metric_prior_says_how_far_a_surface_is_whatever_else_is_seen():
     np.testing.assert_allclose(made.from_sim(mixed)[0, -2], made.from_sim(far)[0, -2], atol=1e-6)
     rng = np.random.default_rng(0)
     np.testing.assert_allclose(made.from_recording(mixed, None, rng), made.from_sim(mixed), atol=1e-6)
+    close = np.full((1, 24, 32), 0.3, np.float32)  # nearer than most of what a normalised prior tells apart
+    np.testing.assert_allclose(made.from_sim(close), 2 / 0.3 - 2, rtol=1e-5)
+    np.testing.assert_allclose(made.from_recording(close, None, rng), made.from_sim(close), rtol=1e-5)
+    np.testing.assert_allclose(made.from_sim(close / 10), 2 / prior.NEAREST_M - 2, rtol=1e-5)
 
 
 def test_recording_and_simulation_of_one_scene_give_the_same_prior():

@@ -9,7 +9,7 @@ import pytest
 
 from ddg_jax import stage
 from ddg_jax.representation import LIMIT_PER_M
-from ddg_jax.sample import Generator, generate
+from ddg_jax.sample import Generator, generate, predict
 from ddgrasp import artifacts
 from ddgrasp.config import Config, DDGConfig
 from ddgrasp.errors import UserError
@@ -84,6 +84,12 @@ def test_generator_loads_and_generates_at_another_size(fitted):
     assert made.depth_m.shape == depth.shape
     assert made.mask.shape == depth.shape
     assert made.depth_m[~made.mask].tobytes() == depth[~made.mask].tobytes()
+
+
+def test_sampling_sees_the_prior_that_training_saw_however_large(fitted):
+    generator = Generator.load(fitted.directory)
+    near, nearer = (predict(jax.random.key(0), generator, np.full((2, 16, 24), c)) for c in (3.0, 5.0))
+    assert np.abs(near - nearer).max() > 1e-3
 
 
 def test_sample_folder_draws_a_picture(fitted, recordings, tmp_path):
