@@ -19,9 +19,9 @@ import numpy as np
 from benchmarks import compare
 from ddg_jax.prior import make_prior
 from ddg_jax.representation import channels, correlations
-from ddg_jax.sample import DPM_SOLVER, PROGRESSIVE, Generator, condition, frame_noise, generate, grafted
+from ddg_jax.sample import Generator, condition, frame_noise, generate, grafted
 from ddg_jax.train import init_params, predict_noise
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.presets import get_preset
 
 REFERENCE = ("ddim", 50)

@@ -17,6 +17,9 @@ from ddgrasp.progress import Progress
 from sensors.holes import fill_from_background, smooth_surface
 from sensors.recordings import Recording, find_recordings, is_recording
 
+LEAST_KEPT = 0.98
+"""Share of a frame below which it is said that the generator sees a window of it."""
+
 
 @dataclass(frozen=True)
 class Frames:
@@ -77,6 +80,8 @@ def load_frames(
     for number, folder in enumerate(progress.track(folders, "reading recordings")):
         try:
             recording = find_recordings(folder)[0]
+            if number == 0:
+                _tell_of_crop(recording, config, progress)
             frames, rgb, left_out = _read(recording, left, config, prior, progress)
         except UserError as error:
             refused.append(error)
@@ -145,6 +150,17 @@ def _read(
         progress.note(f"{recording.path}: left out {blind} frame(s) without a valid pixel in the window")
     rgb = np.stack([recording.rgb(int(i)) for i in usable]) if prior.needs_rgb else None
     return frames[usable], rgb, len(recording.skipped) + blind
+
+
+def _tell_of_crop(recording: Recording, config: DDGConfig, progress: Progress) -> None:
+    height, width, rows, columns = recording.height_px, recording.width_px, config.height_px, config.width_px
+    kept = min(height / rows, width / columns) ** 2 * rows * columns / (height * width)
+    if kept < LEAST_KEPT:
+        progress.note(
+            f"{recording.path}: the generator sees {kept:.0%} of each {width}x{height} frame, a centred "
+            f"window of {columns}:{rows}, the simulated camera's shape; --ddg.height-px "
+            f"{round(columns * height / width)} takes all of it"
+        )
 
 
 def resize_nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -21,13 +21,10 @@ from ddg_jax.prior import Prior, make_prior
 from ddg_jax.representation import channels, correlations, decode
 from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
-from ddgrasp.config import DDGConfig
-from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
+from ddgrasp.errors import UserError
 
 PARAMS_FILE = "params.msgpack"
-PROGRESSIVE = "progressive"
-DPM_SOLVER = "dpm_solver"
-SAMPLERS = ("ddim", DPM_SOLVER, "ddpm", PROGRESSIVE)
 SHARED = 2**31 - 1
 """Stands for the frame number in the key of the noise that an episode's frames share."""
 _ASPECT_TOLERANCE = 0.02
@@ -58,8 +55,6 @@ class Generator:
             raise UserError(f"{directory} holds a {manifest.stage!r} artefact; expected one of stage 'ddg'.")
         config = artifacts.config_from_json(manifest.config).ddg
         sampler, steps = sampler or config.sampler, steps or config.sample_steps
-        if sampler not in SAMPLERS:
-            raise unknown_name("sampler", sampler, SAMPLERS)
         file = directory / (params_file(steps) if sampler == PROGRESSIVE else PARAMS_FILE)
         if sampler == PROGRESSIVE and not file.exists():
             raise UserError(
@@ -119,8 +114,6 @@ def sample(
       key: the whole data set's key; c: (B, H, W); episode, frame: see `frame_noise`.
       steps: network evaluations per map.
     """
-    if config.sampler not in SAMPLERS:
-        raise unknown_name("sampler", config.sampler, SAMPLERS)
     if config.sampler == PROGRESSIVE and steps != config.sample_steps:
         raise UserError(
             f"This generator was distilled to {config.sample_steps} evaluations, not {steps}: load the one "
@@ -141,7 +134,7 @@ def sample(
         x_0 = jnp.clip(diffusion.predict_x_0(made, x, k, eps), -X_LIMIT, X_LIMIT)
         if config.sampler == DPM_SOLVER:
             x = diffusion.dpm_solver_step(made, x, k, previous, x_0, before, x_0_before)
-        elif config.sampler == "ddpm":
+        elif config.sampler == DDPM:
             x = diffusion.ddpm_step(made, x, k, previous, eps, fresh(), X_LIMIT)
         elif config.sampler == PROGRESSIVE:
             x = diffusion.ddim_step(made, x, k, previous, eps, None)

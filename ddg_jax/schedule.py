@@ -16,9 +16,9 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from ddgrasp.config import SPACINGS
 from ddgrasp.errors import UserError, unknown_name
 
-SPACINGS = ("leading", "trailing", "linspace", "quadratic")
 COSINE_OFFSET = 0.008
 """s of Nichol & Dhariwal, eq. 17."""
 MAX_BETA = 0.999

@@ -13,11 +13,11 @@ from ddg_jax import data
 from ddg_jax.distil import distil
 from ddg_jax.loop import Params
 from ddg_jax.prior import Prior, invert, make_prior
-from ddg_jax.sample import PROGRESSIVE, Generator, grafted, predict
+from ddg_jax.sample import Generator, grafted, predict
 from ddg_jax.train import fit
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
-from ddgrasp.config import Config, DDGConfig
+from ddgrasp.config import PROGRESSIVE, Config, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from sensors import stats

@@ -26,8 +26,7 @@ from ddg_jax.data import Frames, make_batch
 from ddg_jax.loop import Params, TrainState, first_state, run_steps, updated
 from ddg_jax.representation import channels
 from ddg_jax.unet import UNet
-from ddgrasp.config import CROSS_ENTROPY, SQUARED, DDGConfig
-from ddgrasp.errors import unknown_name
+from ddgrasp.config import CROSS_ENTROPY, SQUARED, UNIFORM, DDGConfig
 from ddgrasp.progress import Progress
 
 WARMUP_STEPS = 50
@@ -116,12 +115,10 @@ def loss_weight(config: DDGConfig, step: Array) -> Array:
     "uniform" is the paper's 1. "truncated" is clip(SNR, *config.snr_limits) / SNR: per unit of error in x_0
     no step weighs less than the floor (Salimans & Ho 2022, section 4) nor more than a cap (Hang et al. 2023).
     """
-    if config.loss_weight == "uniform":
+    if config.loss_weight == UNIFORM:
         return jnp.ones(step.shape)
-    if config.loss_weight == "truncated":
-        snr = diffusion.signal_to_noise(config_schedule(config), step)
-        return jnp.clip(snr, *config.snr_limits) / snr
-    raise unknown_name("loss weight", config.loss_weight, ("uniform", "truncated"))
+    snr = diffusion.signal_to_noise(config_schedule(config), step)
+    return jnp.clip(snr, *config.snr_limits) / snr
 
 
 def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Array, eps: Array) -> Array:

@@ -7,6 +7,10 @@ from ddgrasp import contract
 from ddgrasp.errors import UserError, unknown_name
 
 SQUARED, CROSS_ENTROPY = HOLE_LOSSES = ("squared", "cross_entropy")
+UNIFORM, TRUNCATED = LOSS_WEIGHTS = ("uniform", "truncated")
+DPM_SOLVER, DDIM, DDPM, PROGRESSIVE = SAMPLERS = ("dpm_solver", "ddim", "ddpm", "progressive")
+SPACINGS = ("leading", "trailing", "linspace", "quadratic")
+"""Of the diffusion steps that a sampler visits: ddg_jax/schedule.py, timesteps."""
 
 
 def _check_counts(section: str, config: Any, *names: str) -> None:
@@ -474,8 +478,16 @@ class DDGConfig:
                 f"ddg.deviation_threshold is {self.deviation_threshold}; expected 0 or more in 1/m, and 1 to "
                 "graft holes alone."
             )
-        if self.hole_loss not in HOLE_LOSSES:
-            raise unknown_name("ddg.hole_loss", self.hole_loss, HOLE_LOSSES)
+        for name, choices in (
+            ("hole_loss", HOLE_LOSSES),
+            ("loss_weight", LOSS_WEIGHTS),
+            ("sampler", SAMPLERS),
+            ("sample_spacing", SPACINGS),
+        ):
+            if getattr(self, name) not in choices:
+                raise unknown_name(f"ddg.{name}", getattr(self, name), choices)
+        if not 0 <= self.eta <= 1:
+            raise UserError(f"ddg.eta is {self.eta}; expected 0 (no fresh noise) to 1 (DDPM's).")
         if self.hole_loss == CROSS_ENTROPY and self.representation != "deviation":
             raise UserError(
                 f"ddg.hole_loss {CROSS_ENTROPY} needs holes in a channel of their own: ddg.representation is "

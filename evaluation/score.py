@@ -73,7 +73,7 @@ def run_real(
     frames = score_data.load_real(root, config.ddg.width_px, score_frames)
     if fit_frames < 2 or fit_frames + score_frames > frames.total:
         raise UserError(
-            f"--fit-frames {fit_frames} and --score-frames {score_frames} of {frames.total} frames: "
+            f"--fit-frames {fit_frames} and --score-frames {score_frames} of {frames.total} frame(s): "
             "they must not overlap, and fitting needs 2 or more."
         )
     config = replace(config, ddg=replace(config.ddg, height_px=frames.depth_mm.shape[1]))

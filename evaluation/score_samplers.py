@@ -16,7 +16,7 @@ import numpy as np
 
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
-from ddgrasp.config import Config
+from ddgrasp.config import PROGRESSIVE, Config
 from ddgrasp.progress import Progress
 from evaluation import holes, score_data, score_features, score_table
 from evaluation.score_domains import FLOOR, RAW, Methods
@@ -68,7 +68,7 @@ def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Arti
 
 def _generators(directory: Path) -> Iterator[tuple[str, "Generator"]]:
     """Name -> the fitted generator with that sampler; distilled ones as far as they were made."""
-    from ddg_jax.sample import PROGRESSIVE, Generator
+    from ddg_jax.sample import Generator
 
     for sampler, steps in PLAIN:
         yield _name(sampler, steps), Generator.load(directory, sampler, steps)

@@ -143,6 +143,14 @@ def _depth(root, name, frame, image):
     (root / name / "depth" / f"{frame:06d}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
+def test_a_crop_is_told(tmp_path):
+    _record(tmp_path / "square", size=(64, 64))
+    assert any(
+        "sees 56% of each 64x64 frame" in line and "--ddg.height-px 32" in line for line in load(tmp_path)[1]
+    )
+    assert not any("sees" in line for line in load(tmp_path, DDGConfig(height_px=32, width_px=32))[1])
+
+
 def test_what_cannot_be_used_is_named_and_counted(recordings):
     _depth(recordings, "a", 1, np.zeros((36, 64), np.uint16))  # nothing valid
     (recordings / "b" / "color" / "000000.jpg").unlink()  # no colour

@@ -89,6 +89,20 @@ def test_the_loss_weighs_errors_of_the_clean_map(hole_loss):
     np.testing.assert_allclose(train.noise_loss(config, params, x_0, c, k, eps), expected, rtol=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sampler": "progresive"}, "ddg.sampler.*Did you mean 'progressive'"),
+        ({"sample_spacing": "quadratc"}, "ddg.sample_spacing.*Did you mean 'quadratic'"),
+        ({"loss_weight": "trunc"}, "ddg.loss_weight.*truncated"),
+        ({"eta": 5.0}, "ddg.eta is 5.0; expected 0"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_is_fitted(change, message):
+    with pytest.raises(UserError, match=message):
+        DDGConfig(**change)
+
+
 def test_cross_entropy_needs_holes_of_their_own_channel():
     with pytest.raises(UserError, match="hole_loss cross_entropy needs holes in a channel"):
         DDGConfig(hole_loss=CROSS_ENTROPY, representation="depth", noise_threshold=-0.2)

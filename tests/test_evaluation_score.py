@@ -154,6 +154,8 @@ def test_a_real_cameras_recordings_are_fitted_and_scored(tmp_path, capsys):
     command = ["ddg", "score", *SIZES, "--out", str(tmp_path / "out"), "--real", str(tmp_path / "room")]
     assert cli.main([*command, "--fit-frames", "20", "--score-frames", "16"]) == 2
     assert "must not overlap" in capsys.readouterr().err
+    assert cli.main([*command, "--run-dir", str(tmp_path)]) == 2
+    assert "leave one of them out" in capsys.readouterr().err
     assert cli.main([*command, "--fit-frames", "10", "--score-frames", "16", "--resume"]) == 0
     result = json.loads((tmp_path / "out" / "score_real" / "score.json").read_text())
     table = result["tables"]["depthfeat-v1"]

@@ -10,8 +10,8 @@ import tyro
 
 from ddgrasp import artifacts, pipeline
 from ddgrasp.commands.base import load_config
-from ddgrasp.commands.checks import check_count
 from ddgrasp.config import Config, DepthFeatureConfig, ScoreConfig
+from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 
 
@@ -46,7 +46,8 @@ class DDGScore(Scoring):
     """Compare generated depth with recorded depth: the paper's Table I, hole measures, t-SNE."""
 
     real: Path | None = None
-    """Recordings of a real camera: fits on the first frames and scores the last, instead of the rig."""
+    """Recordings of a real camera: fits the preset's generator on the first frames and scores it on the last,
+    instead of the rig; no run is needed."""
     fit_frames: int = 80
     """Frames that --real is fitted on."""
     score_frames: int = 40
@@ -60,7 +61,11 @@ class DDGScore(Scoring):
             self._make("score", lambda config, source, p: score.run(config, source, self.out, progress=p))
             print_result(self.out / "score")
             return
-        check_count("--fit-frames", self.fit_frames)
+        if self.run_dir is not None:
+            raise UserError(
+                f"--run-dir {self.run_dir} with --real: the generator is fitted on the first frames, none is "
+                "taken from a run; leave one of them out."
+            )
         config = replace(get_preset(self.preset), score=self.score, seed=self.seed)
         root, stage = self.real, pipeline.get_stage("score_real")
 
