@@ -150,6 +150,7 @@ CAMERA = replace(
         batch_size=4,
         train_steps=4000,
         sampler="ddim",
+        sample_steps=2,
         eta=1.0,
     ),
 )
