@@ -61,7 +61,8 @@ class Frames:
         held = max(1, round(len(self) * holdout_fraction))
         if held >= len(self):
             raise UserError(
-                f"{len(self)} frame(s) cannot be split: the generator needs 2 or more; record more."
+                f"ddg.holdout_fraction {holdout_fraction:g} of {len(self)} frame(s) leaves none to fit on: "
+                "record more, or hold out less."
             )
         return self.part(slice(0, len(self) - held)), self.part(slice(len(self) - held, len(self)))
 
@@ -84,6 +85,8 @@ def load_frames(
                 _tell_of_crop(recording, config, progress)
             frames, rgb, left_out = _read(recording, left, config, prior, progress)
         except UserError as error:
+            if len(folders) == 1:
+                raise
             refused.append(error)
             progress.note(f"left out: {error}")
             continue

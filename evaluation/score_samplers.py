@@ -29,6 +29,7 @@ STAGE = "samplers"
 JSON = "samplers.json"
 REFERENCE = ("ddim", 50)
 PLAIN = (REFERENCE, ("ddim", 10), ("ddim", 4), ("dpm_solver", 8), ("dpm_solver", 4))
+"""DDIM with the generator's own `ddg.eta`."""
 TARGET = 1.1
 """FID of a sampler of at most 4 evaluations over that of REFERENCE."""
 TIMED_FRAMES = 64
