@@ -17,6 +17,7 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.progress import PICTURES, Progress
 from evaluation import score_data, score_features, score_figures, score_table, two_samples
+from evaluation.figures import draw_panels
 from evaluation.score_domains import COLUMNS, DOMAINS, Methods, wanted_domains
 from evaluation.score_episodes import Load, Scored, collect, score_episodes
 from evaluation.score_page import HTML, JSON, render, summary
@@ -120,7 +121,6 @@ def _finish(
     artifacts.atomic_write_json(directory / JSON, _without_draws(result))
     for name, png in pictures.items():
         artifacts.atomic_write_bytes(directory / PICTURES / f"{name}.png", png)
-    _keep_examples(scored, progress)
     artifacts.atomic_write_text(directory / HTML, render(result, pictures))
     return artifacts.finish(
         directory, stage, config, seconds=progress.seconds, metrics=summary(result), parents=parents
@@ -161,6 +161,7 @@ def _draw(scored: Scored, result: dict[str, Any], config: Config, progress: Prog
         )
         for name, value in result["tables"].items()
     }
+    pictures["examples"] = draw_panels(_examples(scored))
     pictures["holes"] = score_figures.draw_holes(result["holes"])
     paired = {domain for name in config.score.columns for domain in vars(COLUMNS[name]).values()}
     shown = {name: sample for name, sample in scored.features[first].items() if name in paired}
@@ -179,11 +180,11 @@ def _spread(rows: np.ndarray, count: int) -> np.ndarray:
     return rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int)]
 
 
-def _keep_examples(scored: Scored, progress: Progress) -> None:
-    """Maps of every domain side by side, for the report; domains of one side show the same moments."""
+def _examples(scored: Scored) -> dict[str, np.ndarray]:
+    """Title -> (N, H, W) maps in mm of every domain; those of one side show the same moments."""
     names = [name for name in DOMAINS if name in scored.examples]
     count = min(len(scored.examples[name]) for name in names)
-    progress.picture("examples", **{DOMAINS[n].title: np.stack(scored.examples[n][:count]) for n in names})
+    return {DOMAINS[name].title: np.stack(scored.examples[name][:count]) for name in names}
 
 
 def _without_draws(result: Mapping[str, Any]) -> dict[str, Any]:

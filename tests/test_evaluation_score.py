@@ -128,9 +128,9 @@ def test_hole_figures_say_what_must_be_so(scored):
 
 def test_pages_and_pictures_are_there_and_the_report_shows_them(scored):
     pictures = {path.name for path in (scored / "score" / "pictures").iterdir()}
-    assert pictures == {"table_1_depthfeat_v1.png", "holes.png", "tsne.png", "examples.npz"}
+    assert pictures == {"table_1_depthfeat_v1.png", "holes.png", "tsne.png", "examples.png"}
     page = (scored / "score" / "score.html").read_text()
-    assert "no weights" in page and page.count("data:image/png") == 2
+    assert "no weights" in page and page.count("data:image/png") == 3
     report = write_report(scored)
     assert report["score"]["targets"][0]["target"].startswith("FID of DDG <= 0.15")
     html = (scored / "report.html").read_text()
