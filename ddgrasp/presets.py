@@ -152,6 +152,7 @@ CAMERA = replace(
         sampler="ddim",
         sample_steps=2,
         eta=1.0,
+        deviation_threshold=0.0016,
     ),
 )
 """`laptop` with a generator for a real camera that moves, chosen on 80 of its frames (docs/generator.md)."""
