@@ -265,6 +265,16 @@ def _filled_up(values: np.ndarray, size: int) -> np.ndarray:
     return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype)])
 
 
+def check_aspect(size: tuple[int, ...], config: DDGConfig) -> None:
+    """UserError if depth of (H, W) `size` is not of the generator's shape."""
+    height, width = size
+    if abs(width / height / (config.width_px / config.height_px) - 1) > _ASPECT_TOLERANCE:
+        raise UserError(
+            f"Simulated depth is {width}x{height}; the generator was fitted at "
+            f"{config.width_px}x{config.height_px}: render with that aspect ratio."
+        )
+
+
 def _check_depth(depth_m: np.ndarray, config: DDGConfig) -> None:
     if depth_m.ndim != 3 or not np.issubdtype(depth_m.dtype, np.floating):
         raise UserError(
@@ -275,12 +285,7 @@ def _check_depth(depth_m: np.ndarray, config: DDGConfig) -> None:
             f"Simulated depth reaches {np.max(depth_m):g}; expected finite metres, 0 for nothing in range "
             "(divide millimetres by 1000)."
         )
-    aspect, wanted = depth_m.shape[2] / depth_m.shape[1], config.width_px / config.height_px
-    if abs(aspect / wanted - 1) > _ASPECT_TOLERANCE:
-        raise UserError(
-            f"Simulated depth is {depth_m.shape[2]}x{depth_m.shape[1]}; the generator was fitted at "
-            f"{config.width_px}x{config.height_px}: render with that aspect ratio."
-        )
+    check_aspect(depth_m.shape[1:], config)
 
 
 def _at_size(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:

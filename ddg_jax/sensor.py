@@ -9,7 +9,7 @@ from jax import Array
 
 from ddg_jax.graft import graft
 from ddg_jax.representation import decode
-from ddg_jax.sample import Generator, sample
+from ddg_jax.sample import Generator, check_aspect, sample
 from ddgrasp.config import SensorConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError, unknown_name
@@ -61,7 +61,7 @@ def learned(generator: Generator) -> Sense:
         return np.concatenate(frames).astype(np.float32).reshape(depth.shape)
 
     def sense_frame(key: Array, depth_m: Array, rgb: Array | None) -> Array:
-        _check_aspect(depth_m.shape, size)
+        check_aspect(depth_m.shape, config)
         clean = jax.image.resize(depth_m, size, "nearest")
         shape = jax.ShapeDtypeStruct(size, jnp.float32)
         c = jax.pure_callback(prior_on_host, shape, clean, vmap_method="broadcast_all")[None]
@@ -81,11 +81,3 @@ def _fitted(directory: str) -> Generator:
             "runs/demo/ddg (`ddgrasp ddg fit` makes one)."
         )
     return Generator.load(directory)
-
-
-def _check_aspect(shape: tuple[int, ...], size: tuple[int, int]) -> None:
-    if abs(shape[1] * size[0] / (shape[0] * size[1]) - 1) > 0.02:
-        raise UserError(
-            f"Depth is {shape[1]}x{shape[0]}; the generator was fitted at {size[1]}x{size[0]}: render with "
-            "that aspect ratio."
-        )

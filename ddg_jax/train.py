@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
-from jax.typing import DTypeLike
 
 from ddg_jax import schedule as diffusion
 from ddg_jax.data import Frames, make_batch
@@ -38,9 +37,9 @@ LOG_ODDS_PER_OUTPUT = 4.0
 CHECKPOINTS = "checkpoints"
 
 
-def make_unet(config: DDGConfig, dtype: DTypeLike = jnp.float32) -> UNet:
+def make_unet(config: DDGConfig) -> UNet:
     """The noise-prediction network of the configuration."""
-    return UNet(config.widths, config.blocks, config.attention_heads, config.space_to_depth, dtype)
+    return UNet(config.widths, config.blocks, config.attention_heads, config.space_to_depth)
 
 
 def make_optimizer(config: DDGConfig, steps: int, scale: float = 1.0) -> optax.GradientTransformation:

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import DTypeLike
 
 GROUPS = 8
 MAX_PERIOD = 10_000.0
@@ -42,18 +41,17 @@ class ResBlock(nn.Module):
     """Two 3x3 convolutions with group normalisation; the time embedding scales and shifts between them."""
 
     width: int
-    dtype: DTypeLike = jnp.float32
 
     @nn.compact
     def __call__(self, x: Array, time: Array) -> Array:
         groups = math.gcd(GROUPS, self.width)
-        h = nn.silu(nn.GroupNorm(math.gcd(GROUPS, x.shape[-1]), dtype=self.dtype)(x))
-        h = nn.Conv(self.width, (3, 3), dtype=self.dtype)(h)
-        scale, shift = jnp.split(nn.Dense(2 * self.width, dtype=self.dtype)(time)[:, None, None], 2, axis=-1)
-        h = nn.silu(nn.GroupNorm(groups, dtype=self.dtype)(h) * (1 + scale) + shift)
-        h = nn.Conv(self.width, (3, 3), dtype=self.dtype, kernel_init=nn.initializers.zeros)(h)
+        h = nn.silu(nn.GroupNorm(math.gcd(GROUPS, x.shape[-1]))(x))
+        h = nn.Conv(self.width, (3, 3))(h)
+        scale, shift = jnp.split(nn.Dense(2 * self.width)(time)[:, None, None], 2, axis=-1)
+        h = nn.silu(nn.GroupNorm(groups)(h) * (1 + scale) + shift)
+        h = nn.Conv(self.width, (3, 3), kernel_init=nn.initializers.zeros)(h)
         if x.shape[-1] != self.width:
-            x = nn.Dense(self.width, dtype=self.dtype)(x)
+            x = nn.Dense(self.width)(x)
         return x + h
 
 
@@ -61,15 +59,12 @@ class SelfAttention(nn.Module):
     """Attention between all positions of a feature map, as a residual. (B, H, W, C) -> same."""
 
     heads: int
-    dtype: DTypeLike = jnp.float32
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
         b, h, w, c = x.shape
-        tokens = nn.GroupNorm(math.gcd(GROUPS, c), dtype=self.dtype)(x).reshape(b, h * w, c)
-        out = nn.MultiHeadDotProductAttention(
-            self.heads, dtype=self.dtype, out_kernel_init=nn.initializers.zeros
-        )(tokens)
+        tokens = nn.GroupNorm(math.gcd(GROUPS, c))(x).reshape(b, h * w, c)
+        out = nn.MultiHeadDotProductAttention(self.heads, out_kernel_init=nn.initializers.zeros)(tokens)
         return x + out.reshape(b, h, w, c)
 
 
@@ -87,32 +82,27 @@ class UNet(nn.Module):
     blocks: Sequence[int]
     heads: int
     factor: int
-    dtype: DTypeLike = jnp.float32
 
     @nn.compact
     def __call__(self, x_k: Array, c: Array, step: Array) -> Array:
         """x_k (B, H, W, C), c (B, H, W), step (B,) int -> (B, H, W, C) float32. Any H, W."""
         height, width, maps = x_k.shape[1:]
         both = self._padded(jnp.concatenate([x_k, c[..., None]], axis=-1))
-        folded = space_to_depth(both, self.factor).astype(self.dtype)
+        folded = space_to_depth(both, self.factor)
         time = self._time_embedding(step)
-        h, skips = self._encode(nn.Dense(self.widths[0], dtype=self.dtype)(folded), time)
-        h = ResBlock(self.widths[-1], self.dtype)(h, time)
+        h, skips = self._encode(nn.Dense(self.widths[0])(folded), time)
+        h = ResBlock(self.widths[-1])(h, time)
         if self.heads:
-            h = SelfAttention(self.heads, self.dtype)(h)
-        h = ResBlock(self.widths[-1], self.dtype)(h, time)
+            h = SelfAttention(self.heads)(h)
+        h = ResBlock(self.widths[-1])(h, time)
         h = self._decode(h, skips, time)
         # How much of x_k may reach the output past the bottlenecks depends on how noisy it is.
-        scale, shift = jnp.split(
-            nn.Dense(2 * self.widths[0], dtype=self.dtype)(time)[:, None, None], 2, axis=-1
-        )
+        scale, shift = jnp.split(nn.Dense(2 * self.widths[0])(time)[:, None, None], 2, axis=-1)
         h = nn.silu(h * (1 + scale) + shift)
         size = maps * self.factor**2
-        out = nn.Conv(size, (3, 3), dtype=self.dtype, kernel_init=nn.initializers.zeros)(h)
-        out = out + nn.Dense(size, dtype=self.dtype, kernel_init=nn.initializers.zeros)(
-            folded[..., maps :: maps + 1]
-        )
-        return depth_to_space(out, self.factor)[:, :height, :width].astype(jnp.float32)
+        out = nn.Conv(size, (3, 3), kernel_init=nn.initializers.zeros)(h)
+        out = out + nn.Dense(size, kernel_init=nn.initializers.zeros)(folded[..., maps :: maps + 1])
+        return depth_to_space(out, self.factor)[:, :height, :width]
 
     def _padded(self, x: Array) -> Array:
         """Zeros at the bottom and right up to the next multiple of the total stride."""
@@ -121,25 +111,25 @@ class UNet(nn.Module):
 
     def _time_embedding(self, step: Array) -> Array:
         size = 4 * self.widths[0]
-        time = nn.Dense(size, dtype=self.dtype)(time_features(step, size).astype(self.dtype))
-        return nn.silu(nn.Dense(size, dtype=self.dtype)(nn.silu(time)))
+        time = nn.Dense(size)(time_features(step, size))
+        return nn.silu(nn.Dense(size)(nn.silu(time)))
 
     def _encode(self, h: Array, time: Array) -> tuple[Array, list[Array]]:
         skips = []
         for level, (width, blocks) in enumerate(zip(self.widths, self.blocks, strict=True)):
             if level:
-                h = nn.Dense(width, dtype=self.dtype)(space_to_depth(h, 2))
+                h = nn.Dense(width)(space_to_depth(h, 2))
             for _ in range(blocks):
-                h = ResBlock(width, self.dtype)(h, time)
+                h = ResBlock(width)(h, time)
             skips.append(h)
         return h, skips
 
     def _decode(self, h: Array, skips: list[Array], time: Array) -> Array:
         for level in reversed(range(len(self.widths))):
             width = self.widths[level]
-            h = nn.Dense(width, dtype=self.dtype)(jnp.concatenate([h, skips[level]], axis=-1))
+            h = nn.Dense(width)(jnp.concatenate([h, skips[level]], axis=-1))
             for _ in range(self.blocks[level]):
-                h = ResBlock(width, self.dtype)(h, time)
+                h = ResBlock(width)(h, time)
             if level:
-                h = depth_to_space(nn.Dense(4 * self.widths[level - 1], dtype=self.dtype)(h), 2)
+                h = depth_to_space(nn.Dense(4 * self.widths[level - 1])(h), 2)
         return h

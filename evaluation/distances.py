@@ -33,8 +33,13 @@ def fid(x: np.ndarray, y: np.ndarray) -> float:
     return float(difference @ difference + np.sum(a * a) + np.sum(b * b) - 2 * root)
 
 
+def kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(m, d), (n, d) -> (m, n): the cubic kernel of KID, (x.y / d + 1)^3."""
+    return (x @ y.T / x.shape[1] + 1) ** 3
+
+
 def mmd2(x: np.ndarray, y: np.ndarray) -> float:
-    """Unbiased squared maximum mean discrepancy (Gretton et al. 2012, lemma 6), kernel (x.y / d + 1)^3.
+    """Unbiased squared maximum mean discrepancy (Gretton et al. 2012, lemma 6) under `kernel`.
 
     x and y (m, d) of one length. It can be negative.
     """
@@ -42,10 +47,6 @@ def mmd2(x: np.ndarray, y: np.ndarray) -> float:
     if len(x) != len(y):
         raise UserError(f"mmd2 compares sets of one size, not {len(x)} and {len(y)} vectors.")
     x, y, count = np.asarray(x, np.float64), np.asarray(y, np.float64), len(x)
-
-    def kernel(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        return (p @ q.T / p.shape[1] + 1) ** 3
-
     within = (kernel(p, p) for p in (x, y))
     same = sum(float(k.sum() - np.trace(k)) for k in within) / (count * (count - 1))
     return same - 2 * float(kernel(x, y).mean())

@@ -48,11 +48,7 @@ def _kid(x: np.ndarray, y: np.ndarray, config: ScoreConfig) -> float:
 def _kid_draws(real: Sample, sim: Sample, drawn: Drawn) -> list[float]:
     """The squared maximum mean discrepancy of every draw, by weights: kernels are computed once."""
     x, y = real.features.astype(np.float64), sim.features.astype(np.float64)
-
-    def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return (a @ b.T / a.shape[1] + 1) ** 3
-
-    kxx, kyy, kxy = kernel(x, x), kernel(y, y), kernel(x, y)
+    kxx, kyy, kxy = distances.kernel(x, x), distances.kernel(y, y), distances.kernel(x, y)
 
     def within(k: np.ndarray, w: np.ndarray) -> float:
         return float((w @ k @ w - w @ np.diag(k)) / (w.sum() * (w.sum() - 1)))
