@@ -23,6 +23,11 @@ _BATCH = 8
 """Pictures that the image network is given together."""
 
 
+def weights_folder(config: DDGConfig) -> Path:
+    """Where the network's converted weights are looked for."""
+    return Path(config.prior_weights or store.WEIGHTS_DIR / f"{config.prior}_small")
+
+
 class DepthNetworkPrior:
     """c = affine-normalised output of Video Depth Anything or Depth Anything V2. See `Prior`."""
 
@@ -33,7 +38,7 @@ class DepthNetworkPrior:
             raise unknown_name("ddg.prior_in_sim", config.prior_in_sim, IN_SIMULATION)
         self.name, self._config = config.prior, config
         self.needs_sim_rgb = config.prior_in_sim == "rgb"
-        self._directory = Path(config.prior_weights or store.WEIGHTS_DIR / f"{config.prior}_small")
+        self._directory = weights_folder(config)
         manifest = store.read_manifest(self._directory)
         if not manifest.network.startswith(config.prior):
             raise UserError(f"{self._directory} holds {manifest.network}; ddg.prior is {config.prior}.")

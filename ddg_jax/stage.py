@@ -71,14 +71,16 @@ def fit_folder(
     )
 
 
-def sample_folder(directory: Path, root: Path, out: Path, *, seed: int, count: int = SHOWN_FRAMES) -> Path:
+def sample_folder(
+    directory: Path, root: Path, out: Path, *, seed: int, progress: Progress, count: int = SHOWN_FRAMES
+) -> Path:
     """Writes one PNG: recorded frames of `root` beside what the generator in `directory` makes of their
     priors.
 
     Behind `ddgrasp ddg sample`. Returns the picture's path, `out`/samples.png.
     """
     generator = Generator.load(directory)
-    frames = data.load_frames(root, generator.config, generator.prior, seed, Progress(quiet=True))
+    frames = data.load_frames(root, generator.config, generator.prior, seed, progress)
     chosen = frames.part(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int))
     panels = _panels(generator, chosen, seed)
     path = out / "samples.png"

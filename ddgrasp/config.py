@@ -368,9 +368,9 @@ class DDGConfig:
     width_px: int = 320
     """Columns of the generated map."""
     near_m: float = 0.25
-    """Nearest depth that is told apart (depth only)."""
+    """Nearest depth that is told apart (representation depth)."""
     far_m: float = 10.0
-    """Farthest depth that is told apart (depth only)."""
+    """Farthest depth that is told apart (representation depth), and that a monocular baseline may have."""
     noise_threshold: float = 0.4
     """The paper's: below it a generated pixel is a hole. Holes are -1, surfaces 1 (depth: 0 to 1, which
     needs a negative one, for example -0.2; docs/generator.md)."""
@@ -401,7 +401,7 @@ class DDGConfig:
     prior_jitter: float = 0.1
     """Relative scale and shift of c varied in training, so that it need not match to the last percent."""
     decoy_holes: float = 0.5
-    """Share of training frames whose prior is filled under another frame's holes as well."""
+    """Share of recorded frames whose prior is filled under another frame's holes as well."""
     # --- U-Net (ddg_jax/unet.py) ---
     space_to_depth: int = 4
     """Pixels per side folded into channels before the U-Net."""
@@ -451,8 +451,8 @@ class DDGConfig:
     sample_steps: int = 4
     """Network evaluations per map."""
     sample_spacing: str = "quadratic"
-    """Which diffusion steps they visit: trailing (equal steps) or quadratic (short ones at the end, where the
-    noise on surfaces is decided)."""
+    """Which diffusion steps they visit: trailing, leading or linspace (equal steps, named as in the
+    literature) or quadratic (short ones at the end, where the noise on surfaces is decided)."""
     distil_from: int = 16
     """Evaluations of the fitted network from which distillation starts; sample_steps times a power of two."""
     distil_steps: int = 150
@@ -460,8 +460,8 @@ class DDGConfig:
     eta: float = 0.0
     """Fresh noise in DDIM: 0 none, 1 as much as DDPM."""
     frame_correlation: float = 0.8
-    """Share of the initial noise's variance that the frames of an episode have in common: decides the flicker
-    of holes (docs/generator.md)."""
+    """Share of the noise's variance (the initial one's, the prior's, and eta's) that the frames of an episode
+    have in common: decides the flicker of holes (docs/generator.md)."""
     deviation_correlation: float = 0.0
     """The same for the noise that deviations come from: decides how surfaces change in time (representation
     deviation only)."""
@@ -492,6 +492,12 @@ class DDGConfig:
             raise UserError(
                 f"ddg.hole_loss {CROSS_ENTROPY} needs holes in a channel of their own: ddg.representation is "
                 f"{self.representation}; take deviation, or hole_loss {SQUARED}."
+            )
+        if self.hole_loss == CROSS_ENTROPY and self.sampler == PROGRESSIVE:
+            raise UserError(
+                f"ddg.sampler {PROGRESSIVE} distils squared errors: ddg.hole_loss is {CROSS_ENTROPY}, whose "
+                f"holes cannot leave -1 to 1 as a distilled step must; take sampler ddim with 2 to 4 "
+                f"sample_steps, or hole_loss {SQUARED}."
             )
         if not 0 < self.snr_limits[0] <= self.snr_limits[1] < float("inf"):
             raise UserError(

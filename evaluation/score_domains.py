@@ -14,7 +14,6 @@ import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.config import DextrahConfig, ScoreConfig
-from ddgrasp.errors import UserError
 from evaluation.score_data import REAL, SIM, Episode, metres, millimetres
 
 if TYPE_CHECKING:
@@ -41,7 +40,8 @@ class Methods:
 
     @cached_property
     def monocular(self) -> "Prior | None":
-        """The monocular network, None without weights."""
+        """The monocular network; None if no folder was named and the usual one is not there."""
+        from ddg_jax.depth_prior import weights_folder
         from ddg_jax.prior import make_prior
 
         settings = replace(
@@ -50,12 +50,9 @@ class Methods:
             prior_weights=self.config.monocular_weights,
             prior_in_sim="rgb",
         )
-        try:
-            return make_prior(settings)
-        except UserError:
-            if self.config.monocular_weights:
-                raise
+        if not self.config.monocular_weights and not weights_folder(settings).exists():
             return None
+        return make_prior(settings)
 
     @property
     def needs_rgb(self) -> bool:

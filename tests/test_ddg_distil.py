@@ -32,6 +32,11 @@ TINY = DDGConfig(
 DISTILLED = dataclasses.replace(TINY, sampler="progressive", sample_steps=1, distil_from=4, distil_steps=60)
 
 
+def test_log_odds_are_not_distilled():
+    with pytest.raises(UserError, match="hole_loss is cross_entropy.*take sampler ddim"):
+        dataclasses.replace(DISTILLED, hole_loss="cross_entropy")
+
+
 def pictures(count: int = 32) -> Frames:
     """Random blocks of holes on a random slope."""
     rng = np.random.default_rng(0)

@@ -13,6 +13,7 @@ from ddg_jax.sample import Generator, generate, predict
 from ddgrasp import artifacts
 from ddgrasp.config import Config, DDGConfig
 from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress, read_curves
 from sensors.recordings import RecordingWriter
 
@@ -93,8 +94,32 @@ def test_sampling_sees_the_prior_that_training_saw_however_large(fitted):
 
 
 def test_sample_folder_draws_a_picture(fitted, recordings, tmp_path):
-    path = stage.sample_folder(fitted.directory, recordings, tmp_path, seed=0, count=3)
+    path = stage.sample_folder(
+        fitted.directory, recordings, tmp_path, seed=0, progress=Progress(quiet=True), count=3
+    )
     assert cv2.imread(str(path)).shape == (4 * 16, 3 * 24, 3)
+
+
+def test_the_camera_presets_generator_fits_and_samples_with_fresh_noise(recordings, tmp_path):
+    small = {
+        name: getattr(CONFIG.ddg, name) for name in ("height_px", "width_px", "widths", "diffusion_steps")
+    }
+    small |= {"train_steps": 10, "attention_heads": 1, "blocks": (1, 1), "sample_batch": 4}
+    config = dataclasses.replace(CONFIG, ddg=dataclasses.replace(get_preset("camera").ddg, **small))
+    progress = Progress(tmp_path / "ddg", "ddg", quiet=True)
+    fitted = stage.fit_folder(config, recordings, tmp_path / "ddg", progress=progress)
+    progress.close()
+    assert fitted.manifest.metrics["prior"] == "metric_inverse_depth"
+    generator = Generator.load(fitted.directory)
+    assert (generator.config.sampler, generator.config.eta, generator.config.sample_steps) == ("ddim", 1.0, 2)
+    c = np.zeros((3, 16, 24), np.float32)
+    made = predict(jax.random.key(0), generator, c)
+    np.testing.assert_array_equal(predict(jax.random.key(0), generator, c), made)
+    # fresh noise is each frame's own, however they are batched
+    last = predict(jax.random.key(0), generator, c[2:], frame=np.array([2]))
+    np.testing.assert_allclose(last[0], made[2], atol=1e-5)
+    calm = dataclasses.replace(generator, config=dataclasses.replace(generator.config, eta=0.0))
+    assert np.abs(predict(jax.random.key(0), calm, c) - made).max() > 1e-2
 
 
 def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):

@@ -50,9 +50,15 @@ class DDGSample:
 
     def run(self) -> None:
         from ddg_jax.stage import sample_folder
+        from ddgrasp.progress import Progress
 
         check_count("--count", self.count)
-        print(sample_folder(self.model, self.data, self.out, seed=self.seed, count=self.count))
+        progress = Progress(name="ddg sample")
+        print(
+            sample_folder(
+                self.model, self.data, self.out, seed=self.seed, progress=progress, count=self.count
+            )
+        )
 
 
 @dataclass(frozen=True)
