@@ -63,10 +63,19 @@ def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Arti
     return _finish(STAGE, setting, methods, loads, parents, progress)
 
 
+def real_config(config: Config, root: Path) -> Config:
+    """`config` with the generator's rows those of the recordings below `root`: nothing is cropped."""
+    rows, _ = score_data.real_size(root, config.ddg.width_px)
+    return replace(config, ddg=replace(config.ddg, height_px=rows))
+
+
 def run_real(
     config: Config, root: Path, fit_frames: int, score_frames: int, out: Path, *, progress: Progress
 ) -> Artifact:
-    """Fits a generator on the first frames of the recordings below `root` and scores it on the last ones."""
+    """Fits a generator on the first frames of the recordings below `root` and scores it on the last ones.
+
+    `config` is one of `real_config`.
+    """
     directory = out / STAGE_REAL
     least = 4 * score_data.BLOCK_FRAMES
     if score_frames < least:
@@ -77,7 +86,6 @@ def run_real(
             f"--fit-frames {fit_frames} and --score-frames {score_frames} of {frames.total} frame(s): "
             "they must not overlap, and fitting needs 2 or more."
         )
-    config = replace(config, ddg=replace(config.ddg, height_px=frames.depth_mm.shape[1]))
     fitted = _fit_real(config, root, fit_frames, directory / "ddg", progress)
     methods = Methods(config.score, config.seed, fitted)
     episodes = score_data.real_episodes(frames, methods.needs_rgb)

@@ -173,30 +173,41 @@ class RealFrames:
     baseline_m: float
 
 
-def load_real(root: Path, width_px: int, last: int) -> RealFrames:
-    """The `last` frames of the recordings at or below `root`, at `width_px` (nearest neighbours).
+def real_size(root: Path, width_px: int) -> tuple[int, int]:
+    """(rows, columns) of the recordings at or below `root` brought to `width_px`.
 
     Raises UserError for recordings of different sizes, or none.
     """
+    return _size(_of_one_size(root)[0], width_px)
+
+
+def load_real(root: Path, width_px: int, last: int) -> RealFrames:
+    """The `last` frames of the recordings at or below `root`, at `width_px` (nearest neighbours).
+
+    Raises UserError for recordings of different sizes or of unknown optics, or none.
+    """
     from ddg_jax.data import resize_nearest
 
-    recordings = find_recordings(root)
-    sizes = {(r.height_px, r.width_px) for r in recordings}
-    if len(sizes) > 1:
-        raise UserError(f"{root} holds recordings of different sizes {sorted(sizes)}: give one of them.")
-    (height, width) = sizes.pop()
-    size = (round(height * width_px / width), width_px)
+    recordings = _of_one_size(root)
+    focal_px, baseline_m = recordings[0].optics()
+    size = _size(recordings[0], width_px)
     frames = [(r, i) for r in recordings for i in range(len(r))]
     chosen = frames[-last:]
     depth = np.stack([resize_nearest(r.depth_mm(i), size) for r, i in chosen])
     rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
-    focal = recordings[0].fx_px or contract.D455.fx_px * width / contract.D455.width_px
-    return RealFrames(len(frames), depth, rgb, focal * width_px / width, _baseline_m(recordings[0]))
+    return RealFrames(len(frames), depth, rgb, focal_px * width_px / recordings[0].width_px, baseline_m)
 
 
-def _baseline_m(recording: Recording) -> float:
-    """As recorded, or a D455's."""
-    return float(recording.meta.get("baseline_m", contract.D455.baseline_m))
+def _of_one_size(root: Path) -> list[Recording]:
+    recordings = find_recordings(root)
+    sizes = {(r.height_px, r.width_px) for r in recordings}
+    if len(sizes) > 1:
+        raise UserError(f"{root} holds recordings of different sizes {sorted(sizes)}: give one of them.")
+    return recordings
+
+
+def _size(recording: Recording, width_px: int) -> tuple[int, int]:
+    return round(recording.height_px * width_px / recording.width_px), width_px
 
 
 def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:

@@ -68,25 +68,23 @@ def hole_figures(scored: Scored, bootstrap: int, seed: int) -> dict[str, Any]:
     """Domain -> figures with intervals, distances of its hole-rate curves from the recorded ones, curves."""
     rng = np.random.default_rng(seed)
     real_draws = [rng.integers(len(scored.sums[RAW]), size=len(scored.sums[RAW])) for _ in range(bootstrap)]
-    return {
-        name: _domain_figures(scored.sums[name], scored.sums[RAW], real_draws, rng)
-        for name in DOMAINS
-        if name in scored.sums
-    }
+    made = {}
+    for name in (n for n in DOMAINS if n in scored.sums):
+        mine = scored.sums[name]
+        paired = scored.groups[name] == scored.groups[RAW]  # the same scenes: drawn together
+        own = real_draws if paired else [rng.integers(len(mine), size=len(mine)) for _ in real_draws]
+        made[name] = _domain_figures(mine, scored.sums[RAW], list(zip(own, real_draws, strict=True)))
+    return made
 
 
 def _domain_figures(
-    mine: Sequence[holes.Sums], real: Sequence[holes.Sums], real_draws: Sequence[np.ndarray],
-    rng: np.random.Generator,
-) -> dict[str, Any]:  # fmt: skip
+    mine: Sequence[holes.Sums], real: Sequence[holes.Sums], drawn: two_samples.Drawn
+) -> dict[str, Any]:
     def figures(own: Sequence[holes.Sums], theirs: Sequence[holes.Sums]) -> dict[str, float]:
         total, reference = holes.added(own), holes.added(theirs)
         return {**holes.figures(total), **holes.gaps(total, reference)}
 
-    resampled = []
-    for rows in real_draws:
-        own = rows if mine is real else rng.integers(len(mine), size=len(mine))
-        resampled.append(figures([mine[i] for i in own], [real[i] for i in rows]))
+    resampled = [figures([mine[i] for i in o], [real[i] for i in t]) for o, t in drawn]
     curves = {name: list(values) for name, values in holes.curves(holes.added(mine)).items()}
     return {"figures": intervals(figures(mine, real), resampled), "curves": curves}
 

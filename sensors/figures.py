@@ -9,15 +9,12 @@ from typing import Any
 import numpy as np
 
 from ddgrasp.contract import CameraProfile
-from ddgrasp.errors import UserError
 from sensors import curves, stats
 from sensors.curves import Curve, Stream
 from sensors.recordings import Recording
 
 STEPS_PER_PX = 32
 """D4xx cameras report disparity in 1/32 of a native pixel."""
-D4XX_BASELINE_M = {"D435": 0.050, "D415": 0.055, "D455": 0.095}
-"""Distance between the imagers (Intel RealSense D400 series datasheet)."""
 RANGE_MM = 750.0
 
 
@@ -100,23 +97,15 @@ def stream_of(recording: Recording, factor: int = 1) -> Stream:
     """A recording's frames, decimated by `factor`, with the baseline of its sensor.
 
     Raises:
-        UserError: focal length or sensor unknown, so that disparity cannot be computed.
+        UserError: focal length or sensor unknown (`Recording.optics`).
     """
-    sensor = str(recording.meta.get("sensor", ""))
-    baseline = recording.meta.get("baseline_m") or next(
-        (metres for name, metres in D4XX_BASELINE_M.items() if name in sensor), None
-    )
-    if not recording.fx_px or not baseline:
-        raise UserError(
-            f"{recording.path}: fx_px is {recording.fx_px!r}, sensor {sensor!r}; add fx_px and "
-            "baseline_m to meta.json: without them disparity is unknown."
-        )
+    fx_px, baseline_m = recording.optics()
     depth = np.stack([recording.depth_mm(i) for i in range(len(recording))])
-    fb_px_m = recording.fx_px * baseline
+    fb_px_m = fx_px * baseline_m
     static = curves.static_runs(depth, fb_px_m) if recording.consecutive else ()
     if factor > 1:
         depth = np.stack([stats.decimated(frame, factor) for frame in depth])
-    return Stream(depth, recording.fx_px / factor, fb_px_m / factor, static)
+    return Stream(depth, fx_px / factor, fb_px_m / factor, static)
 
 
 def rig_stream(depth_mm: np.ndarray, profile: CameraProfile, scenes: int) -> Stream:

@@ -30,6 +30,9 @@ NEAREST_MEDIAN_M = 0.08
 FARTHEST_MEDIAN_M = 6.0
 UNIT_CHECK_FRAMES = 5
 
+D4XX_BASELINE_M = {"D435": 0.050, "D415": 0.055, "D455": 0.095}
+"""Distance between the imagers, from the D400 series datasheet."""
+
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_GREY = 0
 
@@ -110,6 +113,23 @@ class Recording:
     def fx_px(self) -> float | None:
         """Focal length of the depth picture in pixels, where known."""
         return self.meta.get("fx_px")
+
+    def optics(self) -> tuple[float, float]:
+        """(focal length in pixels, baseline in metres), which turn depth into disparity.
+
+        Raises:
+            UserError: meta.json names no focal length, or neither a baseline nor a D4xx that has one.
+        """
+        sensor = str(self.meta.get("sensor", ""))
+        baseline = self.meta.get("baseline_m") or next(
+            (metres for name, metres in D4XX_BASELINE_M.items() if name in sensor), None
+        )
+        if not self.fx_px or not baseline:
+            raise UserError(
+                f"{self.path}: fx_px is {self.fx_px!r}, sensor {sensor!r}; add fx_px and baseline_m to "
+                f"{META_FILE}: without them disparity is unknown."
+            )
+        return self.fx_px, baseline
 
     @property
     def consecutive(self) -> bool:

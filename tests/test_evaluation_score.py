@@ -15,7 +15,7 @@ from ddgrasp import artifacts, cli
 from ddgrasp.config import Config, DDGConfig, RecordConfig, ScoreConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
-from evaluation import score_data, score_features
+from evaluation import holes, score_data, score_features, score_table
 from evaluation.score_domains import (
     COLUMNS,
     DOMAINS,
@@ -27,6 +27,7 @@ from evaluation.score_domains import (
     sense,
     wanted_domains,
 )
+from evaluation.score_episodes import Scored
 from evaluation.score_figures import draw_efficiency
 from evaluation.stage import write_report
 from foundation import convert, store
@@ -69,7 +70,7 @@ SIZES = [
 def write_recording(path: Path, frames: int, size: tuple[int, int]) -> None:
     """A slope, a box that moves, and its shadow."""
     rng = np.random.default_rng(0)
-    with RecordingWriter(path, {"fx_px": 0.6 * size[1]}) as writer:
+    with RecordingWriter(path, {"fx_px": 0.6 * size[1], "sensor": "RealSense D435"}) as writer:
         for t in range(frames):
             depth = np.broadcast_to(np.linspace(1500, 700, size[0])[:, None], size).copy()
             left = size[1] // 3 + t % 10
@@ -115,8 +116,8 @@ def test_the_score_has_every_column_the_floor_and_the_targets(scored):
 
 
 def test_hole_figures_say_what_must_be_so(scored):
-    holes = json.loads((scored / "score" / "score.json").read_text())["holes"]
-    value = {name: {k: v["value"] for k, v in item["figures"].items()} for name, item in holes.items()}
+    result = json.loads((scored / "score" / "score.json").read_text())["holes"]
+    value = {name: {k: v["value"] for k, v in item["figures"].items()} for name, item in result.items()}
     assert value["sim_gt"]["rmse_mm"] == value[LIMIT]["rmse_mm"] == 0  # exact where valid
     # grafting takes small deviations back and adds none; the rest is rounding to millimetres
     assert value["sim_ddg"]["rmse_mm"] <= value["sim_ddg_no_graft"]["rmse_mm"] + 0.5
@@ -156,12 +157,58 @@ def test_a_real_cameras_recordings_are_fitted_and_scored(tmp_path, capsys):
     assert "must not overlap" in capsys.readouterr().err
     assert cli.main([*command, "--run-dir", str(tmp_path)]) == 2
     assert "leave one of them out" in capsys.readouterr().err
-    assert cli.main([*command, "--fit-frames", "10", "--score-frames", "16", "--resume"]) == 0
+    command += ["--fit-frames", "10", "--score-frames", "16", "--ddg.train-steps", "3"]
+    assert cli.main([*command, "--resume"]) == 0
+    fitted = artifacts.read_manifest(tmp_path / "out" / "score_real" / "ddg").config["ddg"]
+    assert (fitted["height_px"], fitted["train_steps"]) == (120, 3)
     result = json.loads((tmp_path / "out" / "score_real" / "score.json").read_text())
     table = result["tables"]["depthfeat-v1"]
     assert "Nobody modelled that room" in result["setting"]
     assert table["sim_gt"]["fid"]["value"] > table["floor"]["fid"]["value"] >= 0
     assert "score.html" in capsys.readouterr().out
+    assert cli.main([*command, "--resume"]) == 0
+    assert "finished before" in capsys.readouterr().err
+
+
+def test_disparity_is_the_recorded_cameras_own(tmp_path):
+    write_recording(tmp_path / "room", 2, (48, 64))
+    real = score_data.load_real(tmp_path / "room", 32, 2)
+    assert (real.focal_px, real.baseline_m) == (pytest.approx(0.6 * 32), 0.050)
+    meta = tmp_path / "room" / "meta.json"
+    meta.write_text(meta.read_text().replace("D435", "of another make"))
+    with pytest.raises(UserError, match="add fx_px and baseline_m to meta.json"):
+        score_data.load_real(tmp_path / "room", 32, 2)
+
+
+@pytest.mark.parametrize(
+    "option", [("--ddg.train-steps", "3"), ("--fit-frames", "9"), ("--score-frames", "17")]
+)
+def test_options_of_real_without_it_are_refused(option, run_dir, tmp_path, capsys):
+    command = [
+        "ddg",
+        "score",
+        "--preset",
+        "debug",
+        "--out",
+        str(tmp_path),
+        "--run-dir",
+        str(run_dir),
+        *option,
+    ]
+    assert cli.main(command) == 2
+    assert "without --real" in capsys.readouterr().err
+
+
+def test_sides_that_show_the_same_scenes_are_resampled_together():
+    rng, clean = np.random.default_rng(0), np.ones((1, 36, 64), np.float32)
+    depths = [np.where(rng.random(clean.shape) < share, 0, clean) for share in (0.1, 0.2, 0.3)]
+    scenes = [holes.episode_sums(depth, clean, [holes.geometry(clean[0], 40.0)]) for depth in depths]
+    both = Scored(sums={"real_raw": scenes, FLOOR: scenes}, groups={"real_raw": [0, 1, 2], FLOOR: [0, 1, 2]})
+    apart = Scored(sums=both.sums, groups={"real_raw": [0, 1, 2], FLOOR: [3, 4, 5]})
+    together, alone = (
+        score_table.hole_figures(s, 20, 0)[FLOOR]["figures"]["gap_depth_m"] for s in (both, apart)
+    )
+    assert together["low"] == together["high"] == 0 < alone["high"] - alone["low"]
 
 
 def test_the_curve_fits_and_scores_every_size_and_keeps_finished_points(run_dir, tmp_path, capsys):
@@ -234,7 +281,7 @@ def test_domains_belong_to_one_side_and_depend_on_seed_and_episode_alone(run_dir
     off_per_m = np.abs(1000 / sim["sim_ddg"][kept] - 1000 / sim["sim_gt"][kept])
     assert off_per_m.max() <= LIMIT_PER_M + 0.002  # and half a millimetre of rounding
     other = sense(replace(methods, seed=1), episode("sim"), ["sim_ddg", "sim_rand_noise"])
-    assert any((other[name] != sim[name]).any() for name in other)
+    assert all((other[name] != sim[name]).any() for name in other)
 
 
 def test_the_monocular_column_uses_the_users_weights(run_dir, tmp_path):

@@ -4,7 +4,7 @@ Stages are imported inside `run`, so that `--help` starts without JAX.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,8 @@ def parse(name: str, args: Sequence[str]) -> Command:
         options["default"] = cls(config=preset, out=Path("runs") / preset.preset)
     elif issubclass(cls, Scoring):
         preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
-        options["default"] = cls(preset.score, preset.preset, Path("runs") / preset.preset)
+        default = cls(preset.score, preset.preset, Path("runs") / preset.preset)
+        options["default"] = replace(default, ddg=preset.ddg) if isinstance(default, DDGScore) else default
     elif cls is Deploy:
         policy = Path(_option(args, "--policy") or Path("runs") / DEFAULT_PRESET / "export" / "policy.onnx")
         options["default"] = Deploy(config=config_of(policy, _option(args, "--preset")), policy=policy)

@@ -10,7 +10,8 @@ import tyro
 
 from ddgrasp import artifacts, pipeline
 from ddgrasp.commands.base import load_config
-from ddgrasp.config import Config, DepthFeatureConfig, ScoreConfig
+from ddgrasp.commands.checks import check_config_values
+from ddgrasp.config import Config, DDGConfig, DepthFeatureConfig, ScoreConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 
@@ -45,19 +46,22 @@ class Scoring:
 class DDGScore(Scoring):
     """Compare generated depth with recorded depth: the paper's Table I, hole measures, t-SNE."""
 
+    ddg: DDGConfig = DDGConfig()
+    """Generator that --real fits; its rows are those of the recordings."""
     real: Path | None = None
     """Recordings of a real camera: fits the preset's generator on the first frames and scores it on the last,
     instead of the rig; no run is needed."""
     fit_frames: int = 80
     """Frames that --real is fitted on."""
     score_frames: int = 40
-    """Frames that --real is scored on."""
+    """Frames that --real is scored on, the last ones."""
 
     def run(self) -> None:
         from evaluation import score
         from evaluation.score_page import print_result
 
         if self.real is None:
+            self._refuse_options_of_real()
             self._make("score", lambda config, source, p: score.run(config, source, self.out, progress=p))
             print_result(self.out / "score")
             return
@@ -66,7 +70,8 @@ class DDGScore(Scoring):
                 f"--run-dir {self.run_dir} with --real: the generator is fitted on the first frames, none is "
                 "taken from a run; leave one of them out."
             )
-        config = replace(get_preset(self.preset), score=self.score, seed=self.seed)
+        preset = replace(get_preset(self.preset), ddg=self.ddg, score=self.score, seed=self.seed)
+        config = score.real_config(check_config_values(preset), self.real)
         root, stage = self.real, pipeline.get_stage("score_real")
 
         def work(progress):
@@ -77,6 +82,16 @@ class DDGScore(Scoring):
         inputs = {"frames": f"{root.resolve()} {self.fit_frames} {self.score_frames}"}
         pipeline.make(stage, config, self.out, work, resume=self.resume, inputs=inputs)
         print_result(self.out / stage.name)
+
+    def _refuse_options_of_real(self) -> None:
+        usual = DDGScore(self.score, self.preset, self.out, ddg=get_preset(self.preset).ddg)
+        for name in ("ddg", "fit_frames", "score_frames"):
+            if getattr(self, name) != getattr(usual, name):
+                option = "--ddg.*" if name == "ddg" else f"--{name.replace('_', '-')}"
+                raise UserError(
+                    f"{option} without --real: the generator of {self.run_dir or self.out} is scored as it "
+                    "is; give --real, or fit another one with `ddgrasp ddg fit`."
+                )
 
 
 @dataclass(frozen=True)
