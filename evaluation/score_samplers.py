@@ -19,7 +19,7 @@ from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE, Config
 from ddgrasp.progress import Progress
 from evaluation import holes, score_data, score_features, score_table
-from evaluation.score_domains import FLOOR, RAW, Methods
+from evaluation.score_domains import FLOOR, RAW, REFERENCES, Methods
 from evaluation.score_episodes import Load, Scored, collect, score_episodes
 
 if TYPE_CHECKING:
@@ -57,11 +57,13 @@ def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Arti
         rows[name]["frames_per_s"] = _frames_per_s(generator, simulated)
     for row in rows.values():
         row["over_reference"] = row["fid"]["value"] / rows[_name(*REFERENCE)]["fid"]["value"]
-    recorded = holes.figures(holes.added(common.sums[FLOOR]))
-    result = {"features": {extractor.name: extractor.source}, "recorded": recorded, "samplers": rows}
+    floor = score_table.make_table(common.features[extractor.name], config.score, config.seed)["floor"]
+    floor["holes"] = holes.figures(holes.added(common.sums[FLOOR]))
+    floor.pop("resampled_fid")
+    result = {"features": {extractor.name: extractor.source}, "floor": floor, "samplers": rows}
     artifacts.atomic_write_json(directory / JSON, result)
     parents = [artifacts.read_artifact(run_dir / name) for name in ("teacher", "ddg")]
-    metrics = {"samplers": table(rows), "targets": [_target(rows)]}
+    metrics = {"samplers": table(rows, floor), "targets": [_target(rows)]}
     return artifacts.finish(
         directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=parents
     )
@@ -105,19 +107,20 @@ def _frames_per_s(generator: "Generator", loads: Sequence[Load]) -> float:
     return len(depth_m) / (time.perf_counter() - begun)
 
 
-def table(rows: dict[str, Any]) -> list[dict[str, str]]:
-    """The rows as text."""
+def table(rows: dict[str, Any], floor: dict[str, Any]) -> list[dict[str, str]]:
+    """The rows as text; the last one is recorded depth against recorded depth."""
     return [
         {
             "sampler": name, "FID": score_table.describe(row["fid"]),
             "FID / Sim GT's": score_table.describe(row["fid_ratio"]),
-            f"over {_name(*REFERENCE)}": f"{row['over_reference']:.2f}",
+            f"over {_name(*REFERENCE)}": f"{row['over_reference']:.2f}" if "over_reference" in row else "",
+            "KID x 100": score_table.describe(row["kid_x100"]),
             "hole regions per frame": f"{row['holes']['components_per_frame']:.1f}",
             "invalid pixels": f"{100 * row['holes']['invalid_share']:.2f} %",
             "flicker": f"{100 * row['holes']['flicker']:.2f} %",
-            "frames/s": f"{row['frames_per_s']:.1f}",
+            "frames/s": f"{row['frames_per_s']:.1f}" if "frames_per_s" in row else "",
         }
-        for name, row in rows.items()
+        for name, row in (rows | {REFERENCES["floor"].title: floor}).items()
     ]  # fmt: skip
 
 

@@ -238,7 +238,9 @@ def test_samplers_are_scored_on_the_same_episodes(run_dir, tmp_path, capsys):
     assert list(rows) == ["ddim 50", "ddim 10", "ddim 4", "dpm_solver 8", "dpm_solver 4"]
     assert rows["ddim 50"]["over_reference"] == 1.0 and rows["ddim 4"]["over_reference"] != 1.0
     assert all(row["frames_per_s"] > 0 and 0 < row["holes"]["invalid_share"] < 1 for row in rows.values())
-    assert "at most 4 evaluations" in capsys.readouterr().out
+    assert 0 <= result["floor"]["fid"]["value"] < rows["ddim 50"]["fid"]["value"]
+    printed = capsys.readouterr().out
+    assert "at most 4 evaluations" in printed and "Real vs real" in printed
 
 
 def test_unknown_columns_and_extractors_are_refused_at_once(capsys, tmp_path):
