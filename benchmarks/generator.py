@@ -21,7 +21,7 @@ from ddg_jax.prior import make_prior
 from ddg_jax.representation import channels, correlations
 from ddg_jax.sample import Generator, condition, frame_noise, generate, grafted
 from ddg_jax.train import init_params, predict_noise
-from ddgrasp.config import DPM_SOLVER, PROGRESSIVE, DDGConfig
+from ddgrasp.config import CROSS_ENTROPY, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.presets import get_preset
 
 REFERENCE = ("ddim", 50)
@@ -30,6 +30,13 @@ SAMPLERS = (
     (PROGRESSIVE, 4), (PROGRESSIVE, 2), (PROGRESSIVE, 1),
 )  # fmt: skip
 DDPM_STEPS = 50
+
+
+def samplers(config: DDGConfig) -> list[tuple[str, int]]:
+    """(name, evaluations): SAMPLERS that the configuration can have, and its own."""
+    found = [pair for pair in SAMPLERS if pair[0] != PROGRESSIVE or config.hole_loss != CROSS_ENTROPY]
+    own = (config.sampler, config.sample_steps)
+    return found if own in found else [*found, own]
 
 
 def scenes(config: DDGConfig, count: int) -> np.ndarray:
@@ -55,7 +62,7 @@ def measure(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
         generator = make_generator(config, params, batch, sampler, steps)
         return compare.Contender(partial(generate, key, generator, depth), work)
 
-    contenders = {f"{sampler} {steps}": contender(sampler, steps) for sampler, steps in SAMPLERS}
+    contenders = {f"{sampler} {steps}": contender(sampler, steps) for sampler, steps in samplers(config)}
     every_step = config.diffusion_steps
     timed = min(DDPM_STEPS, every_step)
     contenders[f"ddpm {every_step}"] = contender("ddpm", timed, count * timed / every_step)

@@ -379,7 +379,7 @@ class DDGConfig:
     D455's; 0.0016 for a D435 at 640x480 (deviation only). 1 grafts holes alone."""
     surface: str = "filtered"
     """The surface that recorded depth deviates from: filtered (fast), or piecewise (planes with sharp edges;
-    nearer to the truth, a third of a second a frame; ddg_jax/piecewise.py)."""
+    nearer to the truth, 0.1 to 0.3 s a frame; ddg_jax/piecewise.py)."""
     # --- geometric prior c (ddg_jax/prior.py) ---
     prior: str = "inverse_depth"
     """Where c comes from: inverse_depth (normalised, built in), metric_inverse_depth (not normalised: for
