@@ -4,7 +4,6 @@ Written against pyrealsense2 2.59's documented API and tried through librealsens
 a synthetic stream; it has not been run on a camera by us.
 """
 
-import importlib
 import time
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from ddgrasp import contract
 from ddgrasp.errors import UserError
 from deploy.interfaces import CameraError, Clock, Frame
+from sensors.realsense import load_pyrealsense2
 
 STREAM_WIDTH_PX, STREAM_HEIGHT_PX = 1280, 720
 FOCAL_TOLERANCE = 0.1
@@ -52,7 +52,7 @@ class RealSenseCamera:
 
     def start(self) -> None:
         """Open the stream and check its focal length. Raises UserError."""
-        rs = _pyrealsense2()
+        rs = load_pyrealsense2()
         self._rs, pipeline, config = rs, rs.pipeline(), rs.config()
         if self._serial:
             config.enable_device(self._serial)
@@ -117,12 +117,3 @@ class RealSenseCamera:
                 f"the camera's focal length is {fx_px:.1f} px at this scale, the policy was trained for "
                 f"{wanted:.1f} px: use a D455, or train with your camera's profile."
             )
-
-
-def _pyrealsense2() -> Any:
-    try:
-        return importlib.import_module("pyrealsense2")
-    except ImportError as error:
-        raise UserError(
-            f"camera 'realsense' needs pyrealsense2 ({error}): pip install -e '.[realsense]'."
-        ) from error

@@ -1,4 +1,4 @@
-"""Recordings from elsewhere into the format of `recordings.py`: folders of pictures, RealSense `.bag` files.
+"""Recordings from elsewhere into the format of `recordings.py`: folders of pictures, RealSense files.
 
 Only pictures and what the camera is are kept: no pose, no CAD, no pairing. A frame that cannot be used is
 named and left out; a source none of whose frames can be used, or whose depth is in another unit, is refused.
@@ -19,6 +19,7 @@ from sensors.recordings import FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M, RecordingWri
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
+REALSENSE_SUFFIXES = (".bag", ".db3")
 _ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
 _UINT16_MAX = np.iinfo(np.uint16).max
 
@@ -146,11 +147,12 @@ def _check_unit(source: Source, medians_m: list[float]) -> None:
     median_m = float(np.median(medians_m)) if medians_m else NEAREST_MEDIAN_M
     if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
         return
-    factor = DEPTH_UNIT_M if median_m > FARTHEST_MEDIAN_M else 1.0 / DEPTH_UNIT_M
+    far = median_m > FARTHEST_MEDIAN_M
+    unit_m = source.depth_unit_m * (DEPTH_UNIT_M if far else 1.0 / DEPTH_UNIT_M)
+    remedy = f"give its unit, perhaps --depth-unit-m {unit_m:g}"
     raise UserError(
         f"{source.path}: median depth {median_m:.4g} m with {source.depth_unit_m:g} m per unit; expected "
-        f"{NEAREST_MEDIAN_M:g} to {FARTHEST_MEDIAN_M:g} m: give its unit, perhaps "
-        f"--depth-unit-m {source.depth_unit_m * factor:g}."
+        f"{NEAREST_MEDIAN_M:g} to {FARTHEST_MEDIAN_M:g} m: {remedy}."
     )
 
 
@@ -226,19 +228,22 @@ def _read_rgb(file: Path) -> np.ndarray | None:
 
 
 def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> list[Source]:
-    """A `.bag` file, a folder of them, or folders of pictures.
+    """A RealSense file (`.bag`, `.db3`), a folder of them, or folders of pictures.
 
     Raises:
         UserError: nothing there that can be imported.
     """
     if not path.exists():
-        raise UserError(f"{path}: no such file or folder; expected a .bag, or a folder of pictures or bags.")
-    bags = [path] if path.is_file() else sorted(path.glob("*.bag"))
-    if not bags:
+        raise UserError(
+            f"{path}: no such file or folder; expected a .bag or .db3, a folder of them, or one of pictures."
+        )
+    if path.is_file() and path.suffix not in REALSENSE_SUFFIXES:
+        raise UserError(f"{path}: a file of type {path.suffix!r}; expected a RealSense .bag or .db3.")
+    inside = [path] if path.is_file() else sorted(path.iterdir())
+    files = [file for file in inside if file.suffix in REALSENSE_SUFFIXES]
+    if not files:
         return folder_sources(path, depth_unit_m, meta)
-    if wrong := [bag for bag in bags if bag.suffix != ".bag"]:
-        raise UserError(f"{wrong[0]}: a file of type {wrong[0].suffix!r}; expected a RealSense .bag.")
-    from sensors.bag import bag_source
+    from sensors.realsense import file_source
 
-    sources = [bag_source(bag) for bag in bags]
+    sources = [file_source(file) for file in files]
     return [replace(s, depth_unit_m=depth_unit_m or s.depth_unit_m, meta={**s.meta, **meta}) for s in sources]

@@ -28,22 +28,22 @@ class Record(OneStage):
 
 @dataclass(frozen=True)
 class RecordImport:
-    """Turn RealSense .bag files or folders of colour and depth pictures into recordings."""
+    """Turn RealSense files (.bag, .db3) or folders of colour and depth pictures into recordings."""
 
     source: tyro.conf.Positional[Path]
-    """A .bag, a folder of them, a folder with depth/ and color/ (or rgb/), or a folder of such folders."""
+    """A .bag or .db3, a folder of them, one with depth/ and color/ (or rgb/), or a folder of such folders."""
     out: Path = Path("recordings")
     """Each source becomes a folder in it."""
     depth_unit_m: float = 0.0
-    """Metres per unit of depth; 0 takes a .bag's own, 0.001 for integer pictures, 1 for floats."""
+    """Metres per unit of depth; 0 takes a RealSense file's own, 0.001 for integer pictures, 1 for floats."""
     sensor: str = ""
-    """Camera model, for example D455; a .bag names its own."""
+    """Camera model, for example D455; a RealSense file names its own."""
     fx_px: float = 0.0
     """Focal length of the depth pictures in pixels; 0 if unknown."""
     baseline_m: float = 0.0
     """Distance between the imagers; 0 if unknown."""
     consecutive: bool = False
-    """The pictures follow each other in time (a .bag's do)."""
+    """The pictures follow each other in time (a RealSense file's do)."""
 
     def run(self) -> None:
         from sensors import importers
