@@ -45,6 +45,10 @@ class Source:
     """Metres per count of integer depth; for floating-point depth, metres per unit."""
     meta: dict[str, Any]
     """Fields of meta.json."""
+    unit_is_certain: bool = False
+    """Whether depths that cannot be a D4xx's are the scene's fault, not the unit's."""
+    closing_meta: Callable[[], dict[str, Any]] = dict
+    """Fields of meta.json that are known after the last frame alone."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ def import_recording(source: Source, path: Path) -> Imported:
             size = depth_mm.shape
             frames += 1
             writer.add(frame.rgb, depth_mm)
+        writer.meta.update(source.closing_meta())
         _check_unit(source, medians_m)
         if not frames:
             raise UserError(
@@ -150,6 +155,8 @@ def _check_unit(source: Source, medians_m: list[float]) -> None:
     far = median_m > FARTHEST_MEDIAN_M
     unit_m = source.depth_unit_m * (DEPTH_UNIT_M if far else 1.0 / DEPTH_UNIT_M)
     remedy = f"give its unit, perhaps --depth-unit-m {unit_m:g}"
+    if source.unit_is_certain:
+        remedy = f"point the camera at something {'nearer' if far else 'farther'}"
     raise UserError(
         f"{source.path}: median depth {median_m:.4g} m with {source.depth_unit_m:g} m per unit; expected "
         f"{NEAREST_MEDIAN_M:g} to {FARTHEST_MEDIAN_M:g} m: {remedy}."

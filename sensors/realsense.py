@@ -1,7 +1,8 @@
 """RealSense D4xx frames through pyrealsense2 (`pip install -e '.[realsense]'`), depth unaligned, no filters.
 
-Recorded files: `.bag`, or `.db3` as pyrealsense2 2.59 writes. Run on files of synthetic frames that
-pyrealsense2 2.56 (`.bag`) and 2.59 (`.db3`) wrote; no file of a real camera was at hand.
+Here the recorded file (`.bag`, or `.db3` as pyrealsense2 2.59 writes) and what it shares with a camera; the
+camera is in `realsense_live.py`. Run on files of synthetic frames that pyrealsense2 2.56 (`.bag`) and 2.59
+(`.db3`) wrote; no file of a real camera was at hand.
 """
 
 import importlib

@@ -212,7 +212,7 @@ class RecordingWriter:
 
     def __init__(self, path: str | os.PathLike, meta: dict[str, Any]):
         self.path = Path(path)
-        self._meta = dict(meta)
+        self.meta = dict(meta)
         self._temporary = self.path.parent / f".{self.path.name}.partial"
         self._size: tuple[int, int] | None = None
         self._frames = 0
@@ -272,7 +272,7 @@ class RecordingWriter:
             "contract_version": CONTRACT_VERSION,
             "invalid_fraction_mean": round(self._invalid / self._frames, 4),
         }
-        text = json.dumps({**self._meta, **meta}, indent=1) + "\n"
+        text = json.dumps({**self.meta, **meta}, indent=1) + "\n"
         _write(self._temporary / META_FILE, text.encode(), sync=True)
         old = self.path.parent / f".{self.path.name}.old"
         if self.path.exists():

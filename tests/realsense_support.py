@@ -1,7 +1,10 @@
-"""librealsense without a camera: its software device, fed with synthetic frames."""
+"""librealsense without a camera: its software device fed with synthetic frames, and a stand-in."""
 
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -68,6 +71,9 @@ class SoftwareCamera:
             sensor.stop()
             sensor.close()
 
+    def streaming(self) -> "Streaming":
+        return Streaming(self.give)
+
     def _stream(self, kind: Any, pixel_format: Any, bytes_per_pixel: int) -> Any:
         rs = self._rs
         intrinsics, stream = rs.intrinsics(), rs.video_stream()
@@ -78,3 +84,77 @@ class SoftwareCamera:
         stream.type, stream.fmt, stream.bpp, stream.fps = kind, pixel_format, bytes_per_pixel, 30
         stream.index, stream.uid, stream.intrinsics = 0, int(kind), intrinsics
         return stream
+
+
+class Streaming:
+    """Context in which frames arrive at 30 Hz."""
+
+    def __init__(self, give: Callable[[int], None]):
+        self._give, self._end = give, threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *error) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        number = 0
+        while not self._end.wait(1 / 30):
+            number += 1
+            self._give(number)
+
+
+class ScriptedLibrary:
+    """What recording needs of pyrealsense2; the pipeline delivers `numbers`, or raises what is among them."""
+
+    camera_info = SimpleNamespace(name="name", serial_number="serial_number")
+    stream = SimpleNamespace(depth="depth", color="color")
+    format = SimpleNamespace(z16="z16", rgb8="rgb8")
+    option = SimpleNamespace(stereo_baseline="baseline")
+
+    def __init__(self, numbers, *, start_error: str = "", serials: tuple[str, ...] = (SERIAL,)):
+        self._numbers, self._start_error, self._serials = iter(numbers), start_error, serials
+        self.asked: list[tuple] = []
+        self.stopped = False
+
+    def pipeline(self) -> "ScriptedLibrary":
+        return self
+
+    def config(self) -> Any:
+        def ask(*values):
+            self.asked.append(values)
+
+        return SimpleNamespace(enable_device=ask, enable_stream=ask)
+
+    def context(self) -> Any:
+        devices = [SimpleNamespace(get_info=lambda what, serial=serial: serial) for serial in self._serials]
+        return SimpleNamespace(query_devices=lambda: devices)
+
+    def start(self, config) -> Any:
+        if self._start_error:
+            raise RuntimeError(self._start_error)
+        sensor = SimpleNamespace(
+            supports=lambda what: True, get_option=lambda what: -BASELINE_MM, get_depth_scale=lambda: 0.0001
+        )
+        device = SimpleNamespace(get_info=lambda what: NAME, first_depth_sensor=lambda: sensor)
+        stream = SimpleNamespace(fps=lambda: 30, get_intrinsics=lambda: SimpleNamespace(fx=FX_PX))
+        video = SimpleNamespace(as_video_stream_profile=lambda: stream)
+        return SimpleNamespace(get_device=lambda: device, get_stream=lambda kind: video)
+
+    def stop(self) -> None:
+        self.stopped = True
+
+    def wait_for_frames(self, timeout_ms: int) -> Any:
+        number = next(self._numbers)
+        if callable(number):
+            number = number()
+        if isinstance(number, Exception):
+            raise number
+        depth = SimpleNamespace(get_data=lambda: 10 * depth_mm(number), get_frame_number=lambda: number)
+        color = SimpleNamespace(get_data=lambda: rgb(number))
+        return SimpleNamespace(
+            get_depth_frame=lambda: depth, get_color_frame=lambda: color, get_frame_number=lambda: number
+        )

@@ -1,6 +1,9 @@
-"""RealSense files into recordings, through librealsense where it is installed."""
+"""RealSense into recordings: files and a live camera, through librealsense where it is, else a stand-in."""
 
+import os
+import signal
 import sys
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +11,28 @@ import pytest
 
 from ddgrasp.commands import parse
 from ddgrasp.errors import UserError
-from realsense_support import FX_PX, NAME, SoftwareCamera, depth_mm
-from sensors.realsense import file_source
+from realsense_support import FX_PX, NAME, SERIAL, SIZE, ScriptedLibrary, SoftwareCamera, depth_mm
+from sensors.realsense_live import Pace, frame_count
 from sensors.recordings import Recording
+
+SMALL = ("--width", str(SIZE[1]), "--height", str(SIZE[0]))
+TIMEOUT = RuntimeError("Frame didn't arrive within 3000")
 
 
 @pytest.fixture
 def rs():
     """The real library; its wheel loads only where libusb is."""
     return pytest.importorskip("pyrealsense2", exc_type=ImportError)
+
+
+def record(out: Path, *args) -> None:
+    parse("record realsense", ["--out", str(out), *SMALL, *map(str, args)]).run()
+
+
+def scripted(monkeypatch, numbers, **how) -> ScriptedLibrary:
+    library = ScriptedLibrary(numbers, **how)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", library)
+    return library
 
 
 def numbers_in(path: Path) -> list[int]:
@@ -49,13 +65,162 @@ def test_a_file_that_librealsense_wrote_becomes_a_recording(rs, tmp_path, capsys
     assert capsys.readouterr().out.splitlines()[-1].endswith("left out: 0 frames, 0 recordings")
 
 
+def test_a_live_camera_becomes_a_recording(rs, tmp_path, monkeypatch, capsys):
+    camera, pipeline = SoftwareCamera(rs), rs.pipeline()
+    pipeline.set_device(camera.device)
+    monkeypatch.setattr(rs, "pipeline", lambda: pipeline)
+    with camera.streaming():
+        record(tmp_path, "--name", "desk", "--seconds", 0.5)
+    numbers = numbers_in(tmp_path / "desk")
+    assert len(numbers) == 5 and numbers[0] >= 16
+    slots = [(number - numbers[0]) // 3 for number in numbers]
+    lost = slots[-1] - 4  # a busy machine may lose frames; then it says how many
+    said = capsys.readouterr().out
+    assert sorted(set(slots)) == slots
+    assert said == (
+        f"{lost} frames were lost, writing them took too long: take a lower --hz or size\n" * (lost > 0)
+        + f"{tmp_path / 'desk'}: 5 frames\n"
+    )
+    meta = Recording.open(tmp_path / "desk").meta
+    assert (meta["sensor"], meta["fx_px"], meta["baseline_m"]) == (NAME, FX_PX, 0.095)
+    assert meta["hz"] == (round(50 / (5 + lost), 1) if lost else 10)
+
+
+def test_a_size_the_camera_does_not_have_is_named(rs, tmp_path, monkeypatch):
+    camera, pipeline = SoftwareCamera(rs), rs.pipeline()
+    pipeline.set_device(camera.device)
+    monkeypatch.setattr(rs, "pipeline", lambda: pipeline)
+    monkeypatch.setattr(rs, "context", ScriptedLibrary(()).context)
+    with pytest.raises(
+        UserError, match=r"no depth and colour of 65x48 at 30 Hz \(Couldn't resolve requests\)"
+    ):
+        record(tmp_path, "--width", 65)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- a scripted camera -----------------------------------------------------------------------------
+
+
+def test_every_third_frame_is_kept_once_the_exposure_has_settled(tmp_path, monkeypatch, capfd):
+    library = scripted(monkeypatch, count(1))
+    record(tmp_path, "--frames", 4, "--serial", SERIAL)
+    assert numbers_in(tmp_path / "take") == [16, 19, 22, 25]
+    assert library.asked == [(SERIAL,), ("depth", 64, 48, "z16", 30), ("color", 64, 48, "rgb8", 30)]
+    assert library.stopped
+    shown = capfd.readouterr()
+    assert shown.out == f"{tmp_path / 'take'}: 4 frames\n"
+    assert "first 0.5 s are left out while its exposure settles" in shown.err and "4/4" in shown.err
+
+
+def test_frames_that_writing_was_too_slow_for_are_counted(tmp_path, monkeypatch, capsys):
+    # After 16 are due 19 (lost), 22 (23 has to do), 25 (lost), 28 (30 has to do).
+    scripted(monkeypatch, [*range(1, 17), 18, 23, 24, 30])
+    record(tmp_path, "--frames", 3)
+    assert numbers_in(tmp_path / "take") == [16, 23, 30]
+    assert capsys.readouterr().out.startswith("2 frames were lost, writing them took too long")
+    assert Recording.open(tmp_path / "take").meta["hz"] == 6.0  # 10, but 3 of 5
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_keeps_what_was_recorded(tmp_path, monkeypatch, capsys, kind):
+    def interrupted():
+        os.kill(os.getpid(), kind)
+        return 22
+
+    before = signal.getsignal(kind)
+    scripted(monkeypatch, [*range(1, 22), interrupted, 25, 28])
+    record(tmp_path, "--seconds", 60)
+    assert numbers_in(tmp_path / "take") == [16, 19, 22]
+    assert capsys.readouterr().out == f"{tmp_path / 'take'}: 3 frames, stopped before the 600 asked for\n"
+    assert signal.getsignal(kind) is before
+
+
+def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, monkeypatch):
+    scripted(monkeypatch, [1, lambda: os.kill(os.getpid(), signal.SIGINT) or 2, 3])
+    with pytest.raises(KeyboardInterrupt, match="nothing was recorded"):
+        record(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_camera_that_stops_keeps_what_it_gave(tmp_path, monkeypatch, capsys):
+    library = scripted(monkeypatch, [*range(1, 20), TIMEOUT])
+    with pytest.raises(UserError, match=r"the camera stopped \(Frame didn't arrive within 3000\).*is kept"):
+        record(tmp_path, "--frames", 100)
+    assert numbers_in(tmp_path / "take") == [16, 19] and library.stopped
+    assert capsys.readouterr().out.endswith("take: 2 frames, stopped before the 100 asked for\n")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "how", "args", "message"),
+    [
+        ([TIMEOUT], {}, (), "has started but gives no frames"),
+        ((), {"start_error": "No device connected", "serials": ()}, (), "no RealSense camera is connected"),
+        ((), {"start_error": "No device"}, ("--serial", "000132"), "Did you mean '000123'"),
+        ((), {"start_error": "Couldn't resolve"}, ("--width", 65), "no depth and colour of 65x48 at 30 Hz"),
+        (
+            range(5500, 5530),
+            {},
+            ("--frames", 2),
+            "expected 0.08 to 6 m: point the camera at something nearer",
+        ),
+    ],
+)
+def test_what_the_camera_cannot_give_is_one_line_and_leaves_nothing(
+    tmp_path, monkeypatch, numbers, how, args, message
+):
+    scripted(monkeypatch, numbers, **how)
+    with pytest.raises(UserError, match=message) as error:
+        record(tmp_path, *args)
+    assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("--hz", 7), "--hz is 7; expected one of 1, 2, 3, 5, 6, 10, 15, 30"),
+        (("--hz", 0), "--hz is 0; expected one of 1"),
+        (("--seconds", 0), "--seconds is 0; expected more than 0, up to 3600"),
+        (("--seconds", "nan"), "--seconds is nan"),
+        (("--frames", -1), "--frames is -1; expected at least 1"),
+        (("--name", "a/b"), "--name is 'a/b'; expected a folder's name"),
+        (("--name", ".."), "--name is '..'"),
+    ],
+)
+def test_wrong_values_are_named_before_the_camera_starts(tmp_path, monkeypatch, args, message):
+    library = scripted(monkeypatch, ())
+    with pytest.raises(UserError, match=message):
+        record(tmp_path, *args)
+    assert library.asked == [] and list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_is_never_overwritten(tmp_path, monkeypatch):
+    scripted(monkeypatch, count(1))
+    record(tmp_path, "--frames", 2)
+    record(tmp_path, "--frames", 1, "--name", "take_2")
+    with pytest.raises(UserError, match="take exists already: choose another, for example --name take_3"):
+        record(tmp_path, "--frames", 1)
+    assert numbers_in(tmp_path / "take") == [16, 19]
+
+
+def test_seconds_and_rate_make_the_number_of_frames():
+    assert frame_count(0, 10.0, 30) == 300
+    assert frame_count(0, 0.25, 10) == 3
+    assert frame_count(7, 10.0, 30) == 7
+
+
+def test_a_counter_that_starts_again_is_followed():
+    pace = Pace(3)
+    assert [pace.lost_before(n) for n in (50, 51, 53, 2, 3, 5, 5, 8)] == [0, None, 0, 0, None, 0, None, 0]
+
+
 def test_a_missing_library_names_the_remedy(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(UserError, match=r"needs pyrealsense2 .* pip install -e '\.\[realsense\]'"):
-        file_source(tmp_path / "a.bag")
+        record(tmp_path)
     monkeypatch.delitem(sys.modules, "pyrealsense2")
     (tmp_path / "path").mkdir()
     (tmp_path / "path" / "pyrealsense2.py").write_text("raise ImportError('libusb-1.0.so.0: cannot open')")
     monkeypatch.syspath_prepend(tmp_path / "path")
     with pytest.raises(UserError, match=r"cannot be loaded \(libusb-1.0.so.0.*apt install libusb-1.0-0"):
-        file_source(tmp_path / "a.bag")
+        record(tmp_path)

@@ -21,7 +21,7 @@ JAX_FREE = (
     "ddgrasp", "deploy", "evaluation", "export.metadata", "mjx_envs.scene", "mjx_envs.objects",
     "mjx_envs.ray_geometry", "mjx_envs.raycast_numpy", "mjx_envs.camera", "mjx_envs.rig",
     "sensors.active_stereo", "sensors.recordings", "sensors.compare", "sensors.importers",
-    "sensors.realsense",
+    "sensors.realsense", "sensors.realsense_live",
 )  # fmt: skip
 """Packages and modules whose module-level imports must not reach JAX, however indirectly."""
 

@@ -14,7 +14,7 @@ from ddgrasp import pipeline
 from ddgrasp.commands.base import DEFAULT_PRESET, Command, FromPreset
 from ddgrasp.commands.checks import check_config_values, check_devices
 from ddgrasp.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
-from ddgrasp.commands.depth import DemosCollect, Record, RecordImport, SensorsCompare
+from ddgrasp.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
 from ddgrasp.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
 from ddgrasp.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from ddgrasp.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
@@ -44,6 +44,7 @@ COMMANDS: dict[str, type] = {
     "demos collect": DemosCollect,
     "record": Record,
     "record import": RecordImport,
+    "record realsense": RecordRealsense,
     "ddg fit": DDGFit,
     "ddg sample": DDGSample,
     "ddg score": DDGScore,

@@ -59,6 +59,42 @@ class RecordImport:
 
 
 @dataclass(frozen=True)
+class RecordRealsense:
+    """Record colour and depth of a RealSense D4xx that is connected, until done or Ctrl-C."""
+
+    out: Path = Path("recordings")
+    """The recording becomes a folder in it."""
+    name: str = "take"
+    """Of that folder; one that exists is never overwritten."""
+    seconds: float = 10.0
+    """Length, after the half second in which the exposure settles. Ctrl-C ends it earlier and keeps it."""
+    frames: int = 0
+    """Frames to record; 0 takes --seconds."""
+    hz: int = 10
+    """Frames kept per second: 1, 2, 3, 5, 6, 10, 15 or 30; the camera itself always runs at 30."""
+    width: int = 1280
+    """Of depth and colour in pixels."""
+    height: int = 720
+    """Of depth and colour in pixels."""
+    serial: str = ""
+    """Serial number of the camera; empty takes the first."""
+
+    def run(self) -> None:
+        from ddgrasp.progress import Progress
+        from sensors import realsense_live as live
+
+        frames = live.frame_count(self.frames, self.seconds, self.hz)
+        options = live.LiveOptions(frames, self.hz, self.width, self.height, self.serial)
+        path = live.new_path(self.out, self.name)
+        imported, take = live.record(options, path, Progress(name="record realsense"))
+        print(live.summary(imported, take, frames))
+        if take.trouble:
+            raise UserError(
+                f"the camera stopped ({take.trouble}): what it gave is kept; check the USB 3 cable."
+            )
+
+
+@dataclass(frozen=True)
 class SensorsCompare:
     """Set the rig's stereo camera beside real D4xx cameras: holes, noise, flicker, as table, JSON and PNG."""
 
