@@ -47,19 +47,19 @@ def run(config: Config, run_dir: Path, out: Path, *, progress: Progress) -> Arti
     extractor = score_features.load(config.score.features[0])
     known = score_episodes(start, [extractor], loads, [RAW, FLOOR, "sim_gt"], directory / "known", progress)
     common, simulated = collect(known), loads[len(loads) // 2 :]
-    rows = {}
+    rows, floor = {}, {}
     for name, generator in generators.items():
         progress.note(name)
         methods = Methods(config.score, config.seed, generator)
         folder = directory / name.replace(" ", "_")
         made = collect(score_episodes(methods, [extractor], simulated, [_DDG], folder, progress, label=name))
-        rows[name] = _row(common, made, extractor.name, config)
+        samples = {**common.features[extractor.name], **made.features[extractor.name]}
+        compared = score_table.make_table(samples, config.score, config.seed)
+        rows[name] = _row(compared["ddg"], made, _DDG)
         rows[name]["frames_per_s"] = _frames_per_s(generator, simulated)
+        floor = _row(compared["floor"], common, FLOOR)
     for row in rows.values():
         row["over_reference"] = row["fid"]["value"] / rows[_name(*REFERENCE)]["fid"]["value"]
-    floor = score_table.make_table(common.features[extractor.name], config.score, config.seed)["floor"]
-    floor["holes"] = holes.figures(holes.added(common.sums[FLOOR]))
-    floor.pop("resampled_fid")
     result = {"features": {extractor.name: extractor.source}, "floor": floor, "samplers": rows}
     artifacts.atomic_write_json(directory / JSON, result)
     parents = [artifacts.read_artifact(run_dir / name) for name in ("teacher", "ddg")]
@@ -84,11 +84,9 @@ def _name(sampler: str, steps: int) -> str:
     return f"{sampler} {steps}"
 
 
-def _row(common: Scored, made: Scored, extractor: str, config: Config) -> dict[str, Any]:
-    samples = {**common.features[extractor], **made.features[extractor]}
-    figures = score_table.make_table(samples, config.score, config.seed)["ddg"]
-    figures.pop("resampled_fid")
-    return {**figures, "holes": holes.figures(holes.added(made.sums[_DDG]))}
+def _row(figures: dict[str, Any], scored: Scored, domain: str) -> dict[str, Any]:
+    plain = {name: value for name, value in figures.items() if name != "resampled_fid"}
+    return {**plain, "holes": holes.figures(holes.added(scored.sums[domain]))}
 
 
 def _frames_per_s(generator: "Generator", loads: Sequence[Load]) -> float:

@@ -102,7 +102,7 @@ def describe_commands(group: str = "") -> str:
 
 
 _PRESET_HELP = (
-    "Presets (--preset): debug (tests), demo (24 minutes on two cores), laptop (all from nothing, 73 minutes",
+    "Presets (--preset): debug (tests), demo (23 minutes on two cores), laptop (all from nothing, 73 minutes",
     "on two busy cores), camera (laptop, the generator for short recordings of a real camera), paper (one",
     "GPU). Any value of a preset can be given, for example --teacher.num-envs 64.",
 )
