@@ -413,7 +413,8 @@ def _check_unit(recording: Recording) -> None:
     unit = recording.meta["depth_unit_m"]
     if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
         return
-    guess = "metres or centimetres" if median_m < NEAREST_MEDIAN_M else "a finer unit (0.0001 m?)"
+    finer = unit / 10 ** round(np.log10(median_m))
+    guess = "metres or centimetres" if median_m < NEAREST_MEDIAN_M else f"a finer unit ({finer:g} m?)"
     raise UserError(
         f"{recording.path}: median depth {median_m:.4g} m with depth_unit_m {unit:g}; expected "
         f"{NEAREST_MEDIAN_M:g} to {FARTHEST_MEDIAN_M:g} m: the pictures look like {guess}; "
