@@ -13,8 +13,9 @@ from dataclasses import replace
 import jax
 import numpy as np
 
+from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import ExportConfig, StudentConfig, WorldConfig
-from export import graph, metadata, parity
+from export import graph, parity
 from student_jax import policy
 
 PROFILE = WorldConfig().profile

@@ -90,7 +90,7 @@ def machine(sizes: Sizes, save: Save) -> Iterator[str]:
     """Devices and versions; without the GPU asked for, one line and the status NO_GPU."""
     import jax
 
-    from evaluation.report import describe_machine
+    from evaluation.report.summary import describe_machine
 
     kinds = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
     if sizes is GPU and not any(device.platform == "gpu" for device in jax.devices()):
@@ -105,13 +105,13 @@ def machine(sizes: Sizes, save: Save) -> Iterator[str]:
 
 
 def conformance(sizes: Sizes, save: Save) -> Iterator[str]:
-    """The experiments of `mjx_envs.conformance` on each backend; their violations."""
-    from mjx_envs import conformance as experiments
-    from mjx_envs import physics
+    """The experiments of `mjx_envs.physics.conformance` on each backend; their violations."""
+    from mjx_envs.physics import backends
+    from mjx_envs.physics import conformance as experiments
 
     for name in sizes.conformance:
         start = time.monotonic()
-        step = experiments.make_step(physics.make_physics(name, experiments.SIM_DT_S))
+        step = experiments.make_step(backends.make_physics(name, experiments.SIM_DT_S))
         measures = experiments.measure(step)
         save(**{name: measures | {"seconds": time.monotonic() - start}})
         yield from experiments.violations(name, measures)
@@ -121,7 +121,7 @@ def pictures(sizes: Sizes, save: Save) -> Iterator[str]:
     """Each renderer against OpenGL; where there is none, Warp's against the ray caster, which says so."""
     import jax
 
-    from mjx_envs import batch_render, render_check
+    from mjx_envs.render import batch_render, render_check
 
     scenes = render_check.random_scenes(sizes.scenes)
     drawn = {}
@@ -144,7 +144,7 @@ def frames(sizes: Sizes, save: Save) -> Iterator[str]:
     import jax
     import numpy as np
 
-    from mjx_envs import batch_render, render_check
+    from mjx_envs.render import batch_render, render_check
 
     scenes = render_check.random_scenes(12)
     for side in sizes.frame_sizes_px:

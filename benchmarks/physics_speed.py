@@ -21,7 +21,7 @@ from ddgrasp import contract
 from ddgrasp.config import Config
 from mjx_envs import grasp_math, scene
 from mjx_envs.grasp_env import AutoReset, GraspEnv
-from mjx_envs.physics import ModelIndex, ModelParams, PhysicsState
+from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState
 from ppo import learner
 from ppo.policy import load_state
 

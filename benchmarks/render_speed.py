@@ -13,8 +13,9 @@ import numpy as np
 from benchmarks.compare import Contender, Row, compare, measure
 from ddgrasp import contract
 from ddgrasp.config import Config
-from mjx_envs import randomize, raycast, raycast_numpy, scene
+from mjx_envs import randomize, scene
 from mjx_envs.camera import Camera, nominal_camera
+from mjx_envs.render import raycast, raycast_numpy
 
 SIZES = ((180, 320), (64, 64))
 """(rows, columns) of the pictures."""

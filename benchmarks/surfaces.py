@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from ddg_jax.data import surfaces
-from ddg_jax.prior import SURFACES, invert
-from evaluation import score_features
-from evaluation.distances import fid
-from evaluation.score_data import REAL, SIM, Episode, load_episode, metres, millimetres
-from evaluation.score_domains import inpainted
+from ddg_jax.inverse_depth import invert
+from ddg_jax.prior import SURFACES
+from evaluation.depth_score import features as score_features
+from evaluation.depth_score.data import REAL, SIM, Episode, load_episode, metres, millimetres
+from evaluation.depth_score.distances import fid
+from evaluation.depth_score.domains import inpainted
 
 Make = Callable[[np.ndarray], np.ndarray]
 """Sensed depth (T, H, W) metres -> geometry, the same."""

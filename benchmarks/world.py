@@ -20,7 +20,7 @@ from benchmarks import physics_speed, render_speed
 from benchmarks.compare import as_json, print_table
 from ddgrasp import artifacts
 from ddgrasp.presets import LAPTOP
-from evaluation.report import describe_machine
+from evaluation.report.summary import describe_machine
 
 
 def main() -> None:

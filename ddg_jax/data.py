@@ -7,15 +7,16 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from ddg_jax.inverse_depth import invert
 from ddg_jax.piecewise import piecewise_smooth
-from ddg_jax.prior import PIECEWISE, Prior, invert
+from ddg_jax.prior import PIECEWISE, Prior
 from ddg_jax.representation import encode
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
-from sensors.holes import fill_from_background, smooth_surface
-from sensors.recordings import Recording, find_recordings, is_recording
+from sensors.recordings.recording import Recording, find_recordings, is_recording
+from sensors.statistics.holes import fill_from_background, smooth_surface
 
 LEAST_KEPT = 0.98
 """Share of a frame below which it is said that the generator sees a window of it."""
@@ -73,7 +74,7 @@ def load_frames(
     """The usable frames of the recordings at or below `root`, at most `max_frames`, with their priors.
 
     Names what it leaves out, and says at the end how much that was. Raises UserError if there is no
-    recording, none can be used, or they are of another contract version (see sensors/recordings.py).
+    recording, none can be used, or they are of another contract version (sensors/recordings/recording.py).
     """
     folders = _folders(root)
     depth, priors, index, skipped, refused = [], [], [], 0, []

@@ -17,9 +17,7 @@ import optax
 from jax import Array
 from jax.typing import ArrayLike
 
-from ddg_jax import schedule as diffusion
 from ddg_jax.data import Frames, make_batch
-from ddg_jax.loop import Params, TrainState, first_state, run_steps, updated
 from ddg_jax.train import (
     config_schedule,
     make_optimizer,
@@ -29,6 +27,8 @@ from ddg_jax.train import (
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.progress import Progress
+from learning import diffusion
+from learning.loop import Params, TrainState, first_state, run_steps, updated
 
 LEARNING_RATE = 0.5
 """Relative to the fit's."""

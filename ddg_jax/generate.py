@@ -11,17 +11,15 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 
 import jax
 import numpy as np
 
 from ddg_jax.sample import Generator, batch_size, condition, grafted, predict
-from ddgrasp import artifacts, contract
+from ddgrasp import contract
 from ddgrasp.artifacts import Artifact
-from ddgrasp.config import Config
 from ddgrasp.errors import UserError
-from ddgrasp.progress import Progress
+from ddgrasp.job import Job
 from demos.store import EpisodeStore
 
 STAGE = "noisy"
@@ -82,14 +80,14 @@ def noisy_episodes(
                 yield np.round(depth_m / contract.DEPTH_UNIT_M).astype(np.uint16)
 
 
-def generate_store(model: Path, demos: Path, directory: Path, config: Config, progress: Progress) -> Artifact:
-    """Writes `directory`/depth.zarr: the demos of a finished `demos` stage as the camera would see them.
+def run(job: Job) -> Artifact:
+    """Stage `noisy`: writes depth.zarr, the demos as the camera would see them.
 
     Goes on after the episodes that are there. `config.seed` is the noise's.
     """
-    parents = [artifacts.read_artifact(path) for path in (model, demos)]
-    generator = Generator.load(model)
-    clean = EpisodeStore(demos / "episodes.zarr")
+    config, directory, progress = job.config, job.directory, job.progress
+    generator = Generator.load(job.parents["ddg"].directory)
+    clean = EpisodeStore(job.parents["demos"].directory / "episodes.zarr")
     noisy = EpisodeStore(directory / STORE, create=True)
     ends = np.concatenate([[0], clean.ends])
     if generator.prior.needs_sim_rgb and "rgb" not in clean.fields:
@@ -109,9 +107,7 @@ def generate_store(model: Path, demos: Path, directory: Path, config: Config, pr
             task.advance()
     invalid = np.average(noisy.episodes("invalid_fraction"), weights=np.diff(ends))
     metrics = {"episodes": len(noisy), "frames": int(ends[-1]), "invalid_fraction": float(invalid)}
-    return artifacts.finish(
-        directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=parents
-    )
+    return job.finish(metrics)
 
 
 def _fields(generator: Generator) -> tuple[str, ...]:

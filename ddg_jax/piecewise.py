@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from sensors.holes import fill_from_background
+from sensors.statistics.holes import fill_from_background
 
 FIDELITY = 0.5
 """Price of a pixel that is off its measured value, against 1 for the same step between neighbours."""

@@ -1,6 +1,6 @@
 """The geometric prior c: clean relative depth that tells the generator what the scene is (paper III-B1).
 
-The paper takes c from a video depth network on RGB (ddg_jax/depth_prior.py, for which the user brings
+The paper takes c from a video depth network on RGB (ddg_jax/network_prior.py, for which the user brings
 weights). Any such source fits the `Prior` protocol; the built-in one needs no network: affine-normalised
 inverse depth, from simulation directly, from recordings after filling the holes. Filling must not betray
 where the holes were, or the generator would look for traces of filling that clean simulated depth never has.
@@ -16,21 +16,20 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from ddg_jax.inverse_depth import invert, normalise
+from ddg_jax.network_prior import NETWORKS, DepthNetworkPrior
 from ddg_jax.piecewise import piecewise_smooth
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import unknown_name
-from sensors.holes import fill_from_background, smooth_surface
+from sensors.statistics.holes import fill_from_background, smooth_surface
 
 FILTERED, PIECEWISE = SURFACES = ("filtered", "piecewise")
-"""Where the surface under recorded depth comes from: sensors/holes.py, ddg_jax/piecewise.py."""
-NORMALISED_LIMIT = 2.5
-"""|c| of normalised priors never exceeds this."""
+"""Where the surface under recorded depth comes from: sensors/statistics/holes.py, ddg_jax/piecewise.py."""
 NEAREST_M = 0.15
 """Closer than any reading of the D435 that the metric prior was tried on (0.23 m): c stays the same from here
 on."""
 SAME_SURFACE = 0.05
 """Relative inverse-depth difference below which two frames see the same surface (temporal smoothing)."""
-_STATISTICS_STRIDE = 7
 
 
 class Prior(Protocol):
@@ -118,8 +117,6 @@ _BUILT_IN = (InverseDepthPrior, MetricInverseDepthPrior)
 
 def make_prior(config: DDGConfig) -> Prior:
     """The prior that the configuration names; UserError for another name, or weights that are not there."""
-    from ddg_jax.depth_prior import NETWORKS, DepthNetworkPrior
-
     if config.surface not in SURFACES:
         raise unknown_name("ddg.surface", config.surface, SURFACES)
     if config.prior in NETWORKS:
@@ -128,19 +125,6 @@ def make_prior(config: DDGConfig) -> Prior:
         if config.prior == kind.name:
             return kind(config.prior_blur_px, config.decoy_holes, config.surface)
     raise unknown_name("prior", config.prior, (*(kind.name for kind in _BUILT_IN), *NETWORKS))
-
-
-def invert(depth_m: np.ndarray) -> np.ndarray:
-    """1/d in 1/m, 0 where depth is 0 (infinitely far, or a hole). Any shape, float32."""
-    return np.divide(1, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)
-
-
-def normalise(inverse: np.ndarray) -> np.ndarray:
-    """Affine-normalised inverse depth of a sequence (T, H, W): median 0, mean deviation 1/2, clipped."""
-    sample = inverse.reshape(-1)[::_STATISTICS_STRIDE]
-    shift = np.median(sample)
-    scale = 2 * np.mean(np.abs(sample - shift)) + 1e-6
-    return np.clip((inverse - shift) / scale, -NORMALISED_LIMIT, NORMALISED_LIMIT).astype(np.float32)
 
 
 def decoy_holes(holes: np.ndarray, rng: np.random.Generator) -> np.ndarray:

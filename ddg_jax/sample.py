@@ -13,16 +13,16 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.typing import ArrayLike
 
-from ddg_jax import schedule as diffusion
 from ddg_jax.distil import X_LIMIT, params_file
 from ddg_jax.graft import graft
-from ddg_jax.loop import Params
 from ddg_jax.prior import Prior, make_prior
 from ddg_jax.representation import channels, correlations, decode
 from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
 from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.errors import UserError
+from learning import diffusion
+from learning.loop import Params
 
 PARAMS_FILE = "params.msgpack"
 SHARED = 2**31 - 1

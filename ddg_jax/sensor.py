@@ -1,4 +1,4 @@
-"""Camera models by name: the families of sensors/ and the learned one, behind one call (sensors/sense.py)."""
+"""Camera models by name: those of sensors/models/ and the learned one, behind one call (its sense.py)."""
 
 from collections.abc import Callable
 
@@ -13,9 +13,9 @@ from ddg_jax.sample import Generator, check_aspect, sample
 from ddgrasp.config import SensorConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError, unknown_name
-from sensors import procedural
-from sensors.sense import Sense, batched, ideal
-from sensors.stereo_sensor import stereo
+from sensors.models import procedural
+from sensors.models.sense import Sense, batched, ideal
+from sensors.models.stereo_sensor import stereo
 
 SENSORS: dict[str, Callable[[SensorConfig, CameraProfile], Sense]] = {
     "ideal": lambda config, profile: ideal(),

@@ -1,6 +1,5 @@
 """Stage `ddg`: recordings -> a fitted generator, its statistics and its pictures."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,16 +10,18 @@ import numpy as np
 
 from ddg_jax import data
 from ddg_jax.distil import distil
-from ddg_jax.loop import Params
-from ddg_jax.prior import Prior, invert, make_prior
+from ddg_jax.inverse_depth import invert
+from ddg_jax.prior import Prior, make_prior
 from ddg_jax.sample import Generator, grafted, predict
 from ddg_jax.train import fit
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
-from ddgrasp.config import PROGRESSIVE, Config, DDGConfig
+from ddgrasp.config import PROGRESSIVE, DDGConfig
 from ddgrasp.errors import UserError
+from ddgrasp.job import Job
 from ddgrasp.progress import Progress
-from sensors import stats
+from learning.loop import Params
+from sensors.statistics import stats
 
 STAGE = "ddg"
 SCORED_FRAMES = 180
@@ -29,21 +30,15 @@ SHOWN_FRAMES = 4
 _SAMPLE_SEED = 1
 
 
-def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
-    """Fits the generator on the run's recordings."""
-    record = artifacts.require(run_dir, "record", config)
-    return fit_folder(config, record.directory, run_dir / STAGE, progress=progress, parents=(record,))
+def run(job: Job) -> Artifact:
+    """Fits (or loads, `config.ddg.init_from`) a generator: on the run's recordings, or on those at or below
+    the folder that `ddgrasp ddg fit --data` names (input `data`).
 
-
-def fit_folder(
-    config: Config, root: Path, directory: Path, *, progress: Progress, parents: Sequence[Artifact] = ()
-) -> Artifact:
-    """Fits (or loads, `config.ddg.init_from`) a generator for the recordings at or below `root`.
-
-    Behind `ddgrasp ddg fit --data ROOT`. Continues from the checkpoints in `directory`, if there are any.
     Leaves params.msgpack, pictures, and a manifest whose metrics compare held-out recorded frames with
     generated ones.
     """
+    config, directory, progress = job.config, job.directory, job.progress
+    root = job.inputs["data"] if "data" in job.inputs else job.parents["record"].directory
     prior = make_prior(config.ddg)
     frames = data.load_frames(root, config.ddg, prior, config.seed, progress)
     training, held_out = frames.split(config.ddg.holdout_fraction)
@@ -60,15 +55,7 @@ def fit_folder(
         },
         **_score(generator, scored, progress),
     }
-    return artifacts.finish(
-        directory,
-        STAGE,
-        config,
-        seconds=progress.seconds,
-        metrics=metrics,
-        parents=parents,
-        origin="loaded" if config.ddg.init_from else "trained",
-    )
+    return job.finish(metrics, origin="loaded" if config.ddg.init_from else "trained")
 
 
 def sample_folder(

@@ -1,4 +1,4 @@
-"""DDPM training of the generator (paper III-B1): a pure step on x_0 and c; ddg_jax/loop.py repeats it.
+"""DDPM training of the generator (paper III-B1): a pure step on x_0 and c; learning/loop.py repeats it.
 
 What the network's first channel is depends on `ddg.hole_loss`:
 
@@ -20,13 +20,13 @@ import numpy as np
 import optax
 from jax import Array
 
-from ddg_jax import schedule as diffusion
 from ddg_jax.data import Frames, make_batch
-from ddg_jax.loop import Params, TrainState, first_state, run_steps, updated
 from ddg_jax.representation import channels
 from ddg_jax.unet import UNet
 from ddgrasp.config import CROSS_ENTROPY, SQUARED, UNIFORM, DDGConfig
 from ddgrasp.progress import Progress
+from learning import diffusion
+from learning.loop import Params, TrainState, first_state, run_steps, updated
 
 WARMUP_STEPS = 50
 FINAL_LEARNING_RATE = 0.05

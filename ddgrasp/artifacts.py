@@ -22,27 +22,10 @@ from typing import Any
 from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.stages import config_fields, get_stage
 
 MANIFEST = "manifest.json"
 STARTED = "started.json"
-
-STAGE_FIELDS: dict[str, tuple[str, ...]] = {
-    "teacher": ("seed", "world", "teacher"),
-    "demos": ("seed", "world", "teacher", "demos"),
-    "record": ("seed", "world", "teacher", "record"),
-    "ddg": ("seed", "world", "teacher", "record", "ddg"),
-    "noisy": ("seed", "ddg"),
-    "student": ("seed", "world", "teacher", "demos", "record", "ddg", "student"),
-    "export": ("seed", "world", "teacher", "demos", "record", "ddg", "student", "export"),
-    "deploy": (
-        "seed", "world", "teacher", "demos", "record", "ddg", "student", "export", "deploy", "evaluation",
-    ),
-    "score": ("seed", "world", "record", "ddg", "score"),
-    "score_real": ("seed", "ddg", "score"),
-    "curve": ("seed", "world", "record", "ddg", "score"),
-    "samplers": ("seed", "world", "record", "ddg", "score"),
-}  # fmt: skip
-"""The parts of `Config` that a stage's result depends on: these are hashed, and must match on --resume."""
 
 _LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
 _TEMPORARY = ".tmp-"
@@ -135,11 +118,11 @@ class Manifest:
     """Where an artefact came from and what was measured on it."""
 
     stage: str
-    """A name of ddgrasp/pipeline.py (teacher, demos, record, ...), or noisy."""
+    """A name of ddgrasp/stages.py."""
     config: dict[str, Any]
     """The whole configuration, as JSON."""
     config_hash: str
-    """Hash of the parts of the configuration that this stage depends on (`STAGE_FIELDS`)."""
+    """Hash of the parts of the configuration that this stage depends on (`stages.config_fields`)."""
     contract_version: int
     versions: dict[str, str]
     """Python, this project and the libraries."""
@@ -296,7 +279,8 @@ def begin(
                 f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
             )
         _check_same_config(Path(directory), stage, started.get("config", {}), config, "begun")
-        if difference := next(_differences(started.get("inputs", {}), inputs), None):
+        before = started.get("inputs", {})
+        if difference := next(_differences(before, {name: inputs.get(name) for name in before}), None):
             raise UserError(
                 f"{directory} was begun with other inputs: {difference}. Use those, another --out, or delete "
                 "the directory."
@@ -359,7 +343,7 @@ def library_versions() -> dict[str, str]:
 
 
 def _relevant(config: Mapping[str, Any], stage: str) -> dict[str, Any]:
-    return {name: config.get(name) for name in STAGE_FIELDS[stage]}
+    return {name: config.get(name) for name in config_fields(get_stage(stage))}
 
 
 def _hash(value: Any) -> str:

@@ -10,7 +10,7 @@ SQUARED, CROSS_ENTROPY = HOLE_LOSSES = ("squared", "cross_entropy")
 UNIFORM, TRUNCATED = LOSS_WEIGHTS = ("uniform", "truncated")
 DPM_SOLVER, DDIM, DDPM, PROGRESSIVE = SAMPLERS = ("dpm_solver", "ddim", "ddpm", "progressive")
 SPACINGS = ("leading", "trailing", "linspace", "quadratic")
-"""Of the diffusion steps that a sampler visits: ddg_jax/schedule.py, timesteps."""
+"""Of the diffusion steps that a sampler visits: learning/diffusion.py, timesteps."""
 
 
 def _check_counts(section: str, config: Any, *names: str) -> None:
@@ -223,7 +223,7 @@ class DemosConfig:
 
 @dataclass(frozen=True)
 class StereoConfig:
-    """The rig's active-stereo camera: projector, imagers, matcher (sensors/active_stereo.py)."""
+    """The rig's active-stereo camera: projector, imagers, matcher (sensors/models/active_stereo.py)."""
 
     # --- projector ---
     projector_position: float = 0.6
@@ -285,7 +285,7 @@ class StereoConfig:
 
 @dataclass(frozen=True)
 class DextrahConfig:
-    """Depth noise as DextrAH-G trains with (sensors/procedural.py), in pixels of its 160 x 120 pictures."""
+    """Depth noise as DextrAH-G trains with, in pixels of its 160 x 120 pictures."""
 
     shift_px: float = 0.5
     """Standard deviation of the field by which pixels look up their depth beside themselves (sigma_s)."""
@@ -311,7 +311,7 @@ class DextrahConfig:
 
 @dataclass(frozen=True)
 class KinectConfig:
-    """Depth noise of a structured-light camera of the first Kinect's kind (sensors/procedural.py)."""
+    """Depth noise of a structured-light camera of the first Kinect's kind (sensors/models/procedural.py)."""
 
     shift_px: float = 0.5
     """Standard deviation of each pixel's shift, independent per pixel (Handa et al. 2014)."""
@@ -411,7 +411,7 @@ class DDGConfig:
     """Residual blocks per level, in the encoder and again in the decoder; two more sit in the middle."""
     attention_heads: int = 4
     """Attention heads in the middle; 0 turns attention off."""
-    # --- diffusion (ddg_jax/schedule.py) ---
+    # --- diffusion (learning/diffusion.py) ---
     diffusion_steps: int = 1000
     """Steps K of the forward process."""
     schedule: str = "cosine"

@@ -129,7 +129,7 @@ class Progress:
             self._writer.add_scalar(name, value, int(step))
 
     def picture(self, name: str, **panels: Any) -> None:
-        """Keeps images for the report, to be drawn side by side (see `evaluation/figures.py`).
+        """Keeps images for the report, to be drawn side by side (see `evaluation/report/figures.py`).
 
         Args:
           name: file name without suffix; the report's title for it.

@@ -12,7 +12,7 @@ from ddgrasp import contract
 from ddgrasp.config import Config
 from mjx_envs import randomize
 from mjx_envs.grasp_env import GraspEnv
-from mjx_envs.visual import Viewer
+from mjx_envs.render.visual import Viewer
 from ppo.policy import TeacherPolicy
 
 Actor = Callable[["Scene"], np.ndarray]

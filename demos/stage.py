@@ -1,37 +1,31 @@
 """Stage `demos`: teacher -> successful episodes with clean depth on disk (paper III-C1)."""
 
-from pathlib import Path
-
 import jax
 import numpy as np
 
-from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.job import Job
 from ddgrasp.progress import Progress
 from demos.rollout import Roller, noisy_teacher, successful
 from demos.store import EpisodeStore
 from ppo import policy as teacher_policy
 
-STAGE = "demos"
 STORE = "episodes.zarr"
 _SEED = 30_000
 _MAX_TRIES = 4
 """Give up when less than one attempt in this many succeeds."""
 
 
-def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+def run(job: Job) -> Artifact:
     """Collects `config.demos.episodes` successful episodes, going on from what is there."""
-    teacher_artifact = artifacts.require(run_dir, "teacher", config)
-    directory = run_dir / STAGE
-    store = EpisodeStore(directory / STORE, create=True)
-    tried = collect(config, teacher_policy.load(teacher_artifact.directory), store, progress)
-    _picture(store, config, progress)
+    store = EpisodeStore(job.directory / STORE, create=True)
+    teacher = teacher_policy.load(job.parents["teacher"].directory)
+    tried = collect(job.config, teacher, store, job.progress)
+    _picture(store, job.progress)
     metrics = {"episodes": len(store), "steps": int(store.ends[-1]), "tried_now": tried}
-    return artifacts.finish(
-        directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=[teacher_artifact]
-    )
+    return job.finish(metrics)
 
 
 def collect(config: Config, teacher, store: EpisodeStore, progress: Progress) -> int:
@@ -60,7 +54,7 @@ def collect(config: Config, teacher, store: EpisodeStore, progress: Progress) ->
     return tried
 
 
-def _picture(store: EpisodeStore, config: Config, progress: Progress) -> None:
+def _picture(store: EpisodeStore, progress: Progress) -> None:
     """A film strip of the first episode."""
     end = int(store.ends[0])
     shown = np.linspace(0, end - 1, 6).astype(int)

@@ -8,8 +8,8 @@ import numpy as np
 import onnxruntime as ort
 
 from ddgrasp import artifacts, contract
+from ddgrasp import policy_metadata as metadata
 from ddgrasp.errors import UserError
-from export import metadata
 
 POLICY_FILE = "policy.onnx"
 """As the stage `export` names it."""

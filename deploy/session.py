@@ -13,12 +13,12 @@ import numpy as np
 from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.policy_metadata import PolicyMetadata
 from deploy.clock import RealClock
 from deploy.interfaces import Camera, Clock, Robot
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
-from export.metadata import PolicyMetadata
 
 ROBOTS = ("sim", "franka")
 CAMERAS = ("stereo", "realsense", "replay")
@@ -140,12 +140,12 @@ def _devices(
 
 
 def _rig(config: Config, options: SessionOptions, info: PolicyMetadata, clock: Clock) -> tuple[Robot, Camera]:
-    from deploy.rig_eval import camera_pose
-    from deploy.sim_robot import SimRobot
-    from deploy.stereo_camera import StereoCamera
+    from deploy.devices.rig_camera import StereoCamera
+    from deploy.devices.rig_robot import SimRobot
+    from deploy.trials import camera_pose
     from mjx_envs.objects import get_object
-    from mjx_envs.rig import RigWorld
-    from sensors.rig_camera import RigCamera
+    from rig.camera import RigCamera
+    from rig.world import RigWorld
 
     name = get_object(options.object_name or config.world.objects[0]).name
     rng = np.random.default_rng(config.seed)
@@ -155,7 +155,7 @@ def _rig(config: Config, options: SessionOptions, info: PolicyMetadata, clock: C
     if options.camera == "realsense":
         return robot, _realsense(config, info, clock)
     if options.camera == "replay":
-        from deploy.replay_camera import ReplayCamera
+        from deploy.devices.replay_camera import ReplayCamera
 
         assert options.recording is not None
         return robot, ReplayCamera.open(options.recording, clock)
@@ -164,7 +164,7 @@ def _rig(config: Config, options: SessionOptions, info: PolicyMetadata, clock: C
 
 
 def _franka(config: Config, clock: Clock) -> Robot:
-    from deploy.franka_robot import FrankaRobot
+    from deploy.devices.franka_robot import FrankaRobot
 
     deploy_config = config.deploy
     return FrankaRobot(
@@ -176,7 +176,7 @@ def _franka(config: Config, clock: Clock) -> Robot:
 
 
 def _realsense(config: Config, info: PolicyMetadata, clock: Clock) -> Camera:
-    from deploy.realsense_camera import RealSenseCamera
+    from deploy.devices.realsense_camera import RealSenseCamera
 
     if info.depth_dtype != "uint16_mm":
         raise UserError(

@@ -2,9 +2,9 @@
 
 from ddgrasp import contract
 from ddgrasp.config import DeployConfig
+from ddgrasp.policy_metadata import PolicyMetadata
 from deploy.loop import LoopSettings
 from deploy.safety import SafetyFilter, SafetyLimits
-from export.metadata import PolicyMetadata
 
 
 def loop_settings(config: DeployConfig, info: PolicyMetadata) -> LoopSettings:

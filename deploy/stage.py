@@ -12,21 +12,21 @@ from ddgrasp import artifacts, contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.job import Job
 from ddgrasp.progress import Progress
-from deploy.film import Film, contact_sheet
 from deploy.policy import POLICY_FILE
-from deploy.rig_eval import TrialResult, plan, run_trials
 from deploy.timing import Timings
+from deploy.trials import TrialResult, plan, run_trials
+from rig.film import Film, contact_sheet
 
 STAGE = "deploy"
 TRIALS_FILE = "trials.jsonl"
 
 
-def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+def run(job: Job) -> Artifact:
     """Run the trials that are not in trials.jsonl yet, then write the manifest."""
-    export = artifacts.require(run_dir, "export", config)
-    directory = run_dir / STAGE
-    policy_path = export.directory / POLICY_FILE
+    config, directory, progress = job.config, job.directory, job.progress
+    policy_path = job.parents["export"].directory / POLICY_FILE
     log = TrialLog(directory / TRIALS_FILE, _header(config, policy_path))
     trials = plan(config)
     with progress.task("trials", len(trials)) as task:
@@ -40,14 +40,7 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
                 done = [r for r in log.results.values() if not r.realtime]
                 task.advance(success=sum(r.success for r in done) / max(len(done), 1))
     results = [log.results[(trial.index, trial.realtime)] for trial in trials]
-    return artifacts.finish(
-        directory,
-        STAGE,
-        config,
-        seconds=progress.seconds,
-        metrics=metrics(results),
-        parents=[export],
-    )
+    return job.finish(metrics(results))
 
 
 def metrics(results: Sequence[TrialResult]) -> dict[str, Any]:

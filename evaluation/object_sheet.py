@@ -9,10 +9,11 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from ddgrasp import contract
-from evaluation import figures
-from mjx_envs import kinematics, raycast_numpy, scene
+from evaluation.report import figures
+from mjx_envs import kinematics, scene
 from mjx_envs.camera import Buffers, Camera, look_at
 from mjx_envs.objects import ObjectSpec, get_object, slot_layout
+from mjx_envs.render import raycast_numpy
 
 HEIGHT_PX, WIDTH_PX = 120, 160
 WIDTH_M = 0.19

@@ -9,7 +9,8 @@ import numpy as np
 from ddgrasp import artifacts, contract
 from ddgrasp.config import WorldConfig
 from ddgrasp.progress import PICTURES
-from evaluation import figures, wilson
+from evaluation import wilson
+from evaluation.report import figures
 
 TRIALS_FILE = "trials.json"
 SHEET_FILE = "episodes.png"

@@ -15,11 +15,11 @@ from ddgrasp import contract
 from ddgrasp.config import ExportConfig, StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
+from ddgrasp.policy_metadata import PolicyMetadata, check_depth_dtype
 from export.builder import GraphBuilder, tensor
 from export.condition_graph import write_condition
 from export.encoder_graph import write_encoder
 from export.layers import Params
-from export.metadata import PolicyMetadata, check_depth_dtype
 from export.sampler_graph import write_sampler
 from student_jax import denoiser, encoder, hand_view, policy, preprocess
 
@@ -36,7 +36,7 @@ def build_model(
     Args:
         params: tree of `student_jax.policy.init_params`.
         student, export, profile: the configuration `params` belong to.
-        metadata: what the file shall say about itself (`export.metadata.describe`).
+        metadata: what the file shall say about itself (`ddgrasp.policy_metadata.describe`).
 
     Raises:
         UserError: an option that does not exist, or parameters of another configuration.

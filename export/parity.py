@@ -11,7 +11,7 @@ import onnxruntime as ort
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
-from export.metadata import check_depth_dtype
+from ddgrasp.policy_metadata import check_depth_dtype
 from student_jax import denoiser, preprocess
 
 HOLE_SHARE = 0.1

@@ -7,7 +7,8 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from export.builder import GraphBuilder
 from export.layers import Params
-from student_jax import denoiser, diffusion, policy
+from student_jax import action_diffusion as diffusion
+from student_jax import denoiser, policy
 
 
 def write_sampler(

@@ -8,34 +8,31 @@ from ddgrasp import artifacts, contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.job import Job
+from ddgrasp.policy_metadata import describe_run
 from ddgrasp.progress import Progress
 from export import graph, parity
-from export.metadata import describe_run
 
 POLICY_FILE = "policy.onnx"
 BATCH = 4
 BATCH_ONE_CHECKS = 4
 
 
-def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+def run(job: Job) -> Artifact:
     """Writes the run's student as one ONNX file; a finished one is made again (it takes seconds).
 
     Raises:
         UserError: no finished student, or ONNX and JAX disagree by more than config.export.max_abs_diff
             (the file is then not written).
     """
-    del resume  # nothing here is worth resuming
-    student = artifacts.require(run_dir, "student", config)
+    config, student = job.config, job.parents["student"]
     params = load_student(student.directory)
     model = export_policy(config, params, student.hash)
-    progress.note(f"policy.onnx: {len(model) / 1e6:.1f} MB")
-    frames = demo_frames(run_dir, config)
-    metrics = measure(config, params, model, frames, progress)
-    directory = Path(run_dir) / "export"
-    artifacts.atomic_write_bytes(directory / POLICY_FILE, model)
-    return artifacts.finish(
-        directory, "export", config, seconds=progress.seconds, metrics=metrics, parents=[student]
-    )
+    job.progress.note(f"policy.onnx: {len(model) / 1e6:.1f} MB")
+    frames = demo_frames(student.directory.parent / "demos", config)
+    metrics = measure(config, params, model, frames, job.progress)
+    artifacts.atomic_write_bytes(job.directory / POLICY_FILE, model)
+    return job.finish(metrics)
 
 
 def load_student(directory: Path) -> dict:
@@ -94,12 +91,13 @@ def _pick(frames_m: np.ndarray | None, size: int, rng: np.random.Generator) -> n
     return None if frames_m is None else frames_m[rng.integers(len(frames_m), size=size)]
 
 
-def demo_frames(run_dir: Path, config: Config, count: int = 64) -> np.ndarray | None:
-    """(N, 3, H, W) metres: frame triples of the run's first demonstrations; None if it has none."""
+def demo_frames(demos: Path, config: Config, count: int = 64) -> np.ndarray | None:
+    """(N, 3, H, W) metres: frame triples of the first demonstrations in the stage directory `demos`; None if
+    there are none."""
     from demos.stage import STORE
     from demos.store import EpisodeStore
 
-    path = Path(run_dir) / "demos" / STORE
+    path = demos / STORE
     if not path.exists():
         return None
     depth_mm = EpisodeStore(path).steps("depth_mm", 0, count + contract.DEPTH_FRAMES - 1)

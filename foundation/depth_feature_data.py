@@ -13,7 +13,7 @@ import numpy as np
 
 from ddgrasp.contract import D455
 from foundation.depth_feature_noise import ProceduralConfig, corrupt
-from sensors import stats
+from sensors.statistics import stats
 
 GRID = (2, 3)
 """Rows and columns of the coarse layout that is asked for."""

@@ -1,8 +1,8 @@
 """Procedural depth noise of random strength, as depthfeat is trained on it. NumPy and OpenCV.
 
 The family of DextrAH-G's noise: jittered lookup and disparity noise, dropout, random values, sticks.
-Apart from sensors/procedural.py, which models one published camera and is compiled once per strength: every
-training picture has a strength of its own, and what a frozen extractor was trained on does not change.
+Apart from sensors/models/procedural.py, which models one published camera and is compiled once per strength:
+every training picture has a strength of its own, and what a frozen extractor was trained on does not change.
 """
 
 from dataclasses import dataclass

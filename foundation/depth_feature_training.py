@@ -22,7 +22,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from foundation import depth_features
 from foundation.depth_feature_data import MEASURED, TREATMENTS, Batch, Pool, make_batch
-from sensors.random_scenes import random_device, take_picture
+from sensors.models.random_scenes import random_device, take_picture
 
 WORK = ".work"
 """Folder of unfinished training, beside the result; removed at the end."""

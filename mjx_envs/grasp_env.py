@@ -16,7 +16,9 @@ from mujoco_playground._src import mjx_env
 
 from ddgrasp import contract
 from ddgrasp.config import WorldConfig
-from mjx_envs import devices, grasp_math, kinematics, physics, randomize, rewards, scene
+from mjx_envs import devices, grasp_math, kinematics, randomize, rewards, scene
+from mjx_envs.physics import interface as physics
+from mjx_envs.physics.backends import make_physics
 
 TOUCH_N = 0.3
 """Pad force from which a pad counts as touching the object."""
@@ -67,7 +69,7 @@ class GraspEnv(mjx_env.MjxEnv):
         super().__init__(config_dict.create(ctrl_dt=contract.CONTROL_DT_S, sim_dt=config.sim_dt_s))
         self.config = config
         self.table = randomize.ObjectTable(config.objects)
-        self.physics = physics.make_physics(config.backend, config.sim_dt_s, self.table.layout)
+        self.physics = make_physics(config.backend, config.sim_dt_s, self.table.layout)
         self._mj_model = scene.build_model(config.sim_dt_s, self.table.layout)
 
     def reset(self, rng: jax.Array) -> mjx_env.State:

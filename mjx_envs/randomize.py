@@ -8,7 +8,7 @@ from ddgrasp import contract
 from ddgrasp.config import RandomConfig
 from mjx_envs import inverse_kinematics, kinematics, scene
 from mjx_envs.objects import get_object, slot_layout
-from mjx_envs.physics import ModelParams
+from mjx_envs.physics.interface import ModelParams
 
 PREGRASP_HEIGHT_M = 0.15
 

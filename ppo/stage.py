@@ -1,12 +1,11 @@
 """Stage `teacher`: world -> PPO policy on the privileged state."""
 
 import shutil
-from pathlib import Path
 
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
-from ddgrasp.progress import Progress
+from ddgrasp.job import Job
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import hosts, learner, memory
@@ -14,7 +13,6 @@ from ppo import policy as teacher_policy
 from ppo.evaluate import evaluate
 from ppo.train import train, training_world
 
-STAGE = "teacher"
 _TEST_SEED = 20_000
 
 
@@ -27,13 +25,13 @@ def check(config: Config) -> None:
     memory.check(config, AutoReset(GraspEnv(training_world(config)), mesh))
 
 
-def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+def run(job: Job) -> Artifact:
     """Trains a teacher (or loads one, `config.teacher.init_from`) and evaluates it, in every process."""
-    directory = run_dir / STAGE
+    config, directory = job.config, job.directory
     path = directory / teacher_policy.PARAMS_FILE
     hosts.wait_for_all("teacher begins")
     if not _loads(config):
-        train(config, directory, progress)
+        train(config, directory, job.progress)
     elif hosts.leads():
         with artifacts.atomic_path(path) as temporary:
             shutil.copyfile(teacher_policy.find(config.teacher.init_from), temporary)
@@ -41,10 +39,7 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
     policy = teacher_policy.load(directory)
     metrics = evaluate(GraspEnv(config.world), policy, config.evaluation.teacher_trials, _TEST_SEED)
     if hosts.leads():
-        artifacts.finish(
-            directory, STAGE, config, seconds=progress.seconds, metrics=metrics,
-            origin="loaded" if _loads(config) else "trained",
-        )  # fmt: skip
+        job.finish(metrics, origin="loaded" if _loads(config) else "trained")
     hosts.wait_for_all("teacher is finished")
     return artifacts.read_artifact(directory)
 

@@ -12,7 +12,7 @@ from flax import struct
 
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import TOUCH_N, GraspEnv
-from mjx_envs.physics import ModelParams
+from mjx_envs.physics.interface import ModelParams
 from ppo.motion import motion_metrics
 from ppo.policy import TeacherPolicy
 from ppo.visible import Watcher, moments

@@ -10,8 +10,8 @@ from ddgrasp import contract
 from mjx_envs import kinematics, randomize
 from mjx_envs.camera import look_at
 from mjx_envs.grasp_env import GraspEnv
-from mjx_envs.physics import ModelParams
-from mjx_envs.visual import Viewer
+from mjx_envs.physics.interface import ModelParams
+from mjx_envs.render.visual import Viewer
 
 MOMENTS = ("start", "above", "contact", "lifted", "held")
 ABOVE_M = 0.06

@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
-from ddg_jax.schedule import Schedule
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
+from learning.diffusion import Schedule
 from mjx_envs import kinematics
-from student_jax import diffusion
+from student_jax import action_diffusion as diffusion
 from student_jax.denoiser import Denoiser, StateStream, normalise_state
 from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M, DepthEncoder
 from student_jax.hand_view import HandView

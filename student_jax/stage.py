@@ -7,13 +7,11 @@ from the last finished part.
 """
 
 import shutil
-from pathlib import Path
 
 from ddg_jax.sample import Generator
-from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
-from ddgrasp.progress import Progress
+from ddgrasp.job import Job
 from demos.stage import STORE
 from demos.store import EpisodeStore
 from ppo import policy as teacher_policy
@@ -22,15 +20,12 @@ from student_jax.dagger import Trainer
 from student_jax.data import check_chunk
 from student_jax.head import POSES
 
-STAGE = "student"
 
-
-def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> Artifact:
+def run(job: Job) -> Artifact:
     """Trains the student and evaluates it closed-loop on clean and on generated depth."""
+    config, directory, progress, parents = job.config, job.directory, job.progress, job.parents
     check_chunk(config.student)
     encoder_weights = pretrained_encoder.source(config.student)
-    parents = {name: artifacts.require(run_dir, name, config) for name in ("teacher", "demos", "ddg")}
-    directory = run_dir / STAGE
     generator = Generator.load(parents["ddg"].directory)
     teacher = teacher_policy.load(parents["teacher"].directory)
     trainer = Trainer(config, teacher, generator, directory, progress)
@@ -39,10 +34,8 @@ def run(config: Config, run_dir: Path, *, resume: bool, progress: Progress) -> A
     metrics |= {"tried": trainer.history, "frames": trainer.frame_count, "encoder_weights": encoder_weights}
     shutil.rmtree(directory / frames_io.CACHE, ignore_errors=True)
     (directory / POSES).unlink(missing_ok=True)
-    return artifacts.finish(
-        directory, STAGE, config, seconds=progress.seconds, metrics=metrics, parents=list(parents.values()),
-        origin="loaded" if config.student.init_from and not _trains(config) else "trained",
-    )  # fmt: skip
+    loaded = config.student.init_from and not _trains(config)
+    return job.finish(metrics, origin="loaded" if loaded else "trained")
 
 
 def _trains(config: Config) -> bool:

@@ -10,10 +10,10 @@ import numpy as np
 import optax
 from jax import Array
 
-from ddg_jax.schedule import q_sample
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
+from learning.diffusion import q_sample
 from student_jax.augment import disparity_noise
 from student_jax.data import Frames, aux_targets, random_crops, sharpen_gripper
 from student_jax.encoder import POSITION_SCALE_M

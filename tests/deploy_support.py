@@ -8,9 +8,9 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from ddgrasp import contract
+from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import ExportConfig, StudentConfig
 from deploy.interfaces import CameraError, Clock, Frame, RobotState
-from export import metadata
 from mjx_envs import scene
 
 PROFILE = contract.D455.scaled(1 / 80)

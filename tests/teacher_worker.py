@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from ddgrasp import commands
+from app import commands
 from ddgrasp.config import Config
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import learner

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from ddgrasp.errors import UserError
-from mjx_envs import batch_render, render_check, scene
+from mjx_envs import scene
+from mjx_envs.render import batch_render, render_check
 
 COUNT = 12
 

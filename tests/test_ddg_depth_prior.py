@@ -6,8 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from ddg_jax import depth_prior, sample
-from ddg_jax.prior import InverseDepthPrior, invert, make_prior, normalise
+from ddg_jax import network_prior, sample
+from ddg_jax.inverse_depth import invert, normalise
+from ddg_jax.prior import InverseDepthPrior, make_prior
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from demos.rollout import Scene
@@ -98,9 +99,11 @@ def test_what_was_used_is_said(weights):
 
 def test_prior_and_depth_of_other_aspect_ratios_show_the_same_part():
     ramp = np.tile(np.arange(64, dtype=np.float32), (36, 1))
-    np.testing.assert_allclose(depth_prior.at_size(ramp, (18, 32))[0], np.arange(32) * 2 + 0.5, atol=1e-5)
+    np.testing.assert_allclose(network_prior.at_size(ramp, (18, 32))[0], np.arange(32) * 2 + 0.5, atol=1e-5)
     tall = np.tile(np.arange(64, dtype=np.float32), (64, 1)).T
-    np.testing.assert_allclose(depth_prior.at_size(tall, (16, 32))[:, 0], np.arange(16) * 2 + 16.5, atol=1e-5)
+    np.testing.assert_allclose(
+        network_prior.at_size(tall, (16, 32))[:, 0], np.arange(16) * 2 + 16.5, atol=1e-5
+    )
 
 
 def test_monocular_depth_is_fitted_to_the_measured_one():
@@ -108,6 +111,6 @@ def test_monocular_depth_is_fitted_to_the_measured_one():
     relative = rng.uniform(1, 4, (6, 8)).astype(np.float32)
     truth = 1 / (0.5 * relative + 0.2)
     measured = np.where(rng.random((6, 8)) < 0.5, truth, 0)
-    np.testing.assert_allclose(depth_prior.metric_depth(relative, measured, 10.0), truth, rtol=1e-5)
+    np.testing.assert_allclose(network_prior.metric_depth(relative, measured, 10.0), truth, rtol=1e-5)
     with pytest.raises(UserError, match="no two valid"):
-        depth_prior.metric_depth(relative, np.zeros((6, 8)), 10.0)
+        network_prior.metric_depth(relative, np.zeros((6, 8)), 10.0)

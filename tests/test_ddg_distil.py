@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from ddg_jax import distil, sample, train
-from ddg_jax import schedule as diffusion
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress, read_curves
+from learning import diffusion
 
 TINY = DDGConfig(
     height_px=16,

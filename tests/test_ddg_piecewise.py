@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from ddg_jax.data import surfaces
+from ddg_jax.inverse_depth import invert
 from ddg_jax.piecewise import piecewise_smooth
-from ddg_jax.prior import PIECEWISE, invert, make_prior
+from ddg_jax.prior import PIECEWISE, make_prior
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 

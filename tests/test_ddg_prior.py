@@ -12,8 +12,8 @@ from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
-from sensors.holes import fill_from_background
-from sensors.recordings import RecordingWriter
+from sensors.recordings.recording import RecordingWriter
+from sensors.statistics.holes import fill_from_background
 
 
 def test_holes_take_the_farther_neighbour_of_their_row():

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ddg_jax import schedule as s
 from ddgrasp.errors import UserError
+from learning import diffusion as s
 
 PARITY = Path(
     os.environ.get("PARITY_DIR") or Path(__file__).resolve().parents[1].parent / "shared/parity/public"

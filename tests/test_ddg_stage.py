@@ -15,7 +15,8 @@ from ddgrasp.config import Config, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress, read_curves
-from sensors.recordings import RecordingWriter
+from job_support import make_job
+from sensors.recordings.recording import RecordingWriter
 
 CONFIG = Config(
     preset="test",
@@ -53,7 +54,7 @@ def recordings(tmp_path_factory):
 def fitted(recordings, tmp_path_factory):
     directory = tmp_path_factory.mktemp("run") / "ddg"
     progress = Progress(directory, "ddg", quiet=True)
-    artifact = stage.fit_folder(CONFIG, recordings, directory, progress=progress)
+    artifact = stage.run(make_job("ddg", CONFIG, directory, progress, data=recordings))
     progress.close()
     return artifact
 
@@ -107,7 +108,7 @@ def test_the_camera_presets_generator_fits_and_samples_with_fresh_noise(recordin
     small |= {"train_steps": 10, "attention_heads": 1, "blocks": (1, 1), "sample_batch": 4}
     config = dataclasses.replace(CONFIG, ddg=dataclasses.replace(get_preset("camera").ddg, **small))
     progress = Progress(tmp_path / "ddg", "ddg", quiet=True)
-    fitted = stage.fit_folder(config, recordings, tmp_path / "ddg", progress=progress)
+    fitted = stage.run(make_job("ddg", config, tmp_path / "ddg", progress, data=recordings))
     progress.close()
     assert fitted.manifest.metrics["prior"] == "metric_inverse_depth"
     generator = Generator.load(fitted.directory)
@@ -126,8 +127,8 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
     config = dataclasses.replace(
         CONFIG, ddg=dataclasses.replace(CONFIG.ddg, init_from=str(fitted.directory), sample_steps=3)
     )
-    loaded = stage.fit_folder(
-        config, recordings, tmp_path / "ddg", progress=Progress(tmp_path / "ddg", quiet=True)
+    loaded = stage.run(
+        make_job("ddg", config, tmp_path / "ddg", Progress(tmp_path / "ddg", quiet=True), data=recordings)
     )
     assert loaded.manifest.origin == "loaded"
     before, after = (artifacts.load_params(a.directory / "params.msgpack") for a in (fitted, loaded))
@@ -138,7 +139,7 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
     ):
         other = dataclasses.replace(config, ddg=dataclasses.replace(config.ddg, **change))
         with pytest.raises(UserError, match=message):
-            stage.fit_folder(other, recordings, tmp_path / "other", progress=Progress(quiet=True))
+            stage.run(make_job("ddg", other, tmp_path / "other", Progress(quiet=True), data=recordings))
 
 
 def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings, tmp_path):
@@ -154,7 +155,7 @@ def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings
         ),
     )
     directory = tmp_path / "ddg"
-    stage.fit_folder(config, recordings, directory, progress=Progress(directory, quiet=True))
+    stage.run(make_job("ddg", config, directory, Progress(directory, quiet=True), data=recordings))
     before = artifacts.load_params(fitted.directory / "params.msgpack")
     plain = Generator.load(directory, "ddim", 50)
     jax.tree.map(np.testing.assert_array_equal, plain.params, before)
@@ -171,8 +172,8 @@ def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings
         Generator.load(directory, "progresive")
     # the fitted network, not the distilled one, is where another stage starts
     again = dataclasses.replace(CONFIG, ddg=dataclasses.replace(CONFIG.ddg, init_from=str(directory)))
-    loaded = stage.fit_folder(
-        again, recordings, tmp_path / "x", progress=Progress(tmp_path / "x", quiet=True)
+    loaded = stage.run(
+        make_job("ddg", again, tmp_path / "x", Progress(tmp_path / "x", quiet=True), data=recordings)
     )
     jax.tree.map(
         np.testing.assert_array_equal, artifacts.load_params(loaded.directory / "params.msgpack"), before

@@ -16,7 +16,7 @@ from ddg_jax.train import init_params
 from ddgrasp import artifacts
 from ddgrasp.config import Config, DDGConfig
 from ddgrasp.progress import Progress
-from sensors.recordings import RecordingWriter
+from sensors.recordings.recording import RecordingWriter
 
 CONFIG = DDGConfig(height_px=16, width_px=24, widths=(8, 8), blocks=(0, 1), attention_heads=1, sample_steps=2)
 DEPTH = replace(CONFIG, representation="depth", noise_threshold=-0.2)

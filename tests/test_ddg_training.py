@@ -7,13 +7,15 @@ import jax
 import numpy as np
 import pytest
 
-from ddg_jax import loop, sample, schedule, train
+from ddg_jax import sample, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
 from ddg_jax.representation import correlations
 from ddgrasp.config import CROSS_ENTROPY, HOLE_LOSSES, SQUARED, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from learning import diffusion as schedule
+from learning import loop
 
 TINY = DDGConfig(
     height_px=16,

@@ -14,11 +14,11 @@ from ddgrasp import contract
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy.clock import SimClock
-from deploy.franka_robot import FrankaRobot
+from deploy.devices.franka_robot import FrankaRobot
+from deploy.devices.realsense_camera import RealSenseCamera
+from deploy.devices.replay_camera import ReplayCamera
 from deploy.loop import ControlLoop, LoopSettings
 from deploy.policy import OnnxPolicy
-from deploy.realsense_camera import RealSenseCamera
-from deploy.replay_camera import ReplayCamera
 from deploy.safety import SafetyFilter, SafetyLimits
 from deploy.session import SessionOptions, deploy
 from deploy_support import (
@@ -30,7 +30,7 @@ from deploy_support import (
     describe,
     write_policy,
 )
-from sensors.recordings import RecordingWriter
+from sensors.recordings.recording import RecordingWriter
 
 SIZE = (45, 80)
 
@@ -110,7 +110,7 @@ def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
     clock.sleep_until(5.0)
     camera = RealSenseCamera(clock, contract.D455)
     camera._rs = Library
-    monkeypatch.setattr("deploy.realsense_camera.time.time", lambda: 1000.0)
+    monkeypatch.setattr("deploy.devices.realsense_camera.time.time", lambda: 1000.0)
     assert camera._exposed_s(DepthFrame()) == pytest.approx(4.96)
 
 

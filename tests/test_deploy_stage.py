@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 
 from ddgrasp import artifacts, contract
+from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import Config, DeployConfig, EvalConfig, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
-from deploy import rig_eval, stage
+from deploy import stage
+from deploy import trials as rig_eval
 from deploy.clock import SimClock
-from deploy.rig_eval import Trial, TrialResult, plan, run_trials
-from deploy.sim_robot import SimRobot
+from deploy.devices.rig_robot import SimRobot
 from deploy.stage import TrialLog, metrics
+from deploy.trials import Trial, TrialResult, plan, run_trials
 from deploy_support import write_policy
-from export import metadata
+from job_support import make_job
 from mjx_envs.camera import nominal_camera
 
 CONFIG = Config(
@@ -63,7 +65,7 @@ def run_dir(tmp_path, policy) -> Path:
 def run_stage(run_dir: Path, resume: bool = False) -> artifacts.Artifact:
     progress = Progress(run_dir / "deploy", "deploy", quiet=True)
     try:
-        return stage.run(CONFIG, run_dir, resume=resume, progress=progress)
+        return stage.run(make_job("deploy", CONFIG, run_dir / "deploy", progress))
     finally:
         progress.close()
 
@@ -144,7 +146,7 @@ def test_camera_stands_within_the_calibration_error():
 
 
 def test_sim_robot_moves_one_period_per_period_and_holds_where_it_is():
-    from mjx_envs.rig import RigWorld
+    from rig.world import RigWorld
 
     world, clock = RigWorld(objects=("cube",), randomise=False), SimClock()
     world.reset(0, "cube")
@@ -212,8 +214,8 @@ def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):
 
 
 def test_loop_moves_the_arm_as_the_training_environment_does(policy):
-    from mjx_envs.rig import RigWorld
-    from sensors.stage import act
+    from rig.stage import act
+    from rig.world import RigWorld
 
     world = RigWorld(objects=("apple",))
     trial = Trial(1, "apple")

@@ -5,8 +5,8 @@ import pytest
 from ddgrasp import artifacts
 from ddgrasp.config import Config
 from evaluation import backends
-from evaluation.html import render_html
-from evaluation.report import build_report, summary_rows
+from evaluation.report.html import render_html
+from evaluation.report.summary import build_report, summary_rows
 
 CONFIG = Config(preset="debug")
 

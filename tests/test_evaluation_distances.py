@@ -7,7 +7,7 @@ import pytest
 
 import parity_support as parity
 from ddgrasp.errors import UserError
-from evaluation import distances
+from evaluation.depth_score import distances
 
 
 @pytest.mark.parametrize("name", parity.names("unit_fid_kid*") or [""])

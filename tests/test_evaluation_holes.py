@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluation import holes
+from evaluation.depth_score import holes
 
 
 def sums(depth_m: np.ndarray, clean_m: np.ndarray, focal_px: float = 100.0) -> holes.Sums:

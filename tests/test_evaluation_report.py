@@ -12,9 +12,9 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
-from evaluation import figures
-from evaluation.report import build_report, print_summary, summary_rows
-from evaluation.stage import write_report
+from evaluation.report import figures
+from evaluation.report.stage import write_report
+from evaluation.report.summary import build_report, print_summary, summary_rows
 
 CONFIG = Config(preset="debug")
 METRICS = {

@@ -8,15 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app import cli
 from ddg_jax import stage as ddg_stage
 from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator
-from ddgrasp import artifacts, cli
+from ddgrasp import artifacts
 from ddgrasp.config import Config, DDGConfig, RecordConfig, ScoreConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
-from evaluation import holes, score_data, score_features, score_table
-from evaluation.score_domains import (
+from evaluation.depth_score import data as score_data
+from evaluation.depth_score import features as score_features
+from evaluation.depth_score import holes
+from evaluation.depth_score import table as score_table
+from evaluation.depth_score.domains import (
     COLUMNS,
     DOMAINS,
     FLOOR,
@@ -27,11 +31,12 @@ from evaluation.score_domains import (
     sense,
     wanted_domains,
 )
-from evaluation.score_episodes import Scored
-from evaluation.score_figures import draw_efficiency
-from evaluation.stage import write_report
+from evaluation.depth_score.episodes import Scored
+from evaluation.depth_score.figures import draw_efficiency
+from evaluation.report.stage import write_report
 from foundation import convert, store
-from sensors.recordings import RecordingWriter
+from job_support import make_job
+from sensors.recordings.recording import RecordingWriter
 
 ROOT = Path(__file__).parents[1]
 CONFIG = Config(
@@ -86,8 +91,9 @@ def run_dir(tmp_path_factory):
     root = tmp_path_factory.mktemp("run")
     shutil.copytree(ROOT / "pretrained" / "teacher", root / "teacher")
     write_recording(root / "record" / "rig_0000", 6, (180, 320))
+    artifacts.finish(root / "record", "record", CONFIG, seconds=1, metrics={})
     progress = Progress(root / "ddg", "ddg", quiet=True)
-    ddg_stage.fit_folder(CONFIG, root / "record", root / "ddg", progress=progress)
+    ddg_stage.run(make_job("ddg", CONFIG, root / "ddg", progress, data=root / "record"))
     progress.close()
     return root
 

@@ -5,8 +5,9 @@ import pytest
 
 from ddgrasp.config import ScoreConfig
 from ddgrasp.errors import UserError
-from evaluation import distances, score_table, two_samples
-from evaluation.resampling import Sample, draws, interval
+from evaluation.depth_score import distances, two_samples
+from evaluation.depth_score import table as score_table
+from evaluation.depth_score.resampling import Sample, draws, interval
 
 CONFIG = ScoreConfig(kid_subsets=5, kid_subset_size=20, bootstrap=6, neighbours=5)
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from ddgrasp import contract
+from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import ExportConfig, StudentConfig, WorldConfig
 from ddgrasp.errors import UserError
-from export import metadata
 
 PROFILE = WorldConfig().profile
 GOOD = metadata.describe(StudentConfig(), ExportConfig(), PROFILE, student_manifest_hash="abc")
@@ -75,7 +75,7 @@ def test_graph_shapes_must_be_those_promised():
 
 
 def test_reading_metadata_needs_neither_jax_nor_onnx():
-    code = "import sys, export.metadata; print(sorted({'jax', 'onnx', 'flax'} & set(sys.modules)))"
+    code = "import sys, ddgrasp.policy_metadata; print(sorted({'jax', 'onnx', 'flax'} & set(sys.modules)))"
     root = Path(__file__).parents[1]
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert out.stdout.strip() == "[]"

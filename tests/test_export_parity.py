@@ -8,11 +8,12 @@ import numpy as np
 import optax
 import pytest
 
-from ddg_jax.schedule import q_sample
 from ddgrasp import contract
+from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import ExportConfig, StudentConfig
 from ddgrasp.errors import UserError
-from export import graph, metadata, parity
+from export import graph, parity
+from learning.diffusion import q_sample
 from student_jax import policy
 
 PROFILE = contract.D455.scaled(0.125)

@@ -8,12 +8,14 @@ import onnxruntime as ort
 import pytest
 
 from ddgrasp import artifacts
+from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import Config, ExportConfig, StudentConfig, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from demos.stage import STORE
 from demos.store import EpisodeStore
-from export import metadata, stage
+from export import stage
+from job_support import make_job
 from student_jax import policy
 
 CONFIG = Config(
@@ -36,7 +38,7 @@ def finish_student(run_dir, config):
 
 def test_a_student_becomes_a_file_that_describes_itself(tmp_path):
     student = finish_student(tmp_path, CONFIG)
-    artifact = stage.run(CONFIG, tmp_path, resume=False, progress=Progress(quiet=True))
+    artifact = stage.run(make_job("export", CONFIG, tmp_path / "export"))
     metrics = artifact.manifest.metrics
     assert metrics["max_abs_diff"] <= 1e-4
     assert 0 < metrics["latency_ms"]["p50"] <= metrics["latency_ms"]["p99"]
@@ -54,21 +56,21 @@ def test_a_missed_bound_writes_nothing_and_keeps_the_old_file(tmp_path):
     old = tmp_path / "export" / stage.POLICY_FILE
     artifacts.atomic_write_bytes(old, b"old")
     with pytest.raises(UserError, match="differs from JAX by"):
-        stage.run(config, tmp_path, resume=False, progress=Progress(quiet=True))
+        stage.run(make_job("export", config, tmp_path / "export"))
     assert old.read_bytes() == b"old"
     assert not artifacts.is_finished(tmp_path / "export")
 
 
 def test_no_student_is_said(tmp_path):
     with pytest.raises(UserError, match="no finished stage 'student'"):
-        stage.run(CONFIG, tmp_path, resume=False, progress=Progress(quiet=True))
+        stage.run(make_job("export", CONFIG, tmp_path / "export"))
 
 
 def test_frame_triples_come_from_the_run_s_demonstrations(tmp_path):
-    assert stage.demo_frames(tmp_path, CONFIG) is None
+    assert stage.demo_frames(tmp_path / "demos", CONFIG) is None
     depth_mm = np.arange(5, dtype=np.uint16)[:, None, None] * np.ones((1, 90, 160), np.uint16)
     EpisodeStore(tmp_path / "demos" / STORE, create=True).append({"depth_mm": depth_mm}, {"n": np.array(5)})
-    frames = stage.demo_frames(tmp_path, CONFIG)
+    frames = stage.demo_frames(tmp_path / "demos", CONFIG)
     np.testing.assert_allclose(
         frames[:, :, 0, 0], np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]]) / 1000, atol=1e-6
     )

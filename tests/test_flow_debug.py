@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ddgrasp import artifacts, pipeline
+from app import pipeline
+from ddgrasp import artifacts
 from ddgrasp.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
@@ -18,7 +19,7 @@ KILL_AFTER_S = 1.0
 
 
 def _start(out: Path) -> subprocess.Popen:
-    command = [sys.executable, "-m", "ddgrasp.cli", "run", "--preset", "debug", "--out", str(out), "--resume"]
+    command = [sys.executable, "-m", "app.cli", "run", "--preset", "debug", "--out", str(out), "--resume"]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import checkpoint_support as files
 import parity_support as parity
-from ddgrasp.cli import main
+from app.cli import main
 from ddgrasp.errors import UserError
 from foundation import catalog, convert, store
 from foundation.checkpoint_files import read_checkpoint

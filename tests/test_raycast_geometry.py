@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mjx_envs import ray_geometry
+from mjx_envs.render import ray_geometry
 
 INF = math.inf
 DOWN, FORWARD = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)

@@ -11,10 +11,10 @@ import pytest
 
 from ddgrasp.config import RecordConfig, StereoConfig, WorldConfig
 from mjx_envs.camera import Buffers, Camera, nominal_camera
-from sensors import curves, figures, stats
-from sensors.active_stereo import ActiveStereo, flatten
-from sensors.materials import Material
-from sensors.rig_camera import RigCamera, jittered_pose
+from rig.camera import RigCamera, jittered_pose
+from sensors.models.active_stereo import ActiveStereo, flatten
+from sensors.models.materials import Material
+from sensors.statistics import curves, figures, stats
 
 PROFILE = WorldConfig().profile
 FB_PX_M = PROFILE.fx_px * PROFILE.baseline_m
@@ -232,7 +232,7 @@ def test_jittered_pose_stays_near_the_nominal_one():
 
 def test_sensors_need_no_jax():
     code = (
-        "import sys, sensors.rig_camera, sensors.stage, sensors.compare, sensors.importers; "
+        "import sys, rig.camera, rig.stage, evaluation.camera_comparison, sensors.recordings.importers; "
         "assert 'jax' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])

@@ -10,10 +10,11 @@ from ddgrasp.config import RecordConfig
 from ddgrasp.contract import D455
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
-from sensors import compare, curves, figures
-from sensors.curves import Stream
-from sensors.recordings import RecordingWriter
-from sensors.rig_scenes import StandingScene, standing_scenes
+from evaluation import camera_comparison as compare
+from rig.scenes import StandingScene, standing_scenes
+from sensors.recordings.recording import RecordingWriter
+from sensors.statistics import curves, figures
+from sensors.statistics.curves import Stream
 
 FX_PX, FB_PX_M = 170.0, 16.0
 SIZE = (90, 160)

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from ddgrasp.commands import parse
+from app.commands import parse
 from ddgrasp.errors import UserError
-from sensors import importers
-from sensors.recordings import Recording
+from sensors.recordings import importers
+from sensors.recordings.recording import Recording
 
 SIZE = (24, 32)
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from mjx_envs.objects import OBJECTS
-from mjx_envs.rig import RigWorld
-from sensors.materials import OBJECT_MATERIALS, Material, object_material, rig_materials
+from rig.world import RigWorld
+from sensors.models.materials import OBJECT_MATERIALS, Material, object_material, rig_materials
 
 
 def test_every_object_has_a_material_with_a_source():

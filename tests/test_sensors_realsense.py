@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ddgrasp.commands import parse
+from app.commands import parse
 from ddgrasp.errors import UserError
 from realsense_support import FX_PX, NAME, SERIAL, SIZE, ScriptedLibrary, SoftwareCamera, depth_mm
-from sensors.realsense_live import Pace, frame_count
-from sensors.recordings import Recording
+from sensors.recordings.realsense_live import Pace, frame_count
+from sensors.recordings.recording import Recording
 
 SMALL = ("--width", str(SIZE[1]), "--height", str(SIZE[0]))
 TIMEOUT = RuntimeError("Frame didn't arrive within 3000")

@@ -7,11 +7,11 @@ import pytest
 
 from ddgrasp import contract
 from ddgrasp.presets import get_preset
-from sensors.recordings import Recording
-from sensors.rig_camera import RigCamera
-from sensors.stage import act, record_trajectory
+from rig.camera import RigCamera
+from rig.stage import act, record_trajectory
+from sensors.recordings.recording import Recording
 
-rig = pytest.importorskip("mjx_envs.rig", reason="the rig is not there")
+rig = pytest.importorskip("rig.world", reason="the rig is not there")
 
 
 @pytest.fixture(scope="module")

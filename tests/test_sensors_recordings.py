@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ddgrasp.errors import UserError
-from sensors.recordings import Recording, RecordingWriter, find_recordings
+from sensors.recordings.recording import Recording, RecordingWriter, find_recordings
 
 REAL = Path(__file__).parents[2] / "shared" / "real_depth"
 

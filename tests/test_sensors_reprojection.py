@@ -5,7 +5,7 @@ import pytest
 
 from ddgrasp.contract import D455
 from mjx_envs.camera import Camera
-from sensors.reprojection import from_beside
+from sensors.models.reprojection import from_beside
 
 PROFILE = D455.scaled(0.125)
 SIZE = (PROFILE.height_px, PROFILE.width_px)

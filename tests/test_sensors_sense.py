@@ -13,8 +13,8 @@ from ddg_jax.train import init_params
 from ddgrasp.config import DDGConfig, DextrahConfig, KinectConfig, SensorConfig
 from ddgrasp.contract import D455
 from ddgrasp.errors import UserError
-from sensors import procedural
-from sensors.sense import Sense, ideal
+from sensors.models import procedural
+from sensors.models.sense import Sense, ideal
 
 PROFILE = D455.scaled(0.125)
 SIZE = (PROFILE.height_px, PROFILE.width_px)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sensors import stats
+from sensors.statistics import stats
 
 
 def test_holes_are_counted_with_diagonal_neighbours():

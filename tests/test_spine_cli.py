@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ddgrasp.commands import COMMANDS, parse
-from ddgrasp.commands.checks import CHECKPOINTS, check_config_values
+from app.commands import COMMANDS, parse
+from app.commands.checks import CHECKPOINTS, check_config_values
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 
 def ddgrasp(*args: str) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, "-m", "ddgrasp.cli", *args], cwd=ROOT, capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "app.cli", *args], cwd=ROOT, capture_output=True, text=True, timeout=60
     )
 
 
@@ -30,7 +30,7 @@ def _one_error_line(result: subprocess.CompletedProcess) -> str:
 def test_help_of_every_command_starts_without_jax():
     code = f"""
 import sys
-from ddgrasp.cli import main
+from app.cli import main
 main(["--help"])
 for name in {list(COMMANDS)}:
     try:
@@ -109,7 +109,9 @@ def test_an_unknown_option_is_named():
 def test_a_full_disk_gets_one_line(tmp_path):
     code = f"""
 import resource, sys
-from ddgrasp import artifacts, cli, commands
+from ddgrasp import artifacts
+from app import cli
+from app import commands
 resource.setrlimit(resource.RLIMIT_FSIZE, (512, resource.RLIM_INFINITY))
 class Fill:
     def run(self):

@@ -9,25 +9,24 @@ from pathlib import Path
 
 import pytest
 
-from ddgrasp import artifacts, pipeline
+from app import pipeline
+from ddgrasp import artifacts
 from ddgrasp.config import Config, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress, read_curves
+from ddgrasp.stages import STAGES, Stage, config_fields
 
 CONFIG = Config(preset="debug")
 ROOT = Path(__file__).parents[1]
 
 STAGE = """
-from ddgrasp import artifacts
-
-def run(config, run_dir, *, resume, progress):
-    directory = run_dir / NAME
+def run(job):
+    run_dir = job.directory.parent
     with open(run_dir / "log.txt", "a") as log:
-        log.write(f"{NAME} resume={resume}\\n")
-    if (run_dir / f"fail_{NAME}").exists():
+        log.write(f"{job.stage.name}\\n")
+    if (run_dir / f"fail_{job.stage.name}").exists():
         raise OSError(28, "No space left on device")
-    parents = [artifacts.require(run_dir, name, config) for name in PARENTS]
-    return artifacts.finish(directory, NAME, config, seconds=progress.seconds, metrics={}, parents=parents)
+    return job.finish({})
 """
 
 
@@ -40,8 +39,8 @@ def stages(tmp_path, monkeypatch):
         folder = tmp_path / "code" / package
         folder.mkdir(parents=True)
         (folder / "__init__.py").write_text("")
-        (folder / "stage.py").write_text(f"NAME = {name!r}\nPARENTS = {parents!r}\n{STAGE}")
-        made.append(pipeline.Stage(name, package, parents, f"makes {name}"))
+        (folder / "stage.py").write_text(STAGE)
+        made.append(Stage(name, f"{package}.stage", parents, (name,), f"makes {name}"))
     yield made
     for name in [name for name in sys.modules if name.startswith(("stage_a_pkg", "stage_b_pkg"))]:
         del sys.modules[name]
@@ -57,18 +56,18 @@ def _log(run_dir):
 
 def test_stages_run_in_order_and_the_report_has_them(stages, tmp_path):
     report = _run(stages, tmp_path / "run")
-    assert _log(tmp_path / "run") == ["teacher resume=False", "record resume=False"]
+    assert _log(tmp_path / "run") == ["teacher", "record"]
     assert set(report["stages"]) == {"teacher", "record"}
     assert report["stages"]["record"]["trained"] is True
     assert (tmp_path / "run" / "report.html").stat().st_size > 1000
 
 
 def test_the_flow_lists_every_stage_after_its_parents():
-    names = [stage.name for stage in pipeline.STAGES]
+    names = [stage.name for stage in STAGES]
     assert names == ["teacher", "demos", "record", "ddg", "student", "export", "deploy"]
-    for index, stage in enumerate(pipeline.STAGES):
+    for index, stage in enumerate(STAGES):
         assert set(stage.parents) <= set(names[:index])
-        assert stage.name in artifacts.STAGE_FIELDS
+        assert set(config_fields(stage)) <= {field.name for field in dataclasses.fields(Config)}
 
 
 def test_resume_does_only_what_is_left(stages, tmp_path):
@@ -80,7 +79,7 @@ def test_resume_does_only_what_is_left(stages, tmp_path):
     (run_dir / "fail_record").unlink()
     teacher = artifacts.read_artifact(run_dir / "teacher")
     _run(stages, run_dir, resume=True)
-    assert _log(run_dir) == ["teacher resume=False", "record resume=False", "record resume=True"]
+    assert _log(run_dir) == ["teacher", "record", "record"]
     assert artifacts.read_artifact(run_dir / "teacher") == teacher
     _run(stages, run_dir, resume=True)
     assert len(_log(run_dir)) == 3
@@ -124,8 +123,11 @@ def test_a_child_of_a_replaced_parent_is_refused(stages, tmp_path):
 SLOW = """
 import gc, sys, time, types
 from pathlib import Path
-from ddgrasp import cli, commands, pipeline
+from app import cli
+from app import commands
+from app import pipeline
 from ddgrasp.config import Config
+from ddgrasp.stages import Stage
 
 {work}
 
@@ -133,17 +135,17 @@ module = types.ModuleType("slow_pkg.stage")
 module.run = work
 sys.modules["slow_pkg"] = types.ModuleType("slow_pkg")
 sys.modules["slow_pkg.stage"] = module
-stage = pipeline.Stage("teacher", "slow_pkg", (), "nothing")
+stage = Stage("teacher", "slow_pkg.stage", (), ("teacher",), "nothing")
 
 class Slow:
     def run(self):
-        pipeline.run_stage(stage, Config(preset="debug"), Path({run_dir!r}), resume=True, quiet=True)
+        pipeline.make(stage, Config(preset="debug"), Path({run_dir!r}), resume=True, quiet=True)
 
 commands.parse = lambda name, args: Slow()
 sys.exit(cli.main(["teacher", "train"]))
 """
 WRAPS_THE_INTERRUPT = """
-def work(config, run_dir, *, resume, progress):
+def work(job):
     print("working", flush=True)
     try:
         time.sleep(60)
@@ -156,7 +158,7 @@ class Drops:
         print("working", flush=True)
         time.sleep(30)
 
-def work(config, run_dir, *, resume, progress):
+def work(job):
     Drops()
     print("dropped", flush=True)
     try:
@@ -166,7 +168,7 @@ def work(config, run_dir, *, resume, progress):
         print("cleaned up", flush=True)
 """
 COLLECTS_GARBAGE_MOST_OF_THE_TIME = """
-def work(config, run_dir, *, resume, progress):
+def work(job):
     gc.callbacks.append(lambda phase, info: None)
     ballast = [[] for _ in range(1_000_000)]
     print("working", flush=True)

@@ -13,7 +13,8 @@ from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import nominal_camera
-from student_jax import denoiser, diffusion, encoder, hand_view, policy, preprocess
+from student_jax import action_diffusion as diffusion
+from student_jax import denoiser, encoder, hand_view, policy, preprocess
 
 PROFILE = contract.D455.scaled(0.25)
 CONFIG = StudentConfig()

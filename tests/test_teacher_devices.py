@@ -46,7 +46,7 @@ def _start(*command: str, devices: int = 1) -> subprocess.Popen:
 
 def _train(out: Path, *options: str, devices: int = 1) -> subprocess.Popen:
     options = (*worker.TINY, "--out", str(out), *options)
-    return _start("-m", "ddgrasp.cli", "teacher", "train", *options, devices=devices)
+    return _start("-m", "app.cli", "teacher", "train", *options, devices=devices)
 
 
 def _succeed(*processes: subprocess.Popen) -> None:

@@ -8,16 +8,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from ddgrasp import artifacts, cli, contract
+from app import cli
+from ddgrasp import artifacts, contract
 from ddgrasp.config import Config, WorldConfig
 from ddgrasp.progress import Progress
 from evaluation import teacher_trials
-from evaluation.html import render_html
-from evaluation.report import build_report
-from mjx_envs import kinematics, raycast_numpy, scene
+from evaluation.report.html import render_html
+from evaluation.report.summary import build_report
+from mjx_envs import kinematics, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.objects import get_object
+from mjx_envs.render import raycast_numpy
 from ppo import policy as teacher_policy
 from ppo import trials
 from ppo.visible import MOMENTS, Watcher, moments

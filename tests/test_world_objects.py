@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from app.commands import parse
 from ddgrasp import contract
-from ddgrasp.commands import parse
 from ddgrasp.config import RandomConfig, WorldConfig
 from ddgrasp.errors import UserError
 from evaluation import object_sheet
-from mjx_envs import grasp_math, raycast_numpy, scene
+from mjx_envs import grasp_math, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.objects import (
@@ -26,9 +26,10 @@ from mjx_envs.objects import (
     slot_layout,
 )
 from mjx_envs.randomize import ObjectTable, sample_params
-from mjx_envs.rig import RigWorld
-from mjx_envs.visual import Viewer
+from mjx_envs.render import raycast_numpy
+from mjx_envs.render.visual import Viewer
 from ppo.guide import guide
+from rig.world import RigWorld
 
 SEEN, UNSEEN = contract.SEEN_OBJECTS, contract.UNSEEN_OBJECTS
 TWELVE = (*SEEN, *UNSEEN)

@@ -7,9 +7,11 @@ import pytest
 
 from ddgrasp.config import RandomConfig
 from ddgrasp.errors import UserError
-from mjx_envs import conformance, inverse_kinematics, kinematics, physics, physics_warp, randomize, scene
+from mjx_envs import inverse_kinematics, kinematics, randomize, scene
 from mjx_envs.grasp_math import HAND_DOWN
 from mjx_envs.objects import DEFAULT_SLOTS, OBJECTS
+from mjx_envs.physics import backends, conformance
+from mjx_envs.physics import mjx_warp as physics_warp
 
 NAMES = ("cube", "apple", "banana")
 DT_S = 0.005
@@ -24,10 +26,10 @@ def make_backend(name):
     """Warp on its CPU device where there is no GPU: the same kernels and the same route through JAX."""
     if name == "warp":
         return physics_warp.WarpPhysics(DT_S, 20, DEFAULT_SLOTS)
-    return physics.make_physics(name, DT_S)
+    return backends.make_physics(name, DT_S)
 
 
-@pytest.fixture(scope="module", params=physics.BACKENDS)
+@pytest.fixture(scope="module", params=backends.BACKENDS)
 def measured(request):
     """(backend's name, every measure of its experiments)."""
     step = conformance.make_step(make_backend(request.param))
@@ -87,11 +89,11 @@ def test_randomisation_stays_in_range_and_moves_only_what_it_should(table):
 
 def test_unknown_backend_is_named():
     with pytest.raises(UserError, match="'cpuu'.*Did you mean 'cpu'"):
-        physics.make_physics("cpuu", DT_S)
+        backends.make_physics("cpuu", DT_S)
 
 
 def test_warp_without_a_gpu_says_what_to_do():
     if any(device.platform == "gpu" for device in jax.devices()):
         pytest.skip("this machine has a GPU")
     with pytest.raises(UserError, match="'warp' needs an NVIDIA GPU.*choose cpu or jax"):
-        physics.make_physics("warp", DT_S)
+        backends.make_physics("warp", DT_S)

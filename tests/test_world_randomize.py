@@ -9,11 +9,12 @@ import pytest
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig, WorldConfig
-from mjx_envs import grasp_math, kinematics, physics, randomize, scene
+from mjx_envs import grasp_math, kinematics, randomize, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.objects import OBJECTS
-from mjx_envs.rig import RigWorld
+from mjx_envs.physics import interface as physics
+from rig.world import RigWorld
 
 COUNT = 400
 NOTHING = RandomConfig(**{field.name: 0 for field in fields(RandomConfig)})

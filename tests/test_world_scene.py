@@ -8,7 +8,7 @@ from ddgrasp import contract
 from ddgrasp.errors import UserError
 from mjx_envs import grasp_math, kinematics, scene
 from mjx_envs.objects import OBJECTS, get_object
-from mjx_envs.rig import RigWorld
+from rig.world import RigWorld
 
 
 @pytest.fixture(scope="module")

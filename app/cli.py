@@ -1,0 +1,89 @@
+"""Entry point `ddgrasp`: finds the command, runs it, turns what went wrong into one line.
+
+Imports nothing heavy: `--help` and typing errors answer at once, and Ctrl-C is handled from the first moment.
+"""
+
+import errno
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit status: 0 fine, 1 trouble, 2 wrong input, 130 interrupted."""
+    # JAX's GPU build takes most of the device's memory at its start unless told otherwise.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    # Compiled programs are kept: the second run of a stage starts in seconds.
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "ddgrasp" / "jax"
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    try:
+        return _dispatch(list(sys.argv[1:] if argv is None else argv))
+    except KeyboardInterrupt as interrupt:
+        return _fail(str(interrupt) or "Interrupted.", 130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if (message := _one_line(error)) is None:
+            raise
+        return _fail(message, 2 if type(error).__name__ == "UserError" else 1)
+
+
+def _dispatch(argv: list[str]) -> int:
+    from app.commands import COMMANDS, describe_commands, parse
+    from ddgrasp.errors import unknown_name
+
+    words = argv[: next((i for i, word in enumerate(argv) if word.startswith("-")), len(argv))]
+    if argv and argv[0] == "--version":
+        from ddgrasp.artifacts import library_versions
+
+        print("  ".join(f"{name} {version}" for name, version in library_versions().items()))
+        return 0
+    for length in (2, 1):
+        name = " ".join(words[:length])
+        if len(words) >= length and name in COMMANDS:
+            parse(name, argv[length:]).run()
+            return 0
+    group = words[0] if words else ""
+    if words and not any(name.split()[0] == group for name in COMMANDS):
+        raise unknown_name("command", group, {name.split()[0] for name in COMMANDS})
+    if len(words) > 1:
+        raise unknown_name("command", " ".join(words[:2]), [n for n in COMMANDS if n.startswith(f"{group} ")])
+    print(describe_commands(group))
+    return 0 if "--help" in argv or "-h" in argv or not argv else 2
+
+
+def _one_line(error: BaseException) -> str | None:
+    """The message for errors that a person can act on; None for those that need a traceback."""
+    from ddgrasp.errors import UserError
+
+    if isinstance(error, UserError):
+        return " ".join(str(error).split())
+    cause: BaseException | None = error
+    while cause is not None:
+        full = isinstance(cause, OSError) and cause.errno in _DISK_FULL
+        if full or os.strerror(errno.ENOSPC) in str(cause):
+            where = f" at {cause.filename}" if isinstance(cause, OSError) and cause.filename else ""
+            return (
+                f"No space left on the disk{where}: free some and go on with --resume. "
+                "What was finished before is intact."
+            )
+        cause = cause.__cause__ or cause.__context__
+    if isinstance(error, PermissionError):
+        return f"No permission for {error.filename}: choose another --out, or change its owner."
+    if isinstance(error, (FileExistsError, NotADirectoryError, IsADirectoryError)):
+        return f"{error.filename} cannot be written ({error.strerror}): choose another --out."
+    return None
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"ddgrasp: {message}", file=sys.stderr)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,118 @@
+"""The commands of `ddgrasp`, one dataclass each: its fields are the options, `run` does the work.
+
+Stages are imported inside `run`, so that `--help` starts without JAX.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from app import pipeline
+from app.commands.base import DEFAULT_PRESET, Command, FromPreset
+from app.commands.checks import check_config_values, check_devices
+from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
+from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
+from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
+from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
+from app.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
+from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
+from ddgrasp.presets import get_preset
+
+
+@dataclass(frozen=True)
+class Run(FromPreset):
+    """The whole flow: teacher, demos, record, ddg, student, export, deploy, report."""
+
+    def run(self) -> None:
+        from evaluation.report.summary import print_summary
+
+        check_config_values(self.config)
+        check_devices(self.config, self.out)
+        report = pipeline.run(self.config, self.out, resume=self.resume)
+        print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
+        print_summary(report)
+
+
+COMMANDS: dict[str, type] = {
+    "run": Run,
+    "teacher train": TeacherTrain,
+    "teacher eval": TeacherEval,
+    "teacher compare": TeacherCompare,
+    "demos collect": DemosCollect,
+    "record": Record,
+    "record import": RecordImport,
+    "record realsense": RecordRealsense,
+    "ddg fit": DDGFit,
+    "ddg sample": DDGSample,
+    "ddg score": DDGScore,
+    "ddg curve": DDGCurve,
+    "ddg samplers": DDGSamplers,
+    "ddg features": DDGFeatures,
+    "ddg distil": DDGDistil,
+    "ddg generate": DDGGenerate,
+    "ddg thresholds": DDGThresholds,
+    "student train": StudentTrain,
+    "student eval": StudentEval,
+    "export": Export,
+    "deploy": Deploy,
+    "weights convert": WeightsConvert,
+    "weights list": WeightsList,
+    "report": Report,
+    "objects list": ObjectsList,
+    "sensors compare": SensorsCompare,
+    "objects sheet": ObjectsSheet,
+}
+
+
+def parse(name: str, args: Sequence[str]) -> Command:
+    """The command `name` with its options; prints help or usage and raises SystemExit as tyro does."""
+    cls = COMMANDS[name]
+    options: dict[str, Any] = {}
+    if issubclass(cls, FromPreset):
+        preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
+        options["default"] = cls(config=preset, out=Path("runs") / preset.preset)
+    elif issubclass(cls, Scoring):
+        preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
+        default = cls(preset.score, preset.preset, Path("runs") / preset.preset)
+        options["default"] = replace(default, ddg=preset.ddg) if isinstance(default, DDGScore) else default
+    elif cls is Deploy:
+        policy = Path(_option(args, "--policy") or Path("runs") / DEFAULT_PRESET / "export" / "policy.onnx")
+        options["default"] = Deploy(config=config_of(policy, _option(args, "--preset")), policy=policy)
+    elif cls is TeacherEval:
+        options["default"] = with_world_of(Path(args[0]) if args and args[0][0] != "-" else None)
+    return tyro.cli(
+        cls,
+        prog=f"ddgrasp {name}",
+        args=list(args),
+        config=(tyro.conf.FlagCreatePairsOff,),
+        **options,
+    )
+
+
+def describe_commands(group: str = "") -> str:
+    """The list that `ddgrasp --help` (or `ddgrasp teacher`) prints."""
+    names = [name for name in COMMANDS if not group or name.split()[0] == group]
+    lines = [f"  {name:<16} {(COMMANDS[name].__doc__ or '').splitlines()[0]}" for name in names]
+    return "\n".join(
+        ["usage: ddgrasp COMMAND [options]   (each command has --help)", "", *lines, "", *_PRESET_HELP]
+    )
+
+
+_PRESET_HELP = (
+    "Presets (--preset): debug (tests), demo (23 minutes on two cores), laptop (all from nothing, 73 minutes",
+    "on two busy cores), camera (laptop, the generator for short recordings of a real camera), paper (one",
+    "GPU). Any value of a preset can be given, for example --teacher.num-envs 64.",
+)
+
+
+def _option(args: Sequence[str], name: str) -> str | None:
+    """Value of `--name value` or `--name=value` among `args`."""
+    for index, arg in enumerate(args):
+        if arg == name and index + 1 < len(args):
+            return args[index + 1]
+        if arg.startswith(f"{name}="):
+            return arg.split("=", 1)[1]
+    return None

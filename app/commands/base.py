@@ -1,0 +1,45 @@
+"""What commands have in common, and how their defaults are found."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Protocol
+
+import tyro
+
+from app import pipeline
+from app.commands.checks import check_config_values
+from ddgrasp import artifacts
+from ddgrasp.config import Config
+from ddgrasp.stages import get_stage
+
+DEFAULT_PRESET = "demo"
+
+
+class Command(Protocol):
+    """What a parsed command line is."""
+
+    def run(self) -> None:
+        """Does the work; raises UserError for wrong input."""
+        ...
+
+
+@dataclass(frozen=True)
+class FromPreset:
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    """Values of the preset; any of them can be given on its own, for example --seed 1."""
+    out: Path
+    """Directory of the run."""
+    resume: bool = False
+    """Continue what is there; finished stages are not redone."""
+
+
+class OneStage(FromPreset):
+    stage: str
+
+    def run(self) -> None:
+        pipeline.make(get_stage(self.stage), check_config_values(self.config), self.out, resume=self.resume)
+
+
+def load_config(run_dir: Path, stage: str) -> Config:
+    """The configuration that made the finished `stage` of a run."""
+    return artifacts.config_from_json(artifacts.read_manifest(run_dir / stage).config)

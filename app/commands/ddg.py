@@ -1,0 +1,140 @@
+"""ddgrasp ddg: the generator."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from app import pipeline
+from app.commands.base import OneStage
+from app.commands.checks import check_config_values, check_count
+from ddgrasp import artifacts
+from ddgrasp.stages import get_stage
+
+
+@dataclass(frozen=True)
+class DDGFit(OneStage):
+    """Fit the depth noise model on recordings: the run's own, or any in --data."""
+
+    data: Path | None = None
+    """A recording, or a folder of them (color/, depth/, meta.json); none takes the run's recordings."""
+
+    stage = "ddg"
+
+    def run(self) -> None:
+        if self.data is None:
+            super().run()
+            return
+        config, inputs = check_config_values(self.config), {"data": self.data}
+        pipeline.make(get_stage(self.stage), config, self.out, resume=self.resume, parents={}, inputs=inputs)
+
+
+@dataclass(frozen=True)
+class DDGSample:
+    """Draw recorded frames beside what a fitted noise model makes of them, as a PNG."""
+
+    model: Path
+    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    data: Path
+    """A recording, or a folder of them."""
+    out: Path = Path()
+    """Where samples.png goes."""
+    count: int = 4
+    """Frames to draw."""
+    seed: int = 0
+    """Of the noise."""
+
+    def run(self) -> None:
+        from ddg_jax.stage import sample_folder
+        from ddgrasp.progress import Progress
+
+        check_count("--count", self.count)
+        progress = Progress(name="ddg sample")
+        print(
+            sample_folder(
+                self.model, self.data, self.out, seed=self.seed, progress=progress, count=self.count
+            )
+        )
+
+
+@dataclass(frozen=True)
+class DDGDistil:
+    """Distil a fitted noise model to few network evaluations per map."""
+
+    model: Path
+    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    data: Path
+    """The recordings it was fitted on: a recording, or a folder of them."""
+    out: Path
+    """Directory of a run; the distilled model goes to its folder ddg."""
+    evaluations: int = 4
+    """Network evaluations per map; those passed on the way (4 and 2 before 1) are kept too."""
+    steps: int | None = None
+    """Optimiser steps per halving; none takes the model's ddg.distil_steps."""
+    resume: bool = False
+    """Continue what is there."""
+
+    def run(self) -> None:
+        fitted = artifacts.read_artifact(self.model)
+        config = artifacts.config_from_json(fitted.manifest.config)
+        ddg = replace(
+            config.ddg,
+            init_from=str(self.model.resolve()),
+            sampler="progressive",
+            sample_steps=self.evaluations,
+            distil_steps=config.ddg.distil_steps if self.steps is None else self.steps,
+        )
+        config = replace(config, ddg=ddg)
+        inputs = {"data": self.data, "model": fitted.hash}
+        pipeline.make(get_stage("ddg"), config, self.out, resume=self.resume, parents={}, inputs=inputs)
+
+
+@dataclass(frozen=True)
+class DDGGenerate:
+    """Give all demos the camera's artefacts: a stream in constant memory, over all devices."""
+
+    model: Path
+    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    demos: Path
+    """Stage directory of collected demos, for example runs/demo/demos."""
+    out: Path
+    """Directory of a run; the depth goes to its folder noisy."""
+    seed: int = 0
+    """Of the noise."""
+    resume: bool = False
+    """Continue what is there."""
+
+    def run(self) -> None:
+        parents = {"ddg": artifacts.read_artifact(self.model), "demos": artifacts.read_artifact(self.demos)}
+        config = artifacts.config_from_json(parents["ddg"].manifest.config)
+        config = replace(config, seed=self.seed)
+        stage = get_stage("noisy")
+        made = pipeline.make(stage, config, self.out, resume=self.resume, parents=parents).manifest
+        print(
+            "{episodes} episodes, {frames} frames, {invalid_fraction:.1%} of pixels invalid".format(
+                **made.metrics
+            )
+        )
+
+
+@dataclass(frozen=True)
+class DDGThresholds:
+    """Holes, flicker and error over thresholds of a fitted noise model's mask: a table, JSON, a PNG."""
+
+    model: Path
+    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    data: Path
+    """A recording, or a folder of them; its last frames are used."""
+    out: Path = Path()
+    """Where thresholds.json and thresholds.png go."""
+    count: int = 180
+    """Frames."""
+    seed: int = 1
+    """Of the noise."""
+
+    def run(self) -> None:
+        from ddg_jax import thresholds
+        from ddgrasp.progress import Progress
+
+        check_count("--count", self.count)
+        progress = Progress(name="thresholds")
+        rows = thresholds.analyse(self.model, self.data, self.out, progress, count=self.count, seed=self.seed)
+        print(f"{thresholds.table(rows)}\n{self.out / thresholds.FILE}.png")

@@ -1,0 +1,135 @@
+"""ddgrasp demos, record, sensors: depth of every kind."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from app.commands.base import OneStage
+from app.commands.checks import check_count
+from ddgrasp import contract
+from ddgrasp.config import RecordConfig, StereoConfig
+from ddgrasp.errors import UserError
+
+
+@dataclass(frozen=True)
+class DemosCollect(OneStage):
+    """Collect successful teacher episodes with clean depth."""
+
+    stage = "demos"
+
+
+@dataclass(frozen=True)
+class Record(OneStage):
+    """Record RGB-D from the pseudo-real rig, moved by the teacher."""
+
+    stage = "record"
+
+
+@dataclass(frozen=True)
+class RecordImport:
+    """Turn RealSense files (.bag, .db3) or folders of colour and depth pictures into recordings."""
+
+    source: tyro.conf.Positional[Path]
+    """A .bag or .db3, a folder of them, one with depth/ and color/ (or rgb/), or a folder of such folders."""
+    out: Path = Path("recordings")
+    """Each source becomes a folder in it."""
+    depth_unit_m: float = 0.0
+    """Metres per unit of depth; 0 takes a RealSense file's own, 0.001 for integer pictures, 1 for floats."""
+    sensor: str = ""
+    """Camera model, for example D455; a RealSense file names its own."""
+    fx_px: float = 0.0
+    """Focal length of the depth pictures in pixels; 0 if unknown."""
+    baseline_m: float = 0.0
+    """Distance between the imagers; 0 if unknown."""
+    consecutive: bool = False
+    """The pictures follow each other in time (a RealSense file's do)."""
+
+    def run(self) -> None:
+        from sensors.recordings import importers
+
+        if not 0 <= self.depth_unit_m <= 1:
+            raise UserError(f"--depth-unit-m is {self.depth_unit_m}; expected 0 (known) or up to 1 (metres).")
+        known = {"sensor": self.sensor, "fx_px": self.fx_px, "baseline_m": self.baseline_m}
+        meta = {name: value for name, value in known.items() if value}
+        if self.consecutive:
+            meta["consecutive_frames"] = True
+        sources = importers.find_sources(self.source, self.depth_unit_m, meta)
+        print(importers.summary(*importers.import_all(sources, self.out)))
+
+
+@dataclass(frozen=True)
+class RecordRealsense:
+    """Record colour and depth of a RealSense D4xx that is connected, until done or Ctrl-C."""
+
+    out: Path = Path("recordings")
+    """The recording becomes a folder in it."""
+    name: str = "take"
+    """Of that folder; one that exists is never overwritten."""
+    seconds: float = 10.0
+    """Length, after the half second in which the exposure settles. Ctrl-C ends it earlier and keeps it."""
+    frames: int = 0
+    """Frames to record; 0 takes --seconds."""
+    hz: int = 10
+    """Frames kept per second: 1, 2, 3, 5, 6, 10, 15 or 30; the camera itself always runs at 30."""
+    width: int = 1280
+    """Of depth and colour in pixels."""
+    height: int = 720
+    """Of depth and colour in pixels."""
+    serial: str = ""
+    """Serial number of the camera; empty takes the first."""
+
+    def run(self) -> None:
+        from ddgrasp.progress import Progress
+        from sensors.recordings import realsense_live as live
+
+        frames = live.frame_count(self.frames, self.seconds, self.hz)
+        options = live.LiveOptions(frames, self.hz, self.width, self.height, self.serial)
+        path = live.new_path(self.out, self.name)
+        imported, take = live.record(options, path, Progress(name="record realsense"))
+        print(live.summary(imported, take, frames))
+        if take.trouble:
+            raise UserError(
+                f"the camera stopped ({take.trouble}): what it gave is kept; check the USB 3 cable."
+            )
+
+
+@dataclass(frozen=True)
+class SensorsCompare:
+    """Set the rig's stereo camera beside real D4xx cameras: holes, noise, flicker, as table, JSON and PNG."""
+
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    """The rig's camera."""
+    camera_scale: float = 0.25
+    """Size of its picture relative to 1280 x 720."""
+    real: Path | None = None
+    """A recording of a real camera, or a folder of them; none takes the figures measured before."""
+    out: Path = Path()
+    """Where sensors.json and sensors.png go."""
+    scenes: int = 1
+    """Standing scenes per object."""
+    frames: int = 6
+    """Frames per scene."""
+    seed: int = 0
+    """Of the scenes."""
+
+    def run(self) -> None:
+        from ddgrasp.progress import Progress
+        from evaluation import camera_comparison as compare
+
+        if not 0.1 <= self.camera_scale <= 1.0:
+            raise UserError(f"--camera-scale is {self.camera_scale}; expected 0.1 to 1.")
+        check_count("--scenes", self.scenes)
+        if self.frames < 2:
+            raise UserError(f"--frames is {self.frames}; expected at least 2, for noise over time.")
+        result = compare.compare(
+            RecordConfig(stereo=self.stereo),
+            contract.D455.scaled(self.camera_scale),
+            self.real,
+            per_object=self.scenes,
+            frames=self.frames,
+            seed=self.seed,
+            progress=Progress(name="sensors compare"),
+        )
+        compare.print_tables(result)
+        print(*compare.write(result, self.out), sep="\n")

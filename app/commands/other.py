@@ -1,0 +1,99 @@
+"""ddgrasp weights, objects, report."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from ddgrasp import artifacts, contract
+
+
+@dataclass(frozen=True)
+class WeightsConvert:
+    """Convert a published checkpoint (.pth, .safetensors) of a depth network, ResNet-18 or FID Inception."""
+
+    file: tyro.conf.Positional[Path]
+    """File as `ddgrasp weights list` names it; what is pickled in it is not run."""
+    out: Path = Path("weights")
+    """Folder of converted weights; each network gets a folder in it."""
+    max_depth_m: float = 0.0
+    """Range of a metric depth model in metres (20 indoor, 80 outdoor); 0 for the relative ones."""
+
+    def run(self) -> None:
+        from foundation import store
+
+        directory = store.convert_file(self.file, self.out, self.max_depth_m)
+        manifest = store.read_manifest(directory)
+        print(
+            f"{directory}: {manifest.network}, {manifest.parameters:,} numbers\nLicence: {manifest.licence}"
+        )
+
+
+@dataclass(frozen=True)
+class WeightsList:
+    """List networks with published weights: where to get them, their licence, what is installed."""
+
+    out: Path = Path("weights")
+    """Folder of converted weights."""
+
+    def run(self) -> None:
+        from foundation import catalog, store
+
+        there = store.installed(self.out)
+        for name, entry in catalog.ENTRIES.items():
+            manifest = there.get(name)
+            state = (
+                f"installed in {self.out / name}, from {manifest.source_file}"
+                if manifest
+                else "not installed"
+            )
+            lines = {"file": entry.file, "published": entry.published, "licence": entry.licence}
+            lines |= {"used for": entry.used_for, "here": state}
+            print(name, *(f"  {title:<10} {text}" for title, text in lines.items()), "", sep="\n")
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write report.json and report.html of a run anew, and print the table."""
+
+    out: tyro.conf.Positional[Path]
+    """Directory of the run."""
+
+    def run(self) -> None:
+        from evaluation.report.stage import write_report
+        from evaluation.report.summary import print_summary
+
+        report = write_report(self.out)
+        print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
+        print_summary(report)
+
+
+@dataclass(frozen=True)
+class ObjectsList:
+    """Name the objects: category, size, mass, friction, where the numbers come from."""
+
+    def run(self) -> None:
+        from mjx_envs.objects import OBJECTS
+
+        for spec in OBJECTS.values():
+            size = " x ".join(f"{1000 * extent:.0f}" for extent in spec.extents_m())
+            numbers = f"{size:>14} mm {1000 * spec.mass_kg:>4.0f} g  friction {spec.friction}"
+            print(f"{spec.category_id:>2} {spec.name:<10} {numbers}  {spec.source}")
+
+
+@dataclass(frozen=True)
+class ObjectsSheet:
+    """Draw objects as a camera sees them, colour and depth, as one PNG."""
+
+    objects: tuple[str, ...] = ()
+    """Names; none draws all of them, those that the paper trains on first."""
+    out: Path = Path("objects.png")
+    """The picture's file."""
+
+    def run(self) -> None:
+        from evaluation.object_sheet import draw
+        from mjx_envs.objects import OBJECTS
+
+        everything = tuple(dict.fromkeys((*contract.SEEN_OBJECTS, *contract.UNSEEN_OBJECTS, *OBJECTS)))
+        artifacts.atomic_write_bytes(self.out, draw(self.objects or everything))
+        print(self.out)

@@ -1,0 +1,119 @@
+"""ddgrasp ddg score, curve, samplers, features: how real generated depth is."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from app import pipeline
+from app.commands.base import load_config
+from app.commands.checks import check_config_values
+from ddgrasp import artifacts
+from ddgrasp.config import DDGConfig, DepthFeatureConfig, ScoreConfig
+from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
+from ddgrasp.stages import get_stage
+
+
+@dataclass(frozen=True)
+class Scoring:
+    score: Annotated[ScoreConfig, tyro.conf.arg(name="")]
+    """How to score; the rest of the configuration is the run's own."""
+    preset: str
+    """Preset whose sizes to take."""
+    out: Path
+    """Directory of the result, a folder in it; usually the run's."""
+    run_dir: Path | None = None
+    """Run whose teacher and generator to use; none takes --out."""
+    seed: int = 0
+    """Of trajectories, noise and resampling."""
+    resume: bool = False
+    """Continue what is there."""
+
+    def _make(self, stage_name: str) -> None:
+        """Makes the stage from the run's own parts, and prints its table."""
+        from evaluation.depth_score.page import print_result
+
+        stage, source = get_stage(stage_name), self.run_dir or self.out
+        config = replace(load_config(source, "ddg"), score=self.score, seed=self.seed)
+        parents = {name: artifacts.read_artifact(source / name) for name in stage.parents}
+        pipeline.make(stage, config, self.out, resume=self.resume, parents=parents)
+        print_result(self.out / stage_name)
+
+
+@dataclass(frozen=True)
+class DDGScore(Scoring):
+    """Compare generated depth with recorded depth: the paper's Table I, hole measures, t-SNE."""
+
+    ddg: DDGConfig = DDGConfig()
+    """Generator that --real fits; its rows are those of the recordings."""
+    real: Path | None = None
+    """Recordings of a real camera: fits the preset's generator on the first frames and scores it on the last,
+    instead of the rig; no run is needed."""
+    fit_frames: int = 80
+    """Frames that --real is fitted on."""
+    score_frames: int = 40
+    """Frames that --real is scored on, the last ones."""
+
+    def run(self) -> None:
+        if self.real is None:
+            self._refuse_options_of_real()
+            self._make("score")
+            return
+        from evaluation.depth_score.page import print_result
+        from evaluation.depth_score.real import real_config
+
+        if self.run_dir is not None:
+            raise UserError(
+                f"--run-dir {self.run_dir} with --real: the generator is fitted on the first frames, none is "
+                "taken from a run; leave one of them out."
+            )
+        preset = replace(get_preset(self.preset), ddg=self.ddg, score=self.score, seed=self.seed)
+        config = real_config(check_config_values(preset), self.real)
+        stage = get_stage("score_real")
+        inputs = {"data": self.real, "fit_frames": self.fit_frames, "score_frames": self.score_frames}
+        pipeline.make(stage, config, self.out, resume=self.resume, inputs=inputs)
+        print_result(self.out / stage.name)
+
+    def _refuse_options_of_real(self) -> None:
+        usual = DDGScore(self.score, self.preset, self.out, ddg=get_preset(self.preset).ddg)
+        for name in ("ddg", "fit_frames", "score_frames"):
+            if getattr(self, name) != getattr(usual, name):
+                option = "--ddg.*" if name == "ddg" else f"--{name.replace('_', '-')}"
+                raise UserError(
+                    f"{option} without --real: the generator of {self.run_dir or self.out} is scored as it "
+                    "is; give --real, or fit another one with `ddgrasp ddg fit`."
+                )
+
+
+@dataclass(frozen=True)
+class DDGCurve(Scoring):
+    """Fit and score the generator on 5, 10, 20, ... recorded trajectories: the data-efficiency curve."""
+
+    def run(self) -> None:
+        self._make("curve")
+
+
+@dataclass(frozen=True)
+class DDGSamplers(Scoring):
+    """Score every sampler of the generator: what fewer network evaluations cost, and frames per second."""
+
+    def run(self) -> None:
+        self._make("samplers")
+
+
+@dataclass(frozen=True)
+class DDGFeatures:
+    """Train the depth feature extractor that scores use; the frozen one is part of the repository."""
+
+    config: Annotated[DepthFeatureConfig, tyro.conf.arg(name="")] = DepthFeatureConfig()
+    out: Path = Path("runs") / "depthfeat"
+    """Folder of the extractor; the same command continues what was begun there."""
+
+    def run(self) -> None:
+        from foundation.depth_feature_training import train
+
+        manifest = train(self.config, self.out)
+        print(json.dumps(manifest["tested_on_new_cameras"], indent=2))

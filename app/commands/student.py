@@ -1,0 +1,92 @@
+"""ddgrasp student, export, deploy: the policy."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from app.commands.base import DEFAULT_PRESET, OneStage, load_config
+from app.commands.checks import check_count
+from ddgrasp import artifacts
+from ddgrasp.config import Config
+from ddgrasp.presets import get_preset
+
+
+@dataclass(frozen=True)
+class StudentTrain(OneStage):
+    """Train the depth-only student on noisy demonstrations."""
+
+    stage = "student"
+
+
+@dataclass(frozen=True)
+class StudentEval:
+    """Measure a trained student again, closed loop in simulation: clean and generated depth, same seeds."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run."""
+    trials: int = 200
+    """Episodes per kind of depth."""
+    seed: int = 1
+    """Of the episodes."""
+
+    def run(self) -> None:
+        from ddg_jax.sample import Generator
+        from ddgrasp.progress import Progress
+        from evaluation import wilson
+        from ppo.policy import load_policy
+        from student_jax.evaluate import closed_loop
+        from student_jax.policy import PARAMS_FILE
+
+        check_count("--trials", self.trials)
+        config = load_config(self.run_dir, "student")
+        evaluation = replace(config.evaluation, student_trials=self.trials)
+        config = replace(config, seed=self.seed, evaluation=evaluation)
+        params = artifacts.load_params(self.run_dir / "student" / PARAMS_FILE)
+        generator = Generator.load(self.run_dir / "ddg")
+        teacher = load_policy(self.run_dir / "teacher")
+        result = closed_loop(config, teacher, generator, params, Progress(name="student eval"))
+        for name, counts in result.items():
+            success = counts["success"]
+            print(f"{name:<14} {wilson.describe(wilson.success(success['successes'], success['n']))}")
+
+
+@dataclass(frozen=True)
+class Export(OneStage):
+    """Write the student as one ONNX file and check it against JAX."""
+
+    stage = "export"
+
+
+@dataclass(frozen=True)
+class Deploy:
+    """Run an exported policy on a robot and a camera at 10 Hz."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    """Without --preset: the configuration of the run that the policy lies in."""
+    policy: Path
+    """ONNX file that `ddgrasp export` wrote."""
+    robot: str = "sim"
+    """sim (the pseudo-real rig) or franka."""
+    camera: str = "stereo"
+    """stereo (the rig's own), realsense, or replay (a recording)."""
+    recording: Path | None = None
+    """Recording for camera replay."""
+    object_name: str = ""
+    """Object on the rig's table; empty takes the first configured one."""
+    seconds: float = 6.0
+    """How long to run; inf runs until Ctrl-C."""
+
+    def run(self) -> None:
+        from deploy.session import SessionOptions, deploy, describe
+
+        options = SessionOptions(self.robot, self.camera, self.recording, self.object_name, self.seconds)
+        print(describe(deploy(self.config, self.policy, options)))
+
+
+def config_of(policy: Path, preset: str | None) -> Config:
+    """The named preset; else what made the artefact beside `policy`; else the default preset."""
+    if preset is None and artifacts.is_finished(policy.parent):
+        return artifacts.config_from_json(artifacts.read_manifest(policy.parent).config)
+    return get_preset(preset or DEFAULT_PRESET)

@@ -1,0 +1,112 @@
+"""ddgrasp teacher ..."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from app import pipeline
+from app.commands.base import DEFAULT_PRESET, OneStage, load_config
+from app.commands.checks import check_config_values, check_count, check_devices, check_objects
+from ddgrasp import artifacts
+from ddgrasp.config import HostsConfig, WorldConfig
+from ddgrasp.presets import get_preset
+from ddgrasp.stages import get_stage
+
+
+@dataclass(frozen=True)
+class TeacherTrain(OneStage):
+    """Train the privileged teacher by PPO, on every device there is, on one host or several."""
+
+    hosts: HostsConfig = field(default_factory=HostsConfig)
+    """Several hosts: start the same command on each, with an --out that all of them share."""
+
+    stage = "teacher"
+
+    def run(self) -> None:
+        from ppo import hosts
+
+        hosts.connect(self.hosts)
+        check_config_values(self.config)
+        check_devices(self.config, self.out)
+        stage = get_stage(self.stage)
+        pipeline.make(stage, self.config, self.out, resume=self.resume, leads=hosts.leads())
+
+
+@dataclass(frozen=True)
+class TeacherEval:
+    """Measure a trained teacher again, per object: success, motion, what the camera sees, a contact sheet."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run, or pretrained folder."""
+    world: WorldConfig
+    """Objects, seen or not, and randomisation; by default those that the teacher was trained on."""
+    trials: int = 200
+    """Episodes of each object."""
+    watched: int = 8
+    """How many of them are drawn, to count the object's visible pixels."""
+    seed: int = 0
+    """Of the episodes."""
+    out: Path | None = None
+    """Where trials.json and pictures/episodes.png go; by default beside the teacher, for the report."""
+
+    def run(self) -> None:
+        from ddgrasp.progress import Progress
+        from evaluation import teacher_trials
+        from mjx_envs.grasp_env import GraspEnv
+        from ppo import trials
+        from ppo.policy import load_policy
+        from ppo.visible import MOMENTS
+
+        check_count("--trials", self.trials)
+        check_count("--watched", self.watched)
+        check_objects(self.world)
+        directory = self.run_dir / "teacher"
+        teacher = artifacts.read_artifact(directory).hash
+        env, policy = GraspEnv(self.world), load_policy(directory)
+        progress = Progress(name="teacher eval")
+        result, pictures = trials.measure(env, policy, self.trials, self.watched, self.seed, progress)
+        summary = teacher_trials.summarise(result, teacher, self.world, self.seed)
+        teacher_trials.print_summary(summary)
+        for path in teacher_trials.save(self.out or directory, summary, pictures, MOMENTS):
+            print(path)
+
+
+@dataclass(frozen=True)
+class TeacherCompare:
+    """Measure a trained teacher on several physics backends; the run's report shows what it loses."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run."""
+    backends: tuple[str, ...] = ("cpu", "jax")
+    """Physics backends: cpu, jax, warp."""
+    trials: int | None = None
+    """Episodes per backend; by default 1000, on jax 200 (without a GPU it compiles for minutes)."""
+    seed: int = 0
+    """Of the episodes."""
+
+    def run(self) -> None:
+        if self.trials is not None:
+            check_count("--trials", self.trials)
+        from evaluation import backends as measured
+        from evaluation import wilson
+        from ppo.backends import evaluate_backends
+        from ppo.policy import load_policy
+
+        config = load_config(self.run_dir, "teacher")
+        directory, results = self.run_dir / "teacher", {}
+        policy = load_policy(directory)
+        for name, result in evaluate_backends(config.world, policy, self.backends, self.trials, self.seed):
+            success = wilson.success(result["success"]["successes"], result["success"]["n"])
+            print(f"{name:<6} {wilson.describe(success)}", flush=True)
+            results[name] = result
+            measured.save(directory, results, self.seed)
+        print(f"{directory / measured.BACKENDS_FILE}: `ddgrasp report {self.run_dir}` shows it.")
+
+
+def with_world_of(run_dir: Path | None) -> TeacherEval:
+    """The command with the world of the run in `run_dir`, where there is one."""
+    run_dir = run_dir or Path("runs") / DEFAULT_PRESET
+    there = artifacts.is_finished(run_dir / "teacher")
+    config = load_config(run_dir, "teacher") if there else get_preset(DEFAULT_PRESET)
+    return TeacherEval(run_dir=run_dir, world=config.world)

@@ -1,0 +1,190 @@
+"""The whole flow on one page: runs stages in order, refuses or resumes, and survives Ctrl-C.
+
+Which stages there are says `ddgrasp/stages.py`. Every stage is a module with
+
+    run(job: Job) -> Artifact
+
+It works in `job.directory` and ends with `job.finish`. Modules are imported when their turn comes, so that
+`--help` needs none of them.
+"""
+
+import errno
+import gc
+import importlib
+import signal
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.job import Job
+from ddgrasp.progress import Progress
+from ddgrasp.stages import STAGES, Stage
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+_REPEAT_S = 0.5
+_SOON_S = 0.001
+_NO_SUCH_PLACE = (
+    errno.EEXIST, errno.ENOTDIR, errno.ENOENT, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL,
+)  # fmt: skip
+
+
+def run(
+    config: Config, run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES, quiet: bool = False
+) -> dict[str, Any]:
+    """Makes every stage that is not finished, then writes the report; returns what report.json holds.
+
+    Raises UserError if `run_dir` holds a run and `resume` is off, or holds one of another configuration.
+    """
+    if not resume:
+        _refuse_occupied(run_dir, [stage.name for stage in stages])
+    for stage in stages:
+        make(stage, config, run_dir, resume=resume, quiet=quiet)
+    return importlib.import_module("evaluation.report.stage").write_report(run_dir)
+
+
+def make(
+    stage: Stage,
+    config: Config,
+    run_dir: Path,
+    *,
+    resume: bool,
+    parents: Mapping[str, Artifact] | None = None,
+    inputs: Mapping[str, Any] | None = None,
+    quiet: bool = False,
+    leads: bool = True,
+) -> Artifact:
+    """Makes the stage in `run_dir / stage.name`, or returns the finished one if `resume` is on.
+
+    Args:
+      parents: what it is made from; by default the finished stages in `run_dir` that its row names.
+      inputs: material from outside the run (`Job.inputs`). An attempt with other inputs is not continued.
+      leads: off in all but the first of several processes that make the stage together: they keep quiet and
+        write nothing.
+    """
+    if parents is None:
+        parents = {name: artifacts.require(run_dir, name, config) for name in stage.parents}
+    directory = run_dir / stage.name
+    _create(directory)
+    if not resume:
+        _refuse_occupied(run_dir, [stage.name])
+    progress = Progress(directory if leads else None, stage.name, quiet=quiet or not leads)
+    job = Job(stage, config, directory, progress, parents, inputs or {})
+    if artifacts.is_finished(directory):
+        artifact = artifacts.read_artifact(directory)
+        artifacts.check_config(artifact, config)
+        progress.note(f"finished before ({artifact.manifest.seconds:.0f} s, {artifact.manifest.origin})")
+    else:
+        artifact = _work(job, leads)
+    _check_parents(artifact, parents)
+    return artifact
+
+
+def _work(job: Job, leads: bool) -> Artifact:
+    progress = job.progress
+    progress.note(f"-> {job.directory}: {job.stage.makes}")
+    artifacts.begin(job.directory, job.stage.name, job.config, job.identity(), write=leads)
+    with _interruptible(job.stage.name):
+        try:
+            artifact = importlib.import_module(job.stage.module).run(job)
+        finally:
+            progress.close()
+    progress.note(f"finished in {artifact.manifest.seconds:.0f} s ({artifact.manifest.origin})")
+    return artifact
+
+
+def _create(directory: Path) -> None:
+    """UserError if `directory` is or lies below a file, or cannot exist."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if error.errno not in _NO_SUCH_PLACE:
+            raise
+        raise UserError(f"{directory} cannot be created ({error.strerror}): choose another --out.") from None
+
+
+def _refuse_occupied(run_dir: Path, names: Sequence[str]) -> None:
+    for name in names:
+        directory = run_dir / name
+        if artifacts.is_finished(directory):
+            raise UserError(
+                f"{directory} holds a finished stage: continue with --resume, or choose another --out."
+            )
+        if artifacts.has_work(directory):
+            raise UserError(
+                f"{directory} holds an unfinished stage: continue with --resume, or choose another --out."
+            )
+
+
+def _check_parents(artifact: Artifact, parents: Mapping[str, Artifact]) -> None:
+    for name, parent in parents.items():
+        made_from = artifact.manifest.parents.get(name, parent.hash)
+        if made_from != parent.hash:
+            raise UserError(
+                f"{artifact.directory} was made from another {name} ({made_from}; {parent.directory} is now "
+                f"{parent.hash}): delete {artifact.directory} to make it again, or choose another --out."
+            )
+
+
+@contextmanager
+def _interruptible(name: str) -> Iterator[None]:
+    """Turns Ctrl-C and SIGTERM into KeyboardInterrupt with a message, wherever in the stage they arrive.
+
+    A KeyboardInterrupt raised inside a JAX host callback surfaces as some other error; the flag tells. Raised
+    in a destructor it is dropped, and in the garbage collector's callbacks (JAX has one), where it would be
+    too, it is put off: a timer repeats it until it surfaces.
+    """
+    arrived = False
+
+    def interrupt(signum, frame):
+        nonlocal arrived
+        if signum == signal.SIGALRM and _is_unwinding():
+            return
+        arrived = True
+        put_off = _in_gc_callback(frame)
+        signal.setitimer(signal.ITIMER_REAL, _SOON_S if put_off else _REPEAT_S, _REPEAT_S)
+        if not put_off:
+            raise KeyboardInterrupt
+
+    try:
+        previous = {number: signal.signal(number, interrupt) for number in _SIGNALS}
+    except ValueError:  # not in the main thread: signals are someone else's
+        previous = {}
+    message = f"Interrupted in stage {name!r}. Finished work is kept: the same command with --resume goes on."
+    try:
+        yield
+        if arrived:
+            raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(message) from None
+    except Exception:
+        if arrived:
+            raise KeyboardInterrupt(message) from None
+        raise
+    finally:
+        if arrived:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _is_unwinding() -> bool:
+    """Whether a KeyboardInterrupt is being handled right now: cleaning up is not to be disturbed."""
+    error = sys.exception()
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
+
+
+def _in_gc_callback(frame: FrameType | None) -> bool:
+    """Whether `frame` runs in a callback of the garbage collector, from where no exception gets out."""
+    codes = {getattr(callback, "__code__", None) for callback in gc.callbacks}
+    while frame is not None and frame.f_code not in codes:
+        frame = frame.f_back
+    return frame is not None

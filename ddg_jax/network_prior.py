@@ -1,0 +1,118 @@
+"""The geometric prior c from a pretrained depth network on RGB: the paper's own choice (III-B1).
+
+What the paper leaves open is c in simulation. Both readings are here (`DDGConfig.prior_in_sim`): the network
+on simulated RGB, or simulated depth itself, inverted and normalised as the network's output is.
+"""
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ddg_jax.inverse_depth import invert, normalise
+from ddgrasp.config import DDGConfig
+from ddgrasp.errors import UserError, unknown_name
+from foundation import catalog, store
+from foundation.long_video import fit_scale_shift
+
+NETWORKS = (catalog.VIDEO_DEPTH, catalog.IMAGE_DEPTH)
+IN_SIMULATION = ("depth", "rgb")
+_BATCH = 8
+"""Pictures that the image network is given together."""
+
+
+def weights_folder(config: DDGConfig) -> Path:
+    """Where the network's converted weights are looked for."""
+    return Path(config.prior_weights or store.WEIGHTS_DIR / f"{config.prior}_small")
+
+
+class DepthNetworkPrior:
+    """c = affine-normalised output of Video Depth Anything or Depth Anything V2. See `Prior`."""
+
+    needs_rgb = True
+
+    def __init__(self, config: DDGConfig):
+        if config.prior_in_sim not in IN_SIMULATION:
+            raise unknown_name("ddg.prior_in_sim", config.prior_in_sim, IN_SIMULATION)
+        self.name, self._config = config.prior, config
+        self.needs_sim_rgb = config.prior_in_sim == "rgb"
+        self._directory = weights_folder(config)
+        manifest = store.read_manifest(self._directory)
+        if not manifest.network.startswith(config.prior):
+            raise UserError(f"{self._directory} holds {manifest.network}; ddg.prior is {config.prior}.")
+        if manifest.max_depth_m:
+            raise UserError(f"{self._directory} holds a metric model; the prior is relative inverse depth.")
+        self.source: str | dict[str, str] = manifest.summary() | {"in_simulation": config.prior_in_sim}
+
+    def from_recording(
+        self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator
+    ) -> np.ndarray:
+        """See `Prior`; depth gives the size only."""
+        del rng
+        return self._from_rgb(rgb, depth_m.shape[1:])
+
+    def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None = None) -> np.ndarray:
+        """See `Prior`."""
+        if self._config.prior_in_sim == "depth":
+            return normalise(invert(depth_m))
+        return self._from_rgb(rgb, depth_m.shape[1:])
+
+    def _from_rgb(self, rgb: np.ndarray | None, size: tuple[int, ...]) -> np.ndarray:
+        if rgb is None:
+            raise UserError(
+                f"ddg.prior {self.name} was given no RGB: keep it, or set ddg.prior_in_sim depth."
+            )
+        return normalise(np.stack([at_size(frame, (size[0], size[1])) for frame in self._infer(rgb)]))
+
+    @cached_property
+    def _infer(self) -> Callable[[np.ndarray], np.ndarray]:
+        """(T, h, w, 3) uint8 -> (T, h, w) relative inverse depth; loads the weights when first used."""
+        from foundation.convert import depth_network
+        from foundation.depth import predict
+        from foundation.video import stream
+
+        manifest, variables = store.load(self._directory, NETWORKS)
+        network = depth_network(manifest.network, dtype=self._config.prior_dtype)
+        params, side = variables["params"], self._config.prior_input_px
+
+        def video(rgb: np.ndarray) -> np.ndarray:
+            if len(rgb) == 1:  # a frame by itself needs no window of 32
+                return np.asarray(predict(network, params, rgb[None], side))[0]
+            return np.stack(list(stream(network, params, rgb, side)))
+
+        def pictures(rgb: np.ndarray) -> np.ndarray:
+            parts = [rgb[start : start + _BATCH] for start in range(0, len(rgb), _BATCH)]
+            filled = [np.concatenate([part, np.repeat(part[-1:], _BATCH - len(part), 0)]) for part in parts]
+            return np.concatenate([np.asarray(predict(network, params, f, side)) for f in filled])[: len(rgb)]
+
+        return video if network.video else pictures
+
+
+def at_size(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) -> `size`, averaged after a centred crop to its aspect ratio: the part of the scene that depth
+    resized by `ddg_jax.data.resize_nearest` shows.
+    """
+    height, width = image.shape
+    scale = min(height / size[0], width / size[1])
+    rows, columns = round(size[0] * scale), round(size[1] * scale)
+    top, left = (height - rows) // 2, (width - columns) // 2
+    cropped = np.ascontiguousarray(image[top : top + rows, left : left + columns])
+    mode = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
+    return cv2.resize(cropped, size[::-1], interpolation=mode)
+
+
+def metric_depth(relative: np.ndarray, depth_m: np.ndarray, far_m: float) -> np.ndarray:
+    """The monocular baseline: depth in metres from relative inverse depth, fitted to what a camera measured.
+
+    1 / d = a relative + b by least squares over the valid pixels (Ranftl et al. 2020, eq. 4), d <= `far_m`.
+
+    Args:
+      relative, depth_m: of one shape; depth 0 = invalid. UserError if fewer than two pixels are valid.
+    """
+    valid = depth_m > 0
+    if np.count_nonzero(valid) < 2:
+        raise UserError("Relative depth cannot be made metric: the measured depth has no two valid pixels.")
+    scale, shift = fit_scale_shift(relative[valid], 1 / depth_m[valid])
+    return (1 / np.maximum(scale * relative + shift, 1 / far_m)).astype(np.float32)

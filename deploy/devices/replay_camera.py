@@ -1,0 +1,50 @@
+"""A recording played back as a camera, at the pace of the loop's clock."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ddgrasp import contract
+from deploy.interfaces import Clock, Frame
+
+if TYPE_CHECKING:
+    from sensors.recordings.recording import Recording
+
+
+class ReplayCamera:
+    """Frame i is shown from i * period_s after the start; past the end the last one stays (and goes stale).
+
+    `period_s` is the time between two recorded frames.
+    """
+
+    def __init__(self, recording: "Recording", clock: Clock, period_s: float = contract.CONTROL_DT_S):
+        self._recording, self._clock, self._period_s = recording, clock, period_s
+        self._start_s: float | None = None
+        self._shown = -1
+        self._frame: Frame | None = None
+
+    @classmethod
+    def open(cls, path: Path, clock: Clock, period_s: float = contract.CONTROL_DT_S) -> "ReplayCamera":
+        """Play the recording in `path`; UserError if there is none."""
+        from sensors.recordings.recording import Recording
+
+        return cls(Recording.open(path), clock, period_s)
+
+    def __len__(self) -> int:
+        return len(self._recording)
+
+    def start(self) -> None:
+        if self._start_s is None:
+            self._start_s = self._clock.now()
+
+    def read(self) -> Frame:
+        self.start()
+        assert self._start_s is not None
+        elapsed = int((self._clock.now() - self._start_s) / self._period_s + 1e-6)
+        index = min(elapsed, len(self._recording) - 1)
+        if self._frame is None or index != self._shown:
+            self._shown = index
+            self._frame = Frame(self._recording.depth_mm(index), self._start_s + index * self._period_s)
+        return self._frame
+
+    def stop(self) -> None:
+        """Nothing to close."""

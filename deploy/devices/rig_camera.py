@@ -1,0 +1,47 @@
+"""The rig's active-stereo camera as a camera driver."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from deploy.interfaces import Frame
+
+if TYPE_CHECKING:
+    from rig.camera import RigCamera
+    from rig.world import RigWorld
+
+
+class StereoCamera:
+    """Looks at a `RigWorld` through a simulated active-stereo camera: uint16 millimetres, 0 = invalid."""
+
+    def __init__(
+        self,
+        world: "RigWorld",
+        camera: "RigCamera",
+        T_world_cam: np.ndarray,
+        rng: np.random.Generator,
+        catch_up: Callable[[], float],
+        object_name: str = "",
+    ):
+        """`catch_up` moves the world to now and returns the moment it shows (`SimRobot.catch_up`)."""
+        self._world, self._camera, self._T_world_cam = world, camera, T_world_cam
+        self._rng, self._catch_up, self._object_name = rng, catch_up, object_name
+        self._frame: Frame | None = None
+
+    def start(self) -> None:
+        """Nothing to open."""
+
+    def read(self) -> Frame:
+        timestamp_s = self._catch_up()
+        if self._frame is None or timestamp_s > self._frame.timestamp_s:
+            depth = self._camera.depth_mm(self._world.data, self._T_world_cam, self._rng, self._object_name)
+            self._frame = Frame(depth, timestamp_s)
+        return self._frame
+
+    def stop(self) -> None:
+        """Nothing to close."""
+
+    def picture(self) -> np.ndarray:
+        """(H, W, 3) uint8 colour picture of the scene as it stands, from the same place (for people)."""
+        return self._camera.rgb(self._world.data, self._T_world_cam)

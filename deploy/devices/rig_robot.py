@@ -1,0 +1,63 @@
+"""The Franka of the pseudo-real rig as a robot driver: MuJoCo's C engine, advanced by the loop's clock."""
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ddgrasp import contract
+from deploy.interfaces import Clock, RobotState
+
+if TYPE_CHECKING:
+    from rig.world import RigWorld
+
+_EARLY_S = 1e-6
+"""Clock readings this much before a period's end count as its end (rounding)."""
+
+
+class SimRobot:
+    """Drives a `RigWorld`. The world lives in whole control periods: whoever looks at it first in a
+    period (camera or joints) moves it to that period's start, so one period passes between two
+    looks on the simulated clock, and as many as really passed on the real one.
+    """
+
+    def __init__(self, world: "RigWorld", clock: Clock, period_s: float = contract.CONTROL_DT_S):
+        self.world = world
+        self._clock, self._period_s = clock, period_s
+        self._start_s: float | None = None
+        self._periods = 0
+        self._close, self._holding = False, False
+
+    def start(self) -> None:
+        """World time starts to follow the clock (at the first look, if that comes before)."""
+        if self._start_s is None:
+            self._start_s = self._clock.now()
+
+    def read_state(self) -> RobotState:
+        now_s = self.catch_up()
+        q, width_m = self.world.state()
+        return RobotState(np.asarray(q, float), float(width_m), now_s)
+
+    def command(self, q_target_rad: np.ndarray, close: bool) -> None:
+        self.world.command(q_target_rad, close)
+        self._close, self._holding = close, False
+
+    def hold(self) -> None:
+        if not self._holding:  # once: measuring again and again would sag under load
+            q, _ = self.world.state()
+            self.world.command(np.asarray(q, float), self._close)
+        self._holding = True
+
+    def stop(self) -> None:
+        """Nothing to disconnect; the world keeps its state for whoever asks about success."""
+
+    def catch_up(self) -> float:
+        """Move the world to the start of the current period; returns that moment on the clock."""
+        self.start()
+        assert self._start_s is not None
+        elapsed_s = self._clock.now() - self._start_s
+        periods = math.floor((elapsed_s + _EARLY_S) / self._period_s)
+        if periods > self._periods:
+            self.world.step((periods - self._periods) * self._period_s)
+            self._periods = periods
+        return self._start_s + periods * self._period_s

@@ -1,0 +1,218 @@
+"""Trials of an exported policy in the pseudo-real rig, through the very loop that would drive a robot."""
+
+import os
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddgrasp.config import Config
+from deploy.clock import RealClock, SimClock
+from deploy.devices.rig_camera import StereoCamera
+from deploy.devices.rig_robot import SimRobot
+from deploy.loop import ControlLoop, LoopReport, Step
+from deploy.policy import OnnxPolicy
+from deploy.setup import loop_settings, safety_filter
+from rig.film import Film
+
+_STREAM = 0x526967
+"""Keeps the trials' random numbers apart from every other stage's ("Rig")."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One episode to run."""
+
+    index: int
+    object_name: str
+    realtime: bool = False
+    """Against the machine's clock instead of the simulated one."""
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """What came of a trial; plain values, one line of trials.jsonl."""
+
+    index: int
+    object_name: str
+    realtime: bool
+    success: bool
+    steps: int
+    holds: int
+    missed_deadlines: int
+    safety: dict[str, int]
+    events: list[str]
+    sense_s: list[float]
+    infer_s: list[float]
+    act_s: list[float]
+    latency_s: list[float]
+    period_s: list[float]
+
+    @property
+    def key(self) -> tuple[int, bool]:
+        """Identifies the trial."""
+        return self.index, self.realtime
+
+
+def plan(config: Config) -> list[Trial]:
+    """Simulated-clock trials with the objects in turn, then a few on the real clock."""
+    names = config.world.objects
+    simulated = [Trial(i, names[i % len(names)]) for i in range(config.evaluation.rig_trials)]
+    real = [Trial(i, names[i % len(names)], True) for i in range(config.deploy.realtime_trials)]
+    return simulated + real
+
+
+class Rig:
+    """World, camera and policy, built once and used for one trial after the other."""
+
+    def __init__(self, config: Config, policy_path: Path):
+        import cv2
+
+        from rig.camera import RigCamera
+        from rig.world import RigWorld
+
+        cv2.setNumThreads(1)
+        self._config = config
+        self._policy = OnnxPolicy(
+            policy_path, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None
+        )
+        self._world = RigWorld(config.world.objects, randomise=True, random=config.world.random)
+        self._camera = RigCamera(self._world.model, config.record.stereo, config.world.profile)
+
+    def run(self, trial: Trial) -> tuple[TrialResult, Film]:
+        """Run one trial. The same trial gives the same result on the simulated clock."""
+        config = self._config
+        rng = np.random.default_rng([config.seed, _STREAM, trial.index])
+        self._world.reset(int(rng.integers(2**31)), trial.object_name)
+        self._policy.reset(int(rng.integers(2**31)))
+        clock = RealClock() if trial.realtime else SimClock()
+        settings = loop_settings(config.deploy, self._policy.info)
+        robot = SimRobot(self._world, clock, settings.period_s)
+        camera = StereoCamera(
+            self._world, self._camera, camera_pose(config, rng), rng, robot.catch_up, trial.object_name
+        )
+        safety = safety_filter(config.deploy, self._policy.info)
+        loop = ControlLoop(camera, robot, self._policy, safety, clock, settings)
+        filming = _Filming(camera, config.deploy.film_every)
+        # Drawing for people takes the time of a period: not while time is measured.
+        report = loop.run(config.world.episode_steps, None if trial.realtime else filming.look)
+        if report.interrupted:
+            raise KeyboardInterrupt
+        robot.catch_up()
+        return _result(trial, bool(self._world.success()), report), filming.film()
+
+
+def run_trials(
+    config: Config, policy_path: Path, trials: Sequence[Trial], workers: int
+) -> Iterator[tuple[TrialResult, Film]]:
+    """Results of `trials` as they come, from `workers` fresh processes (0: all in this one)."""
+    if not trials:
+        return
+    if workers == 0:
+        rig = Rig(config, policy_path)
+        for trial in trials:
+            yield rig.run(trial)
+        return
+    executor = ProcessPoolExecutor(
+        min(workers, len(trials)),
+        mp_context=get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(config, policy_path, os.getpid()),
+    )
+    try:
+        for future in as_completed([executor.submit(_run_in_worker, trial) for trial in trials]):
+            yield future.result()
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+def camera_pose(config: Config, rng: np.random.Generator) -> np.ndarray:
+    """(4, 4) T_world_cam of one trial: the nominal place within the calibration error trained for."""
+    from mjx_envs.camera import nominal_camera
+
+    spread = config.world.random
+    T_world_cam = nominal_camera(config.world.profile).T_world_cam.copy()
+    T_world_cam[:3, 3] += rng.uniform(-1, 1, 3) * spread.camera_position_m
+    T_world_cam[:3, :3] = T_world_cam[:3, :3] @ _rotation(rng.uniform(-1, 1, 3) * spread.camera_angle_rad)
+    return T_world_cam
+
+
+class _Filming:
+    """Collects a picture every few steps."""
+
+    def __init__(self, camera: StereoCamera, every: int):
+        self._camera, self._every = camera, every
+        self._columns: list[tuple[int, np.ndarray, np.ndarray]] = []
+
+    def look(self, step: Step) -> None:
+        if step.index % self._every == 0 and step.frame is not None:
+            self._columns.append((step.index, self._camera.picture(), step.frame.depth))
+
+    def film(self) -> Film:
+        if not self._columns:
+            return Film((), np.zeros((0, 0, 0, 3), np.uint8), np.zeros((0, 0, 0), np.uint16))
+        steps, rgb, depth = zip(*self._columns, strict=True)
+        return Film(steps, np.stack(rgb), np.stack(depth))
+
+
+def _result(trial: Trial, success: bool, report: LoopReport) -> TrialResult:
+    timings = report.timings
+    seconds: dict[str, Any] = {
+        name: [round(value, 6) for value in getattr(timings, name)]
+        for name in ("sense_s", "infer_s", "act_s", "latency_s", "period_s")
+    }
+    return TrialResult(
+        **asdict(trial),
+        success=success,
+        steps=report.steps,
+        holds=report.holds,
+        missed_deadlines=timings.missed_deadlines,
+        safety=report.safety.as_dict(),
+        events=[str(event) for event in report.events],
+        **seconds,
+    )
+
+
+def _rotation(vector_rad: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation by |vector| about vector (Rodrigues)."""
+    angle = float(np.linalg.norm(vector_rad))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector_rad / angle
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+
+
+# --- worker processes --------------------------------------------------------------------------
+
+_rig: Rig | None = None
+_rig_of: tuple[Config, Path]
+
+
+def _start_worker(config: Config, policy_path: Path, parent: int) -> None:
+    """Leave Ctrl-C to the parent, and go when the parent has gone."""
+    import signal
+
+    global _rig_of
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+    _rig_of = config, policy_path
+
+
+def _leave_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
+
+
+def _run_in_worker(trial: Trial) -> tuple[TrialResult, Film]:
+    # The rig is built here, not in the initialiser, so that its errors reach the parent as they are.
+    global _rig
+    _rig = _rig or Rig(*_rig_of)
+    return _rig.run(trial)

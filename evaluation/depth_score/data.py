@@ -1,0 +1,233 @@
+"""Frames on which generated depth is scored: rig trajectories that no stage trains on, or a camera's frames.
+
+Two sides of different episodes. The real side gives depth as recorded. The simulated side gives clean
+geometry, on which every method draws its depth; what the camera itself would have recorded there is kept too:
+it is the real-vs-real floor, and the reference of paired measures. No method sees it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from ddgrasp import artifacts, contract
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from sensors.recordings.recording import Recording, find_recordings
+
+if TYPE_CHECKING:
+    from rig.camera import RigCamera
+    from rig.world import RigWorld
+
+REAL, SIM = SIDES = ("real", "sim")
+SEED_OFFSET = 1_000_000
+"""Added to a trajectory's number in its seed: far from the numbers of recorded trajectories."""
+BLOCK_FRAMES = 4
+"""Frames of one side that a real camera's stream is cut into: neighbours say the same, so blocks are
+resampled together."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Consecutive frames of one trajectory. Depth (T, H, W) uint16 millimetres, 0 = invalid / nothing there.
+
+    repeats_mm (K, H, W): the first frame sensed again and again, or K = 0.
+    """
+
+    side: str
+    number: int
+    """Unique among both sides."""
+    group: int
+    """Episodes that show the same scene share it: they are never told apart from each other."""
+    sensed_mm: np.ndarray
+    clean_mm: np.ndarray
+    repeats_mm: np.ndarray
+    rgb: np.ndarray | None
+    """(T, h, w, 3) uint8, if some method needs colour."""
+    focal_px: float
+    baseline_m: float
+
+    def repeated(self) -> "Episode":
+        """The episode of a world that stands still: the first frame, as often as it was sensed again."""
+        count = len(self.repeats_mm)
+        rgb = None if self.rgb is None else np.repeat(self.rgb[:1], count, 0)
+        clean = np.repeat(self.clean_mm[:1], count, 0)
+        return replace(self, sensed_mm=self.repeats_mm, clean_mm=clean, rgb=rgb)
+
+
+def metres(depth_mm: np.ndarray) -> np.ndarray:
+    """uint16 millimetres -> float32 metres."""
+    return depth_mm.astype(np.float32) * np.float32(contract.DEPTH_UNIT_M)
+
+
+def millimetres(depth_m: np.ndarray) -> np.ndarray:
+    """Metres -> uint16 millimetres, as a camera delivers them."""
+    return np.rint(np.clip(depth_m / contract.DEPTH_UNIT_M, 0, np.iinfo(np.uint16).max)).astype(np.uint16)
+
+
+# --- the rig -------------------------------------------------------------------------------------
+
+
+def record_rig(
+    config: Config, teacher: Path, directory: Path, with_rgb: bool, progress: Progress
+) -> list[Path]:
+    """Files of `config.score.trajectories` episodes per side, real first; those there already are kept.
+
+    teacher: directory of the finished teacher stage.
+    """
+    names = [
+        (side, directory / f"{side}_{i:04d}.npz") for side in SIDES for i in range(config.score.trajectories)
+    ]
+    missing = [file for _, file in names if not file.exists()]
+    record = _rig_recorder(config, teacher, with_rgb) if missing else None
+    with progress.task("rig trajectories", len(names)) as task:
+        task.start_at(len(names) - len(missing))
+        for number, (side, file) in enumerate(names):
+            if record is not None and not file.exists():
+                _save(file, record(side, number))
+                task.advance()
+    return [file for _, file in names]
+
+
+def _rig_recorder(config: Config, teacher: Path, with_rgb: bool) -> Callable[[str, int], Episode]:
+    from ppo import policy as teacher_policy
+    from rig.camera import RigCamera
+    from rig.world import RigWorld
+
+    policy = teacher_policy.load(teacher)
+    world = RigWorld(objects=config.world.objects, randomise=True)
+    camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+    return lambda side, number: _record(config, side, number, world, camera, policy, with_rgb)
+
+
+def _record(
+    config: Config, side: str, number: int, world: "RigWorld", camera: "RigCamera",
+    policy: Callable[[np.ndarray], np.ndarray], with_rgb: bool,
+) -> Episode:  # fmt: skip
+    from rig.camera import jittered_pose
+    from rig.stage import act
+
+    score = config.score
+    rng = np.random.default_rng([config.seed, SEED_OFFSET + number])
+    name = config.world.objects[number % len(config.world.objects)]
+    world.reset(int(rng.integers(2**31)), name)
+    T_world_cam = jittered_pose(config.record, rng)
+    for _ in range(rng.integers(max(1, config.record.frames - score.frames + 1))):
+        act(world, policy(world.observation()))
+    repeated = side == SIM and number - score.trajectories < score.repeat_scenes
+    repeats = [camera.depth_mm(world.data, T_world_cam, rng, name) for _ in range(repeated * score.repeats)]
+    sensed, clean, rgb = [], [], []
+    for _ in range(score.frames):
+        sensed.append(camera.depth_mm(world.data, T_world_cam, rng, name))
+        clean.append(_clean_mm(world, camera, T_world_cam))
+        if with_rgb:
+            rgb.append(camera.rgb(world.data, T_world_cam))
+        act(world, policy(world.observation()))
+    profile = config.world.profile
+    return Episode(
+        side, number, number, np.stack(sensed), np.stack(clean),
+        np.stack(repeats) if repeats else np.zeros((0, *sensed[0].shape), np.uint16),
+        np.stack(rgb) if rgb else None, profile.fx_px, profile.baseline_m,
+    )  # fmt: skip
+
+
+def _clean_mm(world: "RigWorld", camera: "RigCamera", T_world_cam: np.ndarray) -> np.ndarray:
+    """The simulator's own depth from the place of the left imager."""
+    from mjx_envs.render.raycast_numpy import render_depth
+    from rig.camera import FAR_M
+
+    return millimetres(render_depth(world.model, world.data, camera.stereo.camera(T_world_cam), far_m=FAR_M))
+
+
+def _save(file: Path, episode: Episode) -> None:
+    arrays: dict[str, Any] = {name: value for name, value in vars(episode).items() if value is not None}
+    with artifacts.atomic_path(file) as path:
+        np.savez_compressed(path, **arrays)
+
+
+def load_episode(file: Path) -> Episode:
+    """What `record_rig` wrote; UserError if the file is damaged."""
+    try:
+        with np.load(file) as arrays:
+            plain = {name: a.item() if a.ndim == 0 else a for name, a in arrays.items()}
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{file} is damaged ({error}): delete it and run again with --resume.") from None
+    return Episode(**{"rgb": None, **plain})
+
+
+# --- a real camera -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RealFrames:
+    """The last frames of a camera, in time order. depth_mm (N, H, W); rgb (N, h, w, 3); total: all frames."""
+
+    total: int
+    depth_mm: np.ndarray
+    rgb: np.ndarray
+    focal_px: float
+    baseline_m: float
+
+
+def real_size(root: Path, width_px: int) -> tuple[int, int]:
+    """(rows, columns) of the recordings at or below `root` brought to `width_px`.
+
+    Raises UserError for recordings of different sizes, or none.
+    """
+    return _size(_of_one_size(root)[0], width_px)
+
+
+def load_real(root: Path, width_px: int, last: int) -> RealFrames:
+    """The `last` frames of the recordings at or below `root`, at `width_px` (nearest neighbours).
+
+    Raises UserError for recordings of different sizes or of unknown optics, or none.
+    """
+    from ddg_jax.data import resize_nearest
+
+    recordings = _of_one_size(root)
+    focal_px, baseline_m = recordings[0].optics()
+    size = _size(recordings[0], width_px)
+    frames = [(r, i) for r in recordings for i in range(len(r))]
+    chosen = frames[-last:]
+    depth = np.stack([resize_nearest(r.depth_mm(i), size) for r, i in chosen])
+    rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
+    return RealFrames(len(frames), depth, rgb, focal_px * width_px / recordings[0].width_px, baseline_m)
+
+
+def _of_one_size(root: Path) -> list[Recording]:
+    recordings = find_recordings(root)
+    sizes = {(r.height_px, r.width_px) for r in recordings}
+    if len(sizes) > 1:
+        raise UserError(f"{root} holds recordings of different sizes {sorted(sizes)}: give one of them.")
+    return recordings
+
+
+def _size(recording: Recording, width_px: int) -> tuple[int, int]:
+    return round(recording.height_px * width_px / recording.width_px), width_px
+
+
+def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
+    """The frames as episodes: even ones are the real side, odd ones give the geometry.
+
+    Both sides see the same room, a frame apart: the distance between them is the sensor's alone.
+    """
+    from ddg_jax.data import PIECEWISE, surfaces
+
+    depth, rgb = frames.depth_mm, frames.rgb
+    clean = millimetres(surfaces(metres(depth), PIECEWISE))
+    episodes = []
+    for parity, side in enumerate(SIDES):
+        for block in range(len(depth) // (2 * BLOCK_FRAMES)):
+            rows = np.arange(BLOCK_FRAMES) * 2 + parity + block * 2 * BLOCK_FRAMES
+            episodes.append(
+                Episode(
+                    side, len(episodes), block, depth[rows], clean[rows],
+                    np.zeros((0, *depth.shape[1:]), np.uint16), rgb[rows] if with_rgb else None,
+                    frames.focal_px, frames.baseline_m,
+                )
+            )  # fmt: skip
+    return episodes

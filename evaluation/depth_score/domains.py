@@ -1,0 +1,201 @@
+"""The sets of depth maps that Table I compares, each a function of one episode; and the table's columns.
+
+A column compares two of them, as the paper does: most compare simulation with raw recorded depth, inpainting
+and the monocular network with recorded depth treated alike.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from ddgrasp import contract
+from ddgrasp.config import DextrahConfig, ScoreConfig
+from evaluation.depth_score.data import REAL, SIM, Episode, metres, millimetres
+
+if TYPE_CHECKING:
+    from ddg_jax.prior import Prior
+    from ddg_jax.sample import Generator
+
+RAW = "real_raw"
+FLOOR = "sim_sensed"
+"""What the camera recorded of the episodes whose geometry the methods get: the real-vs-real floor."""
+LIMIT = "sim_graft_limit"
+"""Exact simulated depth under the holes that the camera itself had there: what grafting of holes alone can
+reach at best, whatever the generator."""
+_REPEATS = 100_000
+"""Added to an episode's number where its world stands still: other noise than the moving episode's."""
+
+
+@dataclass(frozen=True)
+class Methods:
+    """What makes depth from an episode."""
+
+    config: ScoreConfig
+    seed: int
+    generator: "Generator"
+
+    @cached_property
+    def monocular(self) -> "Prior | None":
+        """The monocular network; None if no folder was named and the usual one is not there."""
+        from ddg_jax.network_prior import weights_folder
+        from ddg_jax.prior import make_prior
+
+        settings = replace(
+            self.generator.config,
+            prior=self.config.monocular,
+            prior_weights=self.config.monocular_weights,
+            prior_in_sim="rgb",
+        )
+        if not self.config.monocular_weights and not weights_folder(settings).exists():
+            return None
+        return make_prior(settings)
+
+    @property
+    def needs_rgb(self) -> bool:
+        """Whether episodes must bring colour."""
+        wanted = "monocular" in self.config.columns and self.monocular is not None
+        return wanted or self.generator.prior.needs_sim_rgb
+
+
+def sense(methods: Methods, episode: Episode, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Domain -> (T, H, W) uint16 millimetres, of those `names` that belong to the episode's side."""
+    made: dict[str, np.ndarray] = {}
+    for name in names:
+        domain = DOMAINS[name]
+        if domain.side == episode.side and name not in made:
+            made.update(domain.make(methods, episode))
+    return {name: made[name] for name in names if name in made}
+
+
+def sense_repeats(methods: Methods, episode: Episode, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The same for the episode's first scene, sensed again and again; {} if it was not."""
+    if not len(episode.repeats_mm):
+        return {}
+    still = episode.repeated()
+    return sense(methods, replace(still, number=still.number + _REPEATS), names)
+
+
+# --- domains -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Domain:
+    """title: for people; side: whose episodes; make: its maps, perhaps another domain's along with them."""
+
+    title: str
+    side: str
+    make: Callable[[Methods, Episode], dict[str, np.ndarray]]
+
+
+def _graft_limit(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
+    del methods
+    return {LIMIT: np.where(episode.sensed_mm > 0, episode.clean_mm, 0)}
+
+
+def _rand_noise(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
+    """DextrAH-G's published noise."""
+    import jax
+
+    base = contract.D455.scaled(episode.clean_mm.shape[2] / contract.D455.width_px)
+    profile = replace(base, fx_px=episode.focal_px, fy_px=episode.focal_px, baseline_m=episode.baseline_m)
+    key = jax.random.fold_in(jax.random.key(methods.seed), episode.number)
+    noisy = _dextrah(profile)(key, metres(episode.clean_mm), None)
+    return {"sim_rand_noise": millimetres(np.asarray(noisy))}
+
+
+@cache
+def _dextrah(profile: contract.CameraProfile) -> Callable[..., Any]:
+    import jax
+
+    from sensors.models.procedural import dextrah
+
+    return jax.jit(dextrah(DextrahConfig(), profile))
+
+
+def inpainted(depth_mm: np.ndarray, radius_px: float) -> np.ndarray:
+    """(T, H, W) with every hole filled by OpenCV (Telea 2004); the paper names OpenCV and no method."""
+    filled = [
+        cv2.inpaint(frame, (frame == 0).astype(np.uint8), radius_px, cv2.INPAINT_TELEA) for frame in depth_mm
+    ]
+    return np.stack(filled)
+
+
+def _monocular(name: str) -> Callable[[Methods, Episode], dict[str, np.ndarray]]:
+    def make(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
+        """Relative depth from colour, made metric by the depth of its own side."""
+        from ddg_jax.network_prior import metric_depth
+
+        assert methods.monocular is not None and episode.rgb is not None
+        reference = metres(episode.sensed_mm if episode.side == REAL else episode.clean_mm)
+        relative = methods.monocular.from_recording(reference, episode.rgb, np.random.default_rng(0))
+        far_m = methods.generator.config.far_m
+        fitted = [metric_depth(r, d, far_m) for r, d in zip(relative, reference, strict=True)]
+        return {name: millimetres(np.stack(fitted))}
+
+    return make
+
+
+def _generated(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
+    import jax
+
+    from ddg_jax.sample import generate
+
+    made = generate(
+        jax.random.key(methods.seed), methods.generator, metres(episode.clean_mm), episode.rgb,
+        episode=episode.number,
+    )  # fmt: skip
+    return {"sim_ddg": millimetres(made.depth_m), "sim_ddg_no_graft": millimetres(made.predicted_m)}
+
+
+DOMAINS: dict[str, Domain] = {
+    RAW: Domain("Real Raw", REAL, lambda m, e: {RAW: e.sensed_mm}),
+    FLOOR: Domain("Real Raw, other episodes", SIM, lambda m, e: {FLOOR: e.sensed_mm}),
+    "sim_gt": Domain("Sim GT", SIM, lambda m, e: {"sim_gt": e.clean_mm}),
+    LIMIT: Domain("Camera's holes, exact depth", SIM, _graft_limit),
+    "sim_rand_noise": Domain("Sim Rand Noise", SIM, _rand_noise),
+    "real_inpaint": Domain(
+        "Real Inpaint",
+        REAL,
+        lambda m, e: {"real_inpaint": inpainted(e.sensed_mm, m.config.inpaint_radius_px)},
+    ),
+    "real_monocular": Domain("Real monocular", REAL, _monocular("real_monocular")),
+    "sim_monocular": Domain("Sim monocular", SIM, _monocular("sim_monocular")),
+    "sim_ddg_no_graft": Domain("Sim DDG w/o graft", SIM, _generated),
+    "sim_ddg": Domain("Sim DDG", SIM, _generated),
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """real, sim: names of the two domains compared."""
+
+    title: str
+    real: str
+    sim: str
+
+
+COLUMNS: dict[str, Column] = {
+    "sim_gt": Column("Sim GT", RAW, "sim_gt"),
+    "rand_noise": Column("Rand Noise", RAW, "sim_rand_noise"),
+    "inpaint": Column("Inpaint", "real_inpaint", "sim_gt"),
+    "monocular": Column("Monocular", "real_monocular", "sim_monocular"),
+    "ddg_no_graft": Column("DDG w/o graft", RAW, "sim_ddg_no_graft"),
+    "ddg": Column("DDG", RAW, "sim_ddg"),
+}
+"""The paper's Table I and its t-SNE's six pairings, by the names of `ddgrasp.config.SCORE_COLUMNS`."""
+REFERENCES: dict[str, Column] = {
+    "graft_limit": Column("Graft limit", RAW, LIMIT),
+    "floor": Column("Real vs real", RAW, FLOOR),
+}
+"""What figures are to be read against; no methods, and no column can be expected to pass the floor."""
+
+
+def wanted_domains(columns: Sequence[str]) -> list[str]:
+    """Domains that the columns and the references need, in the order of DOMAINS."""
+    pairs = [*(COLUMNS[name] for name in columns), *REFERENCES.values()]
+    needed = {name for pair in pairs for name in (pair.real, pair.sim)}
+    return [name for name in DOMAINS if name in needed]

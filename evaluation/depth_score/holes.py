@@ -1,0 +1,174 @@
+"""Hole-level measures of depth maps: where holes are, how large, how steady, and what valid pixels are worth.
+
+Everything is kept as sums over an episode, so that episodes add up and can be resampled. NumPy and OpenCV.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+import cv2
+import numpy as np
+
+from foundation.depth_feature_data import depth_edges
+from sensors.statistics import stats
+
+DEPTH_EDGES_M = (0.0, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 6.0, np.inf)
+EDGE_DISTANCE_PX = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, np.inf)
+INCIDENCE_DEG = (0, 10, 20, 30, 40, 50, 60, 70, 80, 90.001)
+BINS: dict[str, Sequence[float]] = {
+    "depth_m": DEPTH_EDGES_M, "edge_distance_px": EDGE_DISTANCE_PX, "incidence_deg": INCIDENCE_DEG,
+}  # fmt: skip
+"""Quantities of the clean geometry that hole rates are drawn against, and their bins' edges."""
+SIZE_BINS = 17
+"""Hole sizes 1, 2-3, 4-7, ... pixels."""
+OUTLIER_M = 0.05
+"""A valid pixel farther than this from the clean depth is an outlier."""
+
+Sums = dict[str, np.ndarray]
+
+
+# --- geometry ------------------------------------------------------------------------------------
+
+
+def geometry(clean_m: np.ndarray, focal_px: float) -> dict[str, np.ndarray]:
+    """The quantities of BINS per pixel of (H, W) clean depth in metres."""
+    return {
+        "depth_m": clean_m,
+        "edge_distance_px": edge_distance_px(clean_m),
+        "incidence_deg": incidence_deg(clean_m, focal_px),
+    }
+
+
+def edge_distance_px(clean_m: np.ndarray) -> np.ndarray:
+    """(H, W) pixels to the nearest depth edge; 0 on one, the diagonal where there is none."""
+    edges = depth_edges(clean_m)
+    if not edges.any():
+        return np.full(clean_m.shape, np.hypot(*clean_m.shape), np.float32)
+    return cv2.distanceTransform((~edges).astype(np.uint8), cv2.DIST_L2, 5)
+
+
+def incidence_deg(clean_m: np.ndarray, focal_px: float) -> np.ndarray:
+    """(H, W) degrees between the line of sight and the surface normal, from the depth of neighbours.
+
+    The principal point is the picture's centre.
+    """
+    height, width = clean_m.shape
+    x = (np.arange(width, dtype=np.float32) + 0.5 - width / 2)[None] / focal_px
+    y = (np.arange(height, dtype=np.float32) + 0.5 - height / 2)[:, None] / focal_px
+    points = np.stack([x * clean_m, y * clean_m, clean_m], axis=-1)
+    across, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    normal = np.cross(across, down)
+    scale = np.linalg.norm(normal, axis=-1) * np.linalg.norm(points, axis=-1)
+    cosine = np.abs(np.sum(normal * points, axis=-1)) / np.maximum(scale, 1e-12)
+    return np.degrees(np.arccos(np.clip(cosine, 0, 1)))
+
+
+# --- sums over an episode --------------------------------------------------------------------------
+
+
+def episode_sums(depth_m: np.ndarray, clean_m: np.ndarray, places: Sequence[Mapping[str, Any]]) -> Sums:
+    """Of maps (T, H, W) in time order over the clean geometry they show; places: `geometry` of each frame.
+
+    Counts are taken where the clean geometry has a surface.
+    """
+    holes, surface = depth_m <= 0, clean_m > 0
+    both = ~holes & surface
+    error = (depth_m - clean_m)[both].astype(np.float64)
+    changed = holes[1:] != holes[:-1]
+    sums: Sums = {
+        "pixels": np.array(holes.size), "holes": np.array(holes.sum()), "frames": np.array(len(depth_m)),
+        "valid": np.array(both.sum()), "error": np.array(error.sum()),
+        "squared_error": np.array((error**2).sum()),
+        "outliers": np.array((np.abs(error) > OUTLIER_M).sum()),
+        "pairs": np.array(changed.size), "changed": np.array(changed.sum()),
+        "hole_before": np.array(holes[:-1].sum()), "hole_stayed": np.array((holes[1:] & holes[:-1]).sum()),
+        "size_counts": size_counts(holes),
+    }  # fmt: skip
+    for name, edges in BINS.items():
+        values = np.stack([place[name] for place in places])
+        bins = np.digitize(values[surface], edges[1:-1])
+        count = len(edges) - 1
+        sums[f"{name}_pixels"] = np.bincount(bins, minlength=count)
+        sums[f"{name}_holes"] = np.bincount(bins, weights=holes[surface], minlength=count)
+    return sums
+
+
+def size_counts(holes: np.ndarray) -> np.ndarray:
+    """(SIZE_BINS,) connected regions of (T, H, W) bool holes; bin b counts those of 2^b to 2^(b+1) - 1 px."""
+    sizes = np.concatenate([stats.hole_sizes_px((~frame).astype(np.uint16)) for frame in holes])
+    bins = np.minimum(np.log2(np.maximum(sizes, 1)).astype(int), SIZE_BINS - 1)
+    return np.bincount(bins, minlength=SIZE_BINS)
+
+
+def repeat_sums(depth_m: np.ndarray) -> Sums:
+    """Of one motionless scene sensed again and again, (K, H, W)."""
+    holes = depth_m <= 0
+    overlaps = [
+        (a & b).sum() / union
+        for a, b in combinations(holes, 2)
+        if (union := (a | b).sum())  # two pictures without a hole have no overlap to speak of
+    ]
+    always = ~holes.any(0)
+    deviation = np.std(depth_m[:, always], axis=0, ddof=1, dtype=np.float64)
+    return {
+        "overlap": np.array(sum(overlaps)), "overlap_pairs": np.array(len(overlaps)),
+        "still_changed": np.array((holes[1:] != holes[:-1]).sum()),
+        "still_pairs": np.array(holes[1:].size),
+        "deviation": np.array(deviation.sum()), "deviation_pixels": np.array(always.sum()),
+    }  # fmt: skip
+
+
+def added(sums: Sequence[Sums]) -> Sums:
+    """Sums of several episodes; one that lacks a quantity (no repeats) adds nothing to it."""
+    total: Sums = {}
+    for item in sums:
+        for name, value in item.items():
+            total[name] = total[name] + value if name in total else value
+    return total
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+
+def figures(total: Sums) -> dict[str, float]:
+    """Plain numbers; nan where there was nothing to measure."""
+    rmse = np.sqrt(_ratio(total, "squared_error", "valid"))
+    return {
+        "invalid_share": _ratio(total, "holes", "pixels"),
+        "components_per_frame": float(total["size_counts"].sum() / total["frames"]),
+        "flicker": _ratio(total, "changed", "pairs"),
+        "persistence": _ratio(total, "hole_stayed", "hole_before"),
+        "rmse_mm": 1000 * float(rmse),
+        "bias_mm": 1000 * _ratio(total, "error", "valid"),
+        "outlier_share": _ratio(total, "outliers", "valid"),
+        "repeat_iou": _ratio(total, "overlap", "overlap_pairs"),
+        "repeat_flicker": _ratio(total, "still_changed", "still_pairs"),
+        "repeat_deviation_mm": 1000 * _ratio(total, "deviation", "deviation_pixels"),
+    }
+
+
+def curves(total: Sums) -> dict[str, np.ndarray]:
+    """Hole rate per bin of BINS (nan where no pixel fell), and hole regions per frame by size."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rates = {name: total[f"{name}_holes"] / total[f"{name}_pixels"] for name in BINS}
+    return {**rates, "size_px": total["size_counts"] / total["frames"]}
+
+
+def gaps(total: Sums, real: Sums) -> dict[str, float]:
+    """How far the hole-rate curves lie from the real ones: mean |difference| over the real pixels' bins; for
+    sizes the sum of |differences| of regions per frame over the real ones."""
+    mine, theirs = curves(total), curves(real)
+    result = {}
+    for name in BINS:
+        weight = np.where(total[f"{name}_pixels"] > 0, real[f"{name}_pixels"], 0)
+        difference = np.nan_to_num(np.abs(mine[name] - theirs[name]))
+        result[f"gap_{name}"] = float((difference * weight).sum() / max(weight.sum(), 1))
+    regions = max(float(theirs["size_px"].sum()), 1e-9)
+    result["gap_size_px"] = float(np.abs(mine["size_px"] - theirs["size_px"]).sum() / regions)
+    return result
+
+
+def _ratio(total: Sums, above: str, below: str) -> float:
+    count = float(total.get(below, np.array(0)))
+    return float(total[above]) / count if count else float("nan")

@@ -1,0 +1,66 @@
+"""What a person gets of a score: score.html, and a table at the terminal."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import artifacts
+from evaluation.depth_score import table as score_table
+from evaluation.report.html import image, page, table
+
+JSON, HTML = "score.json", "score.html"
+
+
+def summary(result: Mapping[str, Any]) -> dict[str, Any]:
+    """What the manifest, and with it the run's report, keeps: texts of tables and targets."""
+    tables = {f"distances, {n}": score_table.distance_rows(t) for n, t in result["tables"].items()}
+    return {
+        "setting": result["setting"],
+        "features": list(result["features"]),
+        "targets": result["targets"],
+        **tables,
+        "hole measures": score_table.hole_rows(result["holes"]),
+    }
+
+
+def render(result: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
+    """The page: one file with tables and pictures."""
+    body = [
+        "<h1>Generated depth against recorded depth</h1>",
+        f"<p>{result['setting']} Intervals: 95 %, bootstrap over trajectories.</p>",
+    ]
+    for title, rows in _tables(summary(result)).items():
+        columns = list(rows[0])
+        body.append(f"<h2>{title}</h2>" + table(columns, [[row[c] for c in columns] for row in rows]))
+    body.extend(f"<h2>{n}</h2>" + image(png, n) for n, png in pictures.items() if "table" not in n)
+    return page("Generated depth against recorded depth", body)
+
+
+def print_result(directory: Path) -> None:
+    """Prints the tables of a finished score or curve, and where the rest is."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=220)
+    for title, rows in _tables(artifacts.read_manifest(directory).metrics).items():
+        drawn = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False)
+        for column in rows[0]:
+            drawn.add_column(column, overflow="fold")
+        for row in rows:
+            drawn.add_row(*row.values())
+        console.print(drawn)
+    for name in (JSON, HTML):
+        if (directory / name).exists():
+            print(directory / name)
+    print(directory / "pictures")
+
+
+def _tables(metrics: Mapping[str, Any]) -> dict[str, list[dict[str, str]]]:
+    return {
+        title: rows
+        for title, rows in metrics.items()
+        if isinstance(rows, list) and rows and isinstance(rows[0], Mapping)
+    }

@@ -1,0 +1,16 @@
+"""Stage report: reads every manifest of a run, writes report.json and report.html, prints the table."""
+
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import artifacts
+from evaluation.report.html import REPORT_HTML, render_html
+from evaluation.report.summary import REPORT, build_report
+
+
+def write_report(run_dir: Path) -> dict[str, Any]:
+    """Writes `run_dir/report.json` and `run_dir/report.html` from the finished stages; returns the report."""
+    report = build_report(run_dir)
+    artifacts.atomic_write_json(run_dir / REPORT, report)
+    artifacts.atomic_write_text(run_dir / REPORT_HTML, render_html(report, run_dir))
+    return report

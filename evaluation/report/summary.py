@@ -1,0 +1,184 @@
+"""All numbers of a run in one place: report.json, and the table a run ends with.
+
+Numbers come from the stages' manifests as they were measured; this module only adds Wilson intervals.
+"""
+
+import os
+import platform
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import artifacts, contract
+from ddgrasp.errors import UserError
+from ddgrasp.stages import ON_REQUEST, STAGES
+from evaluation import backends, teacher_trials, wilson
+
+REPORT = "report.json"
+_TOP_LEVEL = "student_"
+
+
+def build_report(run_dir: Path) -> dict[str, Any]:
+    """Report of every finished stage under `run_dir`; UserError if there is none.
+
+    Keys: `stages.<name>.{seconds, trained, loaded}`; `<name>` holds what that stage measured, except keys
+    that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top; `machine`,
+    `versions`, `preset`, `seed`, `config`. A success rate is {rate, n, successes, low, high}.
+    `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows; `teacher.backends`, if `ddgrasp
+    teacher compare` was, is `evaluation.backends.table`.
+    """
+    finished = {
+        stage.name: artifacts.read_manifest(run_dir / stage.name)
+        for stage in (*STAGES, *ON_REQUEST)
+        if artifacts.is_finished(run_dir / stage.name)
+    }
+    if not finished:
+        raise UserError(
+            f"{run_dir} holds no finished stage: nothing to report. Start one with `ddgrasp run`."
+        )
+    flow = [stage.name for stage in STAGES if stage.name in finished]
+    latest = finished[flow[-1]] if flow else next(iter(finished.values()))
+    report: dict[str, Any] = {
+        "preset": latest.config.get("preset"),
+        "seed": latest.seed,
+        "contract_version": contract.CONTRACT_VERSION,
+        "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "machine": describe_machine(),
+        "versions": latest.versions,
+        "stages": {},
+    }
+    for name, manifest in finished.items():
+        report["stages"][name] = {
+            "seconds": manifest.seconds,
+            "trained": manifest.origin == "trained",
+            "loaded": manifest.origin == "loaded",
+            "created": manifest.created,
+        }
+        metrics = with_intervals(manifest.metrics)
+        report[name] = {key: value for key, value in metrics.items() if not key.startswith(_TOP_LEVEL)}
+        report.update({key: value for key, value in metrics.items() if key.startswith(_TOP_LEVEL)})
+    if "teacher" in finished and (rows := teacher_trials.load(run_dir / "teacher")):
+        report["teacher"]["trials"] = rows
+    if "teacher" in finished:
+        trained_on = finished["teacher"].config["world"]["backend"]
+        if rows := backends.table(run_dir / "teacher", trained_on):
+            report["teacher"]["backends"] = rows
+    report["config"] = latest.config
+    return report
+
+
+def with_intervals(value: Any) -> Any:
+    """`value` with rate, low and high added to every {"successes": k, "n": n} in it."""
+    if isinstance(value, Mapping):
+        if {"successes", "n"} <= value.keys():
+            return {**value, **wilson.success(int(value["successes"]), int(value["n"]))}
+        return {key: with_intervals(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [with_intervals(item) for item in value]
+    return value
+
+
+def describe_machine() -> dict[str, Any]:
+    """Processor, cores this process may use, operating system."""
+    processor = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line
+        ]
+        processor = names[0] if names else processor
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"processor": processor, "cores": cores, "system": f"{platform.system()} {platform.machine()}"}
+
+
+# --- for people ----------------------------------------------------------------------------------
+
+
+def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    """(stage, made or loaded, time, result) per line; the last line is the exported student in the rig."""
+    rows = []
+    asked_for = [stage for stage in ON_REQUEST if stage.name in report["stages"]]
+    for stage in (*STAGES[:-1], *asked_for, STAGES[-1]):
+        entry = report["stages"].get(stage.name)
+        if entry is None:
+            rows.append((stage.name, "", "", "not run"))
+            continue
+        start = report["config"].get(stage.name, {}).get("init_from", "")
+        origin = "loaded" if entry["loaded"] else "this run" + (f", from {start}" if start else "")
+        results = _results(stage.name, report) or [stage.makes]
+        rows.append((stage.name, origin, _duration(entry["seconds"]), results[0]))
+        rows.extend(("", "", "", result) for result in results[1:])
+    if rig := _success(report, "student_rig"):
+        rows.append(("deploy", "", "", f"exported student in the pseudo-real rig: success {rig}"))
+    return rows
+
+
+def print_summary(report: Mapping[str, Any]) -> None:
+    """Prints the table of `summary_rows` to standard output."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=140)
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for title in ("Stage", "From", "Time", "Measured (success: rate of n, Wilson 95 % interval)"):
+        table.add_column(title, overflow="fold")
+    for row in summary_rows(report):
+        table.add_row(*row)
+    console.print(table)
+
+
+def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
+    """What is said about a stage, most important first."""
+    metrics = report.get(stage, {})
+    if stage == "teacher":
+        lines = [f"success {wilson.describe(metrics['success'])}"] if "success" in metrics else []
+        per_object = metrics.get("per_object") or metrics.get("objects") or {}
+        lines += [
+            f"{name}: {wilson.describe(value.get('success', value))}"
+            for name, value in (per_object.items() if isinstance(per_object, Mapping) else ())
+            if "rate" in value.get("success", value)
+        ]
+        return lines + [_on_backend(row) for row in metrics.get("backends", [])]
+    if stage == "student":
+        named = (("student_clean", "clean depth"), ("student_ddg", "generated depth"))
+        return [f"{text}: success {rate}" for key, text in named if (rate := _success(report, key))]
+    if stage == "ddg" and {"recorded", "generated"} <= metrics.keys():
+        shares = [metrics[key]["invalid_fraction"] for key in ("recorded", "generated")]
+        return [f"invalid pixels: recorded {shares[0]:.1%}, generated {shares[1]:.1%} (held-out frames)"]
+    if stage == "export" and "max_abs_diff" in metrics:
+        return [f"largest difference between JAX and ONNX actions {metrics['max_abs_diff']:.1e}"]
+    if stage == "deploy" and "latency_ms" in metrics:
+        latency = metrics["latency_ms"]
+        return [f"inference p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"]
+    if "targets" in metrics:
+        met = [target["met"] for target in metrics["targets"]]
+        return [f"{metrics['targets'][0]['target']}: {metrics['targets'][0]['measured']}",
+                f"targets met: {met.count('met')} of {len(met)}"]  # fmt: skip
+    return [
+        f"{name.replace('_', ' ')} {_number(value)}"
+        for name, value in metrics.items()
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
+    ][:3]
+
+
+def _on_backend(row: Mapping[str, Any]) -> str:
+    drop = row["drop_points"]
+    text = f"on {row['backend']}: success {wilson.describe(row['success'])}"
+    return text if not drop else f"{text}, drop {drop:.1f} points"
+
+
+def _success(report: Mapping[str, Any], key: str) -> str:
+    value = report.get(key, {}).get("success")
+    return wilson.describe(value) if value else ""
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.4g}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.1f} min"

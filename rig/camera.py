@@ -1,0 +1,57 @@
+"""The pseudo-real rig's camera: colour and active-stereo depth of a MuJoCo state. JAX-free."""
+
+import mujoco
+import numpy as np
+
+from ddgrasp import contract
+from ddgrasp.config import RecordConfig, StereoConfig
+from mjx_envs.camera import Buffers, Camera, look_at
+from mjx_envs.render.raycast_numpy import render, render_depth
+from sensors.models.active_stereo import ActiveStereo
+from sensors.models.materials import rig_materials
+
+FAR_M = 10.0
+"""Beyond the matcher's range, so that range limits come from the camera alone."""
+
+
+class RigCamera:
+    """Looks at `data` of `model`; reads both anew for every frame, so they may change in place."""
+
+    def __init__(self, model: mujoco.MjModel, config: StereoConfig, profile: contract.CameraProfile):
+        self.model = model
+        self.stereo = ActiveStereo(config, profile)
+
+    def depth_mm(
+        self,
+        data: mujoco.MjData,
+        T_world_cam: np.ndarray,
+        rng: np.random.Generator,
+        object_name: str = "",
+    ) -> np.ndarray:
+        """(H, W) uint16 millimetres as the camera reports them, 0 = invalid."""
+
+        def draw(camera: Camera) -> Buffers:
+            return render(self.model, data, camera, far_m=FAR_M)
+
+        def draw_depth(camera: Camera) -> np.ndarray:
+            return render_depth(self.model, data, camera, far_m=FAR_M)
+
+        return self.stereo.sense(draw, T_world_cam, rng, rig_materials(self.model, object_name), draw_depth)
+
+    def rgb(self, data: mujoco.MjData, T_world_cam: np.ndarray) -> np.ndarray:
+        """(H, W, 3) uint8 colour, aligned to depth."""
+        buffers = render(self.model, data, self.stereo.camera(T_world_cam), far_m=FAR_M)
+        return np.rint(np.clip(buffers.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> np.ndarray:
+    """(4, 4) T_world_cam near the nominal extrinsics: position, aim and roll drawn uniformly."""
+    position = np.array(contract.CAMERA_POSITION_M)
+    aim = np.array(contract.CAMERA_LOOK_AT_M)
+    position += rng.uniform(-1, 1, 3) * config.camera_position_jitter_m
+    aim += rng.uniform(-1, 1, 3) * config.camera_aim_jitter_m
+    roll = rng.uniform(-1, 1) * config.camera_roll_jitter_rad
+    T_world_cam = look_at(position, aim)
+    c, s = np.cos(roll), np.sin(roll)
+    T_world_cam[:3, :3] = T_world_cam[:3, :3] @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return T_world_cam

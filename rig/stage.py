@@ -1,0 +1,126 @@
+"""Stage `record`: RGB-D recordings from the pseudo-real rig, as someone with a camera would make them.
+
+The teacher moves the rig's robot, the active-stereo camera looks on from a slightly different place in
+every trajectory. Only pictures are kept: no pose, no CAD model, no clean depth.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ddgrasp import contract
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.job import Job
+from ddgrasp.progress import Progress
+from mjx_envs.camera import nominal_camera
+from rig.camera import RigCamera, jittered_pose
+from sensors.recordings.recording import Recording, RecordingWriter, is_recording
+from sensors.statistics import stats
+
+if TYPE_CHECKING:
+    from rig.world import RigWorld
+
+STATIC_FRAMES = 10
+"""Frames of a standing scene behind the temporal statistics."""
+
+Policy = Callable[[np.ndarray], np.ndarray]
+"""Observation (40,) to action (8,)."""
+
+
+def run(job: Job) -> Artifact:
+    """Record `config.record.trajectories` episodes; finished recordings are kept on resume."""
+    from ppo import policy as teacher_policy
+    from rig.world import RigWorld
+
+    config, directory, progress = job.config, job.directory, job.progress
+    policy = teacher_policy.load(job.parents["teacher"].directory)
+    world = RigWorld(objects=config.world.objects, randomise=True)
+    camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+    with progress.task("trajectories", config.record.trajectories) as task:
+        for index in range(config.record.trajectories):
+            path = directory / f"rig_{index:04d}"
+            if is_recording(path):
+                task.start_at(index + 1)
+                continue
+            record_trajectory(config, index, path, world, camera, policy)
+            task.advance()
+    recordings = [Recording.open(directory / f"rig_{i:04d}") for i in range(config.record.trajectories)]
+    _show(recordings, progress)
+    return job.finish({**_summary(recordings), "static": _static_statistics(config, world, camera)})
+
+
+def record_trajectory(
+    config: Config, index: int, path: Path, world: "RigWorld", camera: RigCamera, policy: Policy
+) -> None:
+    """One episode of the teacher, one frame per control step, written to `path` when complete."""
+    rng = np.random.default_rng([config.seed, index])
+    name = config.world.objects[index % len(config.world.objects)]
+    world.reset(int(rng.integers(2**31)), name)
+    T_world_cam = jittered_pose(config.record, rng)
+    with RecordingWriter(path, _meta(config, name)) as writer:
+        for _ in range(config.record.frames):
+            writer.add(
+                camera.rgb(world.data, T_world_cam), camera.depth_mm(world.data, T_world_cam, rng, name)
+            )
+            act(world, policy(world.observation()))
+
+
+def act(world: "RigWorld", action: np.ndarray) -> None:
+    """Execute one (8,) action for one control period."""
+    q, _ = world.state()
+    target = q + contract.ACTION_SCALE_RAD * np.clip(action[:7], -1.0, 1.0)
+    target = np.clip(target, contract.JOINT_LOWER_RAD, contract.JOINT_UPPER_RAD)
+    world.command(target, bool(action[7] > 0))
+    world.step(contract.CONTROL_DT_S)
+
+
+def _meta(config: Config, object_name: str) -> dict[str, Any]:
+    profile = config.world.profile
+    return {
+        "sensor": f"pseudo-real rig, active stereo, D455 profile at scale {config.world.camera_scale:g}",
+        "object": object_name,
+        "color_aligned_to_depth": True,
+        "consecutive_frames": True,
+        "hz": contract.CONTROL_HZ,
+        "fx_px": profile.fx_px,
+        "fy_px": profile.fy_px,
+        "cx_px": profile.cx_px,
+        "cy_px": profile.cy_px,
+        "baseline_m": profile.baseline_m,
+    }
+
+
+def _summary(recordings: list[Recording]) -> dict[str, Any]:
+    # Every fifth frame says as much about holes as all of them.
+    frames = [recording.depth_mm(i) for recording in recordings for i in range(0, len(recording), 5)]
+    return {
+        "trajectories": len(recordings),
+        "frames": sum(len(recording) for recording in recordings),
+        "skipped_frames": sum(len(recording.skipped) for recording in recordings),
+        "invalid_fraction": float(np.mean([np.mean(frame == 0) for frame in frames])),
+        "hole_components": float(np.mean([len(stats.hole_sizes_px(frame)) for frame in frames])),
+    }
+
+
+def _static_statistics(config: Config, world: "RigWorld", camera: RigCamera) -> dict[str, float]:
+    """Noise over time needs a scene that stands still: the robot at rest, the nominal camera."""
+    rng = np.random.default_rng([config.seed, config.record.trajectories])
+    name = config.world.objects[0]
+    world.reset(config.seed, name)
+    T_world_cam = nominal_camera(config.world.profile).T_world_cam
+    frames = [camera.depth_mm(world.data, T_world_cam, rng, name) for _ in range(STATIC_FRAMES)]
+    return stats.measure(np.stack(frames)).as_dict()
+
+
+def _show(recordings: list[Recording], progress: Progress) -> None:
+    """A film strip of the first recording for the report."""
+    recording = recordings[0]
+    chosen = np.linspace(0, len(recording) - 1, 4).astype(int)
+    progress.picture(
+        "recorded",
+        rgb=np.stack([recording.rgb(i) for i in chosen]),
+        depth=np.stack([recording.depth_mm(i) for i in chosen]),
+    )

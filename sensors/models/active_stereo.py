@@ -1,0 +1,395 @@
+"""An active-stereo depth camera (D4xx kind): two infrared pictures, a dot projector, a matcher.
+
+Infrared pictures are shaded from rendered depth, normals and materials under the projector's
+pattern (with its own shadow test) and ambient light; OpenCV's semi-global matcher turns them into
+disparity. Holes, edge fattening and range-dependent noise come out of the matching; no noise is
+ever added to depth. NumPy and OpenCV alone.
+
+Frames: camera = left imager (a D4xx's depth frame); the right imager and the projector stand
+beside it along +x with parallel axes. Depth is planar.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from ddgrasp.config import StereoConfig
+from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
+from mjx_envs.camera import Buffers, Camera
+from sensors.models import planes
+from sensors.models.materials import NEAR_INFRARED_RGB, Material
+
+Render = Callable[[Camera], Buffers]
+RenderDepth = Callable[[Camera], np.ndarray]
+
+LAMP_POSITION_W_M = (0.3, -0.8, 2.2)
+"""Centre of the room's lamp, world frame."""
+LAMP_SHARE = 0.35
+"""Share of the ambient light that comes from the lamp; the rest comes evenly from everywhere."""
+SHININESS_DOUBLINGS = 6
+"""Blinn-Phong exponent 2**6 = 64, so that the highlight is a few squarings."""
+SHADOW_BIAS_M = 0.012
+"""A point this much behind the projector's own depth map lies in shadow."""
+PROJECTOR_MARGIN = 1.1
+"""The projector lights a field this much wider than the imagers'."""
+PROJECTOR_FALLOFF = 0.5
+"""Exponent of the cosine by which the projector dims towards its edges."""
+VIGNETTING = 2.5
+"""Exponent of the cosine by which a lens dims towards its edges (4 for a simple one)."""
+TEXELS_PER_PX = 3
+"""Resolution of the stored pattern."""
+TEXTURE_PX, TEXTURE_PX_PER_M = 512, 400.0
+"""Size and scale of the albedo texture that `Material.texture` weighs (a 1.3 m tile)."""
+SPREAD_PX = 9
+"""A translucent body spreads the projector's dots over this width: about two of their distances."""
+DARK_WINDOW_PX = 3
+"""A pixel is too dark if the median over this window is: single dots do not count."""
+TEXTURE_DARKEST = 0.2
+"""The texture's darkest spots keep this share of the albedo."""
+CONTRAST_WINDOW_PX = 9
+"""The pictures are compared less their mean over this window."""
+TEXTURE_WINDOW_PX = 7
+"""Contrast is measured over this window: small enough for a dark object on a bright table."""
+OTHER_SURFACE_PX = 0.5
+"""Neighbouring disparities further apart than this belong to two surfaces."""
+
+
+class ActiveStereo:
+    """Depth as an active-stereo camera reports it, at any scale of a camera profile.
+
+    The pattern and the matcher are made once; frames differ by the generator given to `sense`.
+    """
+
+    def __init__(self, config: StereoConfig, profile: CameraProfile):
+        self.config = config
+        self.profile = profile
+        p = profile
+        self._x = ((np.arange(p.width_px) + 0.5 - p.cx_px) / p.fx_px).astype(np.float32)[None, :]
+        self._y = ((np.arange(p.height_px) + 0.5 - p.cy_px) / p.fy_px).astype(np.float32)[:, None]
+        # The ray's z is 1, so cos = 1 / |ray|.
+        self._vignetting = (1.0 + self._x**2 + self._y**2) ** np.float32(-VIGNETTING / 2)
+        self._projector = _projector_profile(profile)
+        self._pattern = _dot_pattern(config, profile, self._projector)
+        self._texture = albedo_texture(config.pattern_seed, TEXTURE_PX, TEXTURE_PX)
+        self._fb_px_m = p.fx_px * p.baseline_m
+        self._disparities = 16 * math.ceil(self._fb_px_m / config.min_range_m / 16)
+        self._matcher = _matcher(config, self._disparities)
+
+    def sense(
+        self,
+        render: Render,
+        T_world_cam: np.ndarray,
+        rng: np.random.Generator,
+        materials: Mapping[int, Material] | None = None,
+        render_depth: RenderDepth | None = None,
+    ) -> np.ndarray:
+        """(H, W) uint16 planar depth in millimetres, 0 = invalid, in the left imager's frame.
+
+        Args:
+            render: draws the scene as it stands for a pinhole camera; called for both imagers.
+            T_world_cam: (4, 4) pose of the left imager.
+            rng: sensor noise.
+            materials: by geom id; others are guessed from the rendered colour.
+            render_depth: depth alone, for the projector's shadow map (default: from `render`).
+        """
+        left, right = self.infrared(render, T_world_cam, rng, materials, render_depth)
+        return self.depth_mm(self.disparity(left, right))
+
+    def camera(self, T_world_cam: np.ndarray) -> Camera:
+        """The left imager, in whose frame depth is reported."""
+        return _camera(self.profile, T_world_cam, 0.0)
+
+    def infrared(
+        self,
+        render: Render,
+        T_world_cam: np.ndarray,
+        rng: np.random.Generator,
+        materials: Mapping[int, Material] | None = None,
+        render_depth: RenderDepth | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Left and right infrared pictures, (H, W) uint8."""
+        baseline = self.profile.baseline_m
+        projector_m = self.config.projector_position * baseline
+        projector = _camera(self._projector, T_world_cam, projector_m)
+        lit_m = render_depth(projector) if render_depth else render(projector).depth_m
+        lit_m = np.where(lit_m > 0, lit_m, np.float32(1e3)).astype(np.float32)
+        images = []
+        for imager_m in (0.0, baseline):
+            buffers = render(_camera(self.profile, T_world_cam, imager_m))
+            speckle = self._speckle(rng)
+            images.append(
+                self._radiance(
+                    buffers, T_world_cam, imager_m, projector_m - imager_m, lit_m, materials, speckle
+                )
+            )
+        exposure = self.config.exposure_target / max(float(images[0].mean()), 1e-6)
+        left, right = (self._expose(image, exposure, rng) for image in images)
+        return left, right
+
+    def disparity(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """(H, W) float32 disparity of the left picture in pixels, 0 = no match."""
+        pad = self._disparities
+        padded = [cv2.copyMakeBorder(i, 0, 0, pad, 0, cv2.BORDER_REFLECT) for i in (left, right)]
+        coarse = self._matcher.compute(*padded)[:, pad:].astype(np.float32) / 16.0
+        columns = np.arange(self.profile.width_px, dtype=np.float32)[None, :]
+        # The left band has no counterpart in the right picture.
+        valid = (coarse > 0) & (columns - coarse >= 0)
+        contrast = _contrast(left)
+        valid &= cv2.medianBlur(left, DARK_WINDOW_PX) >= self.config.dark_limit
+        left, right = _without_mean(left), _without_mean(right)
+        fine, residual = _refine(left, right, coarse, self.config)
+        valid &= (residual < self.config.residual_limit) & (contrast > self.config.contrast_limit)
+        fine = flatten(fine, valid, self.config)
+        steps = self.config.subpixel_steps
+        return np.where(valid, np.rint(fine * steps) / steps, 0).astype(np.float32)
+
+    def depth_mm(self, disparity_px: np.ndarray) -> np.ndarray:
+        """(H, W) uint16 millimetres from disparity; out-of-range becomes 0."""
+        depth_m = self._fb_px_m / np.maximum(disparity_px, 1e-3)
+        valid = (
+            (disparity_px > 0) & (depth_m >= self.config.min_range_m) & (depth_m <= self.config.max_range_m)
+        )
+        return np.where(valid, np.rint(depth_m / DEPTH_UNIT_M), 0).astype(np.uint16)
+
+    def _radiance(
+        self,
+        buffers: Buffers,
+        T_world_cam: np.ndarray,
+        imager_m: float,
+        projector_m: float,
+        lit_m: np.ndarray,
+        materials: Mapping[int, Material] | None,
+        speckle: np.ndarray,
+    ) -> np.ndarray:
+        """(H, W) radiance of one imager, arbitrary units. Points and normals in that imager's frame.
+
+        `projector_m` is the projector's x in the imager's frame; `speckle` (H, W) multiplies its light.
+        """
+        z = buffers.depth_m
+        x_z, y_z = self._x * z, self._y * z
+        R_world_cam = T_world_cam[:3, :3].astype(np.float32)
+        normal = np.moveaxis(buffers.normal_w @ R_world_cam, -1, 0)
+        T_world_imager = _beside(T_world_cam, imager_m)
+        lamp = R_world_cam.T @ (
+            np.array(LAMP_POSITION_W_M, np.float32) - T_world_imager[:3, 3].astype(np.float32)
+        )
+        albedo, specular, translucency = self._surface(buffers, x_z, y_z, z, T_world_imager, materials)
+        view = _unit(-x_z, -y_z, -z)[0]
+
+        to_projector, range_m = _unit(projector_m - x_z, -y_z, -z)
+        dots = self._dots(x_z - projector_m, y_z, z, lit_m)
+        dots *= self.config.projector_power / np.maximum(range_m, 0.1) ** 2
+        diffuse, highlight = _reflect(normal, to_projector, view)
+        radiance = dots * speckle * ((1.0 - translucency) * albedo * diffuse + specular * highlight)
+        if translucency.any():
+            radiance += cv2.blur(dots, (SPREAD_PX, SPREAD_PX)) * translucency * albedo * diffuse
+
+        to_lamp, _ = _unit(lamp[0] - x_z, lamp[1] - y_z, lamp[2] - z)
+        diffuse, highlight = _reflect(normal, to_lamp, view)
+        radiance += LAMP_SHARE * (albedo * diffuse + specular * highlight)
+        radiance += (1.0 - LAMP_SHARE) * albedo
+        return np.where(z > 0, radiance, np.float32(0.05)) * self._vignetting
+
+    def _surface(
+        self, buffers, x_z, y_z, z, T_world_imager, materials
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(H, W) albedo, specular strength and translucency per pixel."""
+        rgb = buffers.rgb
+        default = Material.from_rgb((0.5, 0.5, 0.5))
+        ids = buffers.segmentation
+        count = max(int(ids.max()), max(materials or (0,))) + 2
+        table = np.tile(np.array([-1.0, default.specular, 0.0, 0.0], np.float32), (count, 1))
+        for geom, material in (materials or {}).items():
+            table[geom + 1] = material.albedo, material.specular, material.texture, material.translucency
+        albedo, specular, texture, translucency = (column[ids + 1] for column in table.T.copy())
+        unknown = albedo < 0
+        if unknown.any():
+            albedo[unknown] = 0.05 + 0.9 * (rgb[unknown] @ np.array(NEAR_INFRARED_RGB, np.float32))
+        if table[:, 2].any():
+            T = (T_world_imager * TEXTURE_PX_PER_M).astype(np.float32)
+            u, v = (T[i, 0] * x_z + T[i, 1] * y_z + T[i, 2] * z + T[i, 3] for i in (0, 1))
+            noise = cv2.remap(self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+            albedo *= np.maximum(1.0 + texture * noise, np.float32(TEXTURE_DARKEST))
+        return np.clip(albedo, 0.0, 1.0), specular, translucency
+
+    def _dots(self, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, lit_m: np.ndarray) -> np.ndarray:
+        """(H, W) brightness of the pattern on points given in the projector's frame; 0 in shadow."""
+        p = self._projector
+        inverse = 1.0 / np.maximum(z_m, np.float32(1e-3))
+        u = x_m * inverse * np.float32(p.fx_px) + np.float32(p.cx_px - 0.5)
+        v = y_m * inverse * np.float32(p.fy_px) + np.float32(p.cy_px - 0.5)
+        nearest_m = cv2.remap(lit_m, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        t = np.float32(TEXELS_PER_PX)
+        shift = np.float32((TEXELS_PER_PX - 1) / 2)
+        dots = cv2.remap(self._pattern, u * t + shift, v * t + shift, cv2.INTER_LINEAR)
+        return np.where(z_m > nearest_m + SHADOW_BIAS_M, np.float32(0), dots)
+
+    def _speckle(self, rng: np.random.Generator) -> np.ndarray:
+        """(H, W) factor of mean about 1 on laser light; each imager, at another place, sees its own."""
+        shape = (self.profile.height_px, self.profile.width_px)
+        noise = rng.standard_normal(shape, dtype=np.float32)
+        return np.maximum(1.0 + np.float32(self.config.speckle_contrast) * noise, 0.0)
+
+    def _expose(self, radiance: np.ndarray, exposure: float, rng: np.random.Generator) -> np.ndarray:
+        """(H, W) uint8: blur of the lens, shot and read noise, saturation, quantisation."""
+        c = self.config
+        if c.lens_blur_px > 0:
+            radiance = cv2.GaussianBlur(radiance, (5, 5), c.lens_blur_px)
+        signal = np.minimum(radiance * np.float32(exposure), 1.0)
+        sigma = np.sqrt(signal / np.float32(c.full_well_electrons) + np.float32(c.read_noise**2))
+        noise = rng.standard_normal(signal.shape, dtype=np.float32)
+        return np.clip(255.0 * (signal + sigma * noise) + 0.5, 0, 255).astype(np.uint8)
+
+
+def _beside(T_world_cam: np.ndarray, x_m: float) -> np.ndarray:
+    T = np.array(T_world_cam, float)
+    T[:3, 3] += x_m * T[:3, 0]
+    return T
+
+
+def _camera(profile: CameraProfile, T_world_cam: np.ndarray, x_m: float) -> Camera:
+    """The pinhole `x_m` to the right of T_world_cam, axes parallel."""
+    p = profile
+    T = _beside(T_world_cam, x_m)
+    return Camera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.height_px, p.width_px, T)
+
+
+def _projector_profile(profile: CameraProfile) -> CameraProfile:
+    """A pinhole with the imager's focal length and a wider picture."""
+    width = 2 * round(profile.width_px * PROJECTOR_MARGIN / 2)
+    height = 2 * round(profile.height_px * PROJECTOR_MARGIN / 2)
+    return replace(profile, width_px=width, height_px=height, cx_px=width / 2, cy_px=height / 2)
+
+
+def _dot_pattern(config: StereoConfig, profile: CameraProfile, projector: CameraProfile) -> np.ndarray:
+    """(h, w) float32 pattern, 1 at the centre of a lone dot, dimming towards the edges.
+
+    Dots are Gaussians as wide as the imager resolves, so sampling the texture does not alias.
+    """
+    rng = np.random.default_rng(config.pattern_seed)
+    area = projector.width_px * projector.height_px / (profile.width_px * profile.height_px)
+    count = round(config.dots * area)
+    height, width = projector.height_px * TEXELS_PER_PX, projector.width_px * TEXELS_PER_PX
+    texture = np.zeros((height, width), np.float32)
+    rows, columns = rng.integers(0, height, count), rng.integers(0, width, count)
+    np.add.at(texture, (rows, columns), rng.uniform(0.6, 1.0, count).astype(np.float32))
+    sigma = config.dot_radius_mrad / 1000 * projector.fx_px * TEXELS_PER_PX
+    texture = cv2.GaussianBlur(texture, (0, 0), sigma) * (2 * math.pi * sigma**2)
+    x = ((np.arange(width) + 0.5) / TEXELS_PER_PX - projector.cx_px) / projector.fx_px
+    y = ((np.arange(height) + 0.5) / TEXELS_PER_PX - projector.cy_px) / projector.fy_px
+    cosine = 1.0 / np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
+    return (np.minimum(texture, 2.0) * cosine**PROJECTOR_FALLOFF).astype(np.float32)
+
+
+def albedo_texture(seed: int, height_px: int, width_px: int) -> np.ndarray:
+    """(height, width) float32 noise of unit variance over several octaves, seamless."""
+    rng = np.random.default_rng(seed)
+    frequency = np.hypot(np.fft.fftfreq(height_px)[:, None], np.fft.fftfreq(width_px)[None, :])
+    frequency[0, 0] = np.inf
+    noise = np.fft.ifft2(np.fft.fft2(rng.standard_normal((height_px, width_px))) / frequency).real
+    return (noise / noise.std()).astype(np.float32)
+
+
+def _matcher(config: StereoConfig, disparities: int) -> cv2.StereoSGBM:
+    area = config.block_px**2
+    return cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=disparities,
+        blockSize=config.block_px,
+        P1=round(8 * area * config.smoothness),
+        P2=round(32 * area * config.smoothness),
+        disp12MaxDiff=config.left_right_px,
+        preFilterCap=31,
+        uniquenessRatio=config.uniqueness_percent,
+        speckleWindowSize=config.speckle_px,
+        speckleRange=1,
+        mode=cv2.STEREO_SGBM_MODE_SGBM,
+    )
+
+
+def _unit(x, y, z) -> tuple[np.ndarray, np.ndarray]:
+    """((3, H, W) unit vectors, (H, W) lengths)."""
+    vector = np.stack([x, y, z])
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    return vector / np.maximum(length, np.float32(1e-6)), length
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _reflect(normal, to_light, to_view) -> tuple[np.ndarray, np.ndarray]:
+    """Lambert's cosine and the Blinn-Phong highlight, (H, W) each."""
+    diffuse = np.maximum(_dot(normal, to_light), 0)
+    half = to_light + to_view
+    squared = np.maximum(_dot(normal, half), 0) ** 2 / np.maximum(_dot(half, half), np.float32(1e-6))
+    for _ in range(SHININESS_DOUBLINGS - 1):
+        squared = squared * squared
+    return diffuse, squared * (diffuse > 0)
+
+
+def _contrast(picture: np.ndarray) -> np.ndarray:
+    """(H, W) float32: standard deviation of the grey levels around each pixel."""
+    window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)
+    mean, square = cv2.blur(picture.astype(np.float32), window), cv2.sqrBoxFilter(picture, cv2.CV_32F, window)
+    return np.sqrt(np.maximum(square - mean * mean, 0.0))
+
+
+def _without_mean(picture: np.ndarray) -> np.ndarray:
+    """(H, W) float32: the picture less its local mean."""
+    picture = picture.astype(np.float32)
+    return picture - cv2.blur(picture, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX))
+
+
+def _refine(
+    left: np.ndarray, right: np.ndarray, coarse_px: np.ndarray, config: StereoConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """One Gauss-Newton step on the windowed squared difference (Lucas and Kanade 1981).
+
+    The semi-global matcher interpolates its cost by a parabola in 1/16 px, which pulls towards whole
+    pixels and differs from pixel to pixel. With i the pixels of a window, c_i their coarse disparity, e_i
+    the difference of the pictures there and s_i the slope, the disparity d that all of them share minimises
+    sum (e_i + s_i (d - c_i))^2. Pixels whose c_i is more than OTHER_SURFACE_PX from their neighbourhood's
+    median do not take part.
+
+    Returns:
+        (H, W) disparity in pixels, moved by at most half a pixel; (H, W) residual relative to the
+        local contrast: near 0 for a perfect match, 1.4 for unrelated pictures.
+    """
+    gradient = cv2.Sobel(right, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+    grid = np.indices(left.shape, dtype=np.float32)
+    rows, at = grid[0], grid[1] - coarse_px
+    matched = cv2.remap(right, at, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    slope = cv2.remap(gradient, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    window = (config.refine_window_px, config.refine_window_px)
+    difference = left - matched
+    middle = cv2.medianBlur(coarse_px, 5)
+    smooth = cv2.blur(middle, window)
+    smooth = np.where(np.abs(smooth - middle) < OTHER_SURFACE_PX, smooth, middle)
+    weight = slope * slope * (np.abs(coarse_px - middle) < OTHER_SURFACE_PX)
+    towards = weight * (coarse_px - smooth) - np.where(weight > 0, slope * difference, 0)
+    total = cv2.blur(weight, window)
+    fine = smooth + cv2.blur(towards, window) / np.maximum(total, 1e-3)
+    window = (config.residual_window_px, config.residual_window_px)
+    energy = 0.5 * cv2.blur(left * left + matched * matched, window) + 1e-3
+    residual = np.sqrt(cv2.blur(difference * difference, window) / energy)
+    return np.clip(fine, coarse_px - 0.5, coarse_px + 0.5), residual
+
+
+def flatten(fine_px: np.ndarray, valid: np.ndarray, config: StereoConfig) -> np.ndarray:
+    """(H, W) disparity, noise on flat surfaces averaged away over a window, edges and relief kept.
+
+    Lee's filter (1980) about the window's plane instead of its mean: with v the variance of the window from
+    its plane and n that of the noise, a pixel keeps max(0, 1 - n / v) of its distance from the plane. For the
+    fit, small holes are filled with the mean around them; large ones leave v, and so the pixel, as it is.
+    """
+    window = (config.flat_window_px, config.flat_window_px)
+    share = cv2.blur(valid.astype(np.float32), window)
+    around = cv2.blur(np.where(valid, fine_px, 0), window) / np.maximum(share, 1e-3)
+    whole = np.where(valid, fine_px, around)
+    variance, plane = planes.residual_variance(whole, config.flat_window_px)
+    keep = np.maximum(1.0 - config.flat_noise_px**2 / np.maximum(variance, 1e-9), 0.0)
+    return (plane + keep * (whole - plane)).astype(np.float32)

@@ -1,0 +1,130 @@
+"""Procedural depth noise: baselines that draw errors from formulas. JAX.
+
+`dextrah`: the model that DextrAH-G trains with (Lum et al. 2024, "DextrAH-G: Pixels-to-Action Dexterous
+Arm-Hand Grasping with Geometric Fabrics"; strengths from its published code): correlated noise in disparity,
+pixel dropout, random values, sticks.
+`kinect`: the model of Handa et al. 2014 ("A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM",
+after Barron and Malik 2013) with the axial noise that Khoshelham and Elberink 2012 measured.
+"""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ddgrasp.config import DextrahConfig, KinectConfig
+from ddgrasp.contract import CameraProfile
+from sensors.models.sense import Sense, batched
+
+NEAREST_M = 0.05
+"""Noise never brings a surface nearer than this."""
+MOST_STICKS = 4.0
+"""Room for this many deviations more sticks than are expected in a picture."""
+
+
+def dextrah(config: DextrahConfig, profile: CameraProfile) -> Sense:
+    """DextrAH-G's depth noise. `profile` gives focal length times baseline."""
+    return batched(partial(_dextrah_frame, config, profile.fx_px * profile.baseline_m))
+
+
+def kinect(config: KinectConfig, profile: CameraProfile) -> Sense:
+    """Kinect-style depth noise. `profile` gives focal length times baseline."""
+    return batched(partial(_kinect_frame, config, profile.fx_px * profile.baseline_m))
+
+
+def _dextrah_frame(
+    config: DextrahConfig, fb_px_m: float, key: Array, depth_m: Array, rgb: Array | None
+) -> Array:
+    shift_key, noise_key, replace_key, value_key, drop_key, stick_key = jax.random.split(key, 6)
+    shape = (depth_m.shape[0], depth_m.shape[1])
+    shift = config.shift_px * smooth_field(shift_key, (2, *shape), config.correlation_px)
+    noise = config.disparity_px * smooth_field(noise_key, shape, config.correlation_px)
+    noisy = add_disparity(shifted(depth_m, shift), noise, fb_px_m)
+    near, far = config.random_near_m, config.random_far_m
+    values = jax.random.uniform(value_key, shape, minval=near, maxval=far)
+    noisy = jnp.where(jax.random.bernoulli(replace_key, config.random_value, shape), values, noisy)
+    noisy = jnp.where(jax.random.bernoulli(drop_key, config.dropout, shape), 0.0, noisy)
+    return draw_sticks(stick_key, noisy, config)
+
+
+def _kinect_frame(
+    config: KinectConfig, fb_px_m: float, key: Array, depth_m: Array, rgb: Array | None
+) -> Array:
+    shift_key, noise_key = jax.random.split(key)
+    shift = config.shift_px * jax.random.normal(shift_key, (2, *depth_m.shape))
+    seen = shifted(depth_m, shift)
+    noisy = seen + axial_deviation_m(seen, config.axial_per_m) * jax.random.normal(noise_key, depth_m.shape)
+    return jnp.where(seen > 0, quantised(jnp.maximum(noisy, NEAREST_M), fb_px_m, config.steps_per_px), 0.0)
+
+
+# --- the equations ---------------------------------------------------------------------------------
+
+
+def axial_deviation_m(depth_m: Array, per_m: float) -> Array:
+    """sigma_z = per_m z^2 (Khoshelham and Elberink 2012, eq. 11)."""
+    return per_m * depth_m**2
+
+
+def quantised(depth_m: Array, fb_px_m: float, steps_per_px: float) -> Array:
+    """z = n f B / round(n f B / z), n steps per pixel (Barron and Malik 2013; n f B is their 35130 cm).
+
+    They round x + 1/2, which moves every depth by half a step; here the nearest step is taken.
+    """
+    scaled = fb_px_m * steps_per_px
+    return scaled / jnp.maximum(jnp.round(scaled / jnp.maximum(depth_m, NEAREST_M)), 1.0)
+
+
+def add_disparity(depth_m: Array, noise_px: Array, fb_px_m: float) -> Array:
+    """z' = f B / (f B / z + noise); 0 stays 0."""
+    disparity = fb_px_m / jnp.maximum(depth_m, NEAREST_M) + noise_px
+    return jnp.where(depth_m > 0, fb_px_m / jnp.clip(disparity, 1e-3, fb_px_m / NEAREST_M), 0.0)
+
+
+def shifted(depth_m: Array, shift_px: Array) -> Array:
+    """z'(v, u) = z(v + s_0, u + s_1) at the nearest pixel: edges become ragged, depths are not mixed.
+
+    depth_m (H, W), shift_px (2, H, W); places outside take the nearest pixel inside.
+    """
+    height, width = depth_m.shape
+    rows = jnp.arange(height)[:, None] + jnp.round(shift_px[0]).astype(int)
+    columns = jnp.arange(width)[None, :] + jnp.round(shift_px[1]).astype(int)
+    return depth_m[jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)]
+
+
+def smooth_field(key: Array, shape: tuple[int, ...], correlation_px: float) -> Array:
+    """(..., H, W) Gaussian noise of unit variance at every pixel, correlated over `correlation_px`."""
+    *lead, height, width = shape
+    up, across = (_interpolation(size, correlation_px) for size in (height, width))
+    coarse = jax.random.normal(key, (*lead, up.shape[1], across.shape[1]))
+    return jnp.einsum("ij,...jk,lk->...il", up, coarse, across)
+
+
+def _interpolation(size: int, spacing_px: float) -> Array:
+    """(size, n) linear interpolation from n knots, rows of unit norm, so that the variance stays one."""
+    knots = math.ceil((size - 1) / max(spacing_px, 1.0)) + 1
+    place = jnp.arange(size)[:, None] * (knots - 1) / max(size - 1, 1)
+    weights = jnp.maximum(1.0 - jnp.abs(place - jnp.arange(knots)[None, :]), 0.0)
+    return weights / jnp.linalg.norm(weights, axis=1, keepdims=True)
+
+
+def draw_sticks(key: Array, depth_m: Array, config: DextrahConfig) -> Array:
+    """Thin segments of one random depth each over (H, W): every pixel starts one with probability `stick`."""
+    height, width = depth_m.shape
+    expected = config.stick * height * width
+    most = math.ceil(expected + MOST_STICKS * math.sqrt(expected))
+    share = expected / max(most, 1)
+    rows, columns = jnp.arange(height)[:, None] + 0.5, jnp.arange(width)[None, :] + 0.5
+
+    def draw(i: Array, picture: Array) -> Array:
+        row, column, angle, length, thick, value, there = jax.random.uniform(jax.random.fold_in(key, i), (7,))
+        v, u = rows - row * height, columns - column * width
+        sine, cosine = jnp.sin(2 * jnp.pi * angle), jnp.cos(2 * jnp.pi * angle)
+        along, across = u * cosine + v * sine, v * cosine - u * sine
+        half_width = (1.0 + thick * (config.stick_width_px - 1.0)) / 2
+        on = (along >= 0) & (along <= length * config.stick_length_px) & (jnp.abs(across) <= half_width)
+        depth = config.random_near_m + value * (config.random_far_m - config.random_near_m)
+        return jnp.where(on & (there < share), depth, picture)
+
+    return jax.lax.fori_loop(0, most, draw, depth_m)

@@ -1,0 +1,230 @@
+"""Recordings from elsewhere into the format of `recordings.py`: folders of pictures, RealSense files.
+
+Only pictures and what the camera is are kept: no pose, no CAD, no pairing. A frame that cannot be used is
+named and left out; a source none of whose frames can be used, or whose depth is in another unit, is refused.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ddgrasp.contract import DEPTH_UNIT_M
+from ddgrasp.errors import UserError
+from sensors.recordings.recording import FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M, RecordingWriter
+from sensors.recordings.sources import RawFrame, Source
+
+COLOR_FOLDERS = ("color", "colour", "rgb", "image")
+DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
+REALSENSE_SUFFIXES = (".bag", ".db3")
+_ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
+_UINT16_MAX = np.iinfo(np.uint16).max
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What became of one source."""
+
+    path: Path
+    frames: int
+    skipped: tuple[str, ...]
+    """Frames left out: name and reason."""
+
+
+def import_recording(source: Source, path: Path) -> Imported:
+    """Writes the usable frames of `source` to a recording at `path`, which appears only when complete.
+
+    Raises:
+        UserError: no usable frame, or depth whose median cannot be a D4xx's in that unit.
+    """
+    skipped, medians_m, size, frames = [], [], None, 0
+    with RecordingWriter(path, source.meta) as writer:
+        for frame in source.frames():
+            medians_m += _median_m(frame, source.depth_unit_m)
+            depth_mm, reason = _usable(frame, source.depth_unit_m, size)
+            if depth_mm is None or frame.rgb is None:
+                skipped.append(f"{frame.name}: {reason}")
+                continue
+            size = depth_mm.shape
+            frames += 1
+            writer.add(frame.rgb, depth_mm)
+        writer.meta.update(source.closing_meta())
+        _check_unit(source, medians_m)
+        if not frames:
+            raise UserError(
+                f"{source.path}: none of its {len(skipped)} frames can be used "
+                f"({skipped[0] if skipped else 'it is empty'})."
+            )
+    return Imported(path, frames, tuple(skipped))
+
+
+def import_all(sources: list[Source], out: Path) -> tuple[list[Imported], list[str]]:
+    """Imports each source to `out`/<its name>; (what was imported, why others were refused).
+
+    Raises:
+        UserError: every one was refused.
+    """
+    done, refused = [], []
+    for source in sources:
+        try:
+            done.append(import_recording(source, out / source.path.stem))
+        except UserError as error:
+            refused.append(str(error))
+    if not done:
+        raise UserError(refused[0])
+    return done, refused
+
+
+def summary(done: list[Imported], refused: list[str]) -> str:
+    """What was imported and left out, counts last."""
+    lines = [f"refused: {why}" for why in refused]
+    lines += [f"{one.path}: left out {what}" for one in done for what in one.skipped]
+    lines += [f"{one.path}: {one.frames} frames" for one in done]
+    frames, skipped = sum(one.frames for one in done), sum(len(one.skipped) for one in done)
+    return "\n".join(
+        [
+            *lines,
+            f"{len(done)} recordings with {frames} frames imported; "
+            f"left out: {skipped} frames, {len(refused)} recordings",
+        ]
+    )
+
+
+def _usable(frame: RawFrame, unit_m: float, size: tuple[int, ...] | None) -> tuple[np.ndarray | None, str]:
+    """((H, W) uint16 millimetres, "") or (None, why the frame is left out)."""
+    depth = frame.depth
+    if depth is None:
+        return None, "depth cannot be read"
+    if depth.ndim != 2 or depth.dtype == np.uint8:
+        return None, f"depth is {depth.dtype} {depth.shape}, expected one channel of 16 bits or floats"
+    if frame.rgb is None:
+        return None, "colour is missing or cannot be read"
+    if size is not None and depth.shape != size:
+        return None, f"depth is {depth.shape[1]}x{depth.shape[0]}, the frames before it {size[1]}x{size[0]}"
+    millimetres = np.nan_to_num(depth.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    millimetres = np.rint(millimetres * (unit_m / DEPTH_UNIT_M))
+    # What does not fit 16 bits is out of a D4xx's range: no reading.
+    millimetres[(millimetres < 0) | (millimetres > _UINT16_MAX)] = 0
+    if not millimetres.any():
+        return None, "no valid depth pixel"
+    return millimetres.astype(np.uint16), ""
+
+
+def _median_m(frame: RawFrame, unit_m: float) -> list[float]:
+    """The median of a frame's positive depths in metres; nothing if it has none."""
+    if frame.depth is None or frame.depth.dtype == np.uint8:
+        return []
+    positive = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
+    return [float(np.median(positive)) * unit_m] if positive.size else []
+
+
+def _check_unit(source: Source, medians_m: list[float]) -> None:
+    median_m = float(np.median(medians_m)) if medians_m else NEAREST_MEDIAN_M
+    if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
+        return
+    far = median_m > FARTHEST_MEDIAN_M
+    unit_m = source.depth_unit_m * (DEPTH_UNIT_M if far else 1.0 / DEPTH_UNIT_M)
+    remedy = f"give its unit, perhaps --depth-unit-m {unit_m:g}"
+    if source.unit_is_certain:
+        remedy = f"point the camera at something {'nearer' if far else 'farther'}"
+    raise UserError(
+        f"{source.path}: median depth {median_m:.4g} m with {source.depth_unit_m:g} m per unit; expected "
+        f"{NEAREST_MEDIAN_M:g} to {FARTHEST_MEDIAN_M:g} m: {remedy}."
+    )
+
+
+# --- folders of pictures ---------------------------------------------------------------------------
+
+
+def folder_sources(root: Path, depth_unit_m: float, meta: dict[str, Any]) -> list[Source]:
+    """`root` if it has depth/ and a colour folder, else every folder in it that does.
+
+    Raises:
+        UserError: neither.
+    """
+    folders = [root] if _is_pair(root) else sorted(p for p in root.iterdir() if _is_pair(p))
+    if not folders:
+        raise UserError(
+            f"{root}: no depth/ beside one of {', '.join(f'{n}/' for n in COLOR_FOLDERS)} in it or in its "
+            "folders; put the pictures there, named alike."
+        )
+    return [folder_source(folder, depth_unit_m, meta) for folder in folders]
+
+
+def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> Source:
+    """Pictures depth/*.png (16 bits), .npy or .tif, matched by name with those of the colour folder.
+
+    `depth_unit_m` 0 takes millimetres for integers, metres for floats.
+    """
+    files = sorted(p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
+    if not files:
+        raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
+    if not depth_unit_m:
+        first = next((d for d in map(_read_depth, files) if d is not None), None)
+        floats = first is not None and np.issubdtype(first.dtype, np.floating)
+        depth_unit_m = 1.0 if floats else DEPTH_UNIT_M
+    colors = {_key(p): p for p in _color_folder(folder).iterdir() if p.suffix.lower() in COLOR_SUFFIXES}
+
+    def frames() -> Iterator[RawFrame]:
+        for file in files:
+            color = colors.get(_key(file))
+            yield RawFrame(file.name, _read_depth(file), None if color is None else _read_rgb(color))
+
+    return Source(folder, frames, depth_unit_m, meta)
+
+
+def _is_pair(folder: Path) -> bool:
+    return (folder / "depth").is_dir() and any((folder / name).is_dir() for name in COLOR_FOLDERS)
+
+
+def _color_folder(folder: Path) -> Path:
+    return next(folder / name for name in COLOR_FOLDERS if (folder / name).is_dir())
+
+
+def _key(file: Path) -> str:
+    """The file's name without what says whether it is depth or colour: 0007_depth and 0007_rgb are a pair."""
+    words = file.stem.lower().replace("-", "_").split("_")
+    return "_".join(word for word in words if word not in _ROLE_WORDS)
+
+
+def _read_depth(file: Path) -> np.ndarray | None:
+    if file.suffix.lower() == ".npy":
+        try:
+            return np.load(file, allow_pickle=False)
+        except (ValueError, EOFError, OSError):
+            return None
+    return cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED) if file.stat().st_size else None
+
+
+def _read_rgb(file: Path) -> np.ndarray | None:
+    bgr = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR) if file.stat().st_size else None
+    return None if bgr is None else cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+# --- anything --------------------------------------------------------------------------------------
+
+
+def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> list[Source]:
+    """A RealSense file (`.bag`, `.db3`), a folder of them, or folders of pictures.
+
+    Raises:
+        UserError: nothing there that can be imported.
+    """
+    if not path.exists():
+        raise UserError(
+            f"{path}: no such file or folder; expected a .bag or .db3, a folder of them, or one of pictures."
+        )
+    if path.is_file() and path.suffix not in REALSENSE_SUFFIXES:
+        raise UserError(f"{path}: a file of type {path.suffix!r}; expected a RealSense .bag or .db3.")
+    inside = [path] if path.is_file() else sorted(path.iterdir())
+    files = [file for file in inside if file.suffix in REALSENSE_SUFFIXES]
+    if not files:
+        return folder_sources(path, depth_unit_m, meta)
+    from sensors.recordings.realsense import file_source
+
+    sources = [file_source(file) for file in files]
+    return [replace(s, depth_unit_m=depth_unit_m or s.depth_unit_m, meta={**s.meta, **meta}) for s in sources]

@@ -1,0 +1,102 @@
+"""RealSense D4xx frames through pyrealsense2 (`pip install -e '.[realsense]'`), depth unaligned, no filters.
+
+Here the recorded file (`.bag`, or `.db3` as pyrealsense2 2.59 writes) and what it shares with a camera; the
+camera is in `realsense_live.py`. Run on files of synthetic frames that pyrealsense2 2.56 (`.bag`) and 2.59
+(`.db3`) wrote; no file of a real camera was at hand.
+"""
+
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddgrasp.errors import UserError
+from sensors.recordings.sources import RawFrame, Source
+
+END_OF_FILE_MS = 2000
+"""A file that gives no frame for so long has ended."""
+
+
+def file_source(file: Path) -> Source:
+    """The depth and colour streams of `file`, depth in the device's own unit.
+
+    Raises:
+        UserError: pyrealsense2 is not installed, or `file` has no such streams.
+    """
+    rs = load_pyrealsense2()
+    _, _, profile = _opened(rs, file)
+    meta, unit_m = describe(rs, profile)
+    return Source(file, lambda: _frames(rs, file), unit_m, meta)
+
+
+def describe(rs: Any, profile: Any) -> tuple[dict[str, Any], float]:
+    """(fields of meta.json, metres per count of depth) of a pipeline's `profile`."""
+    device = profile.get_device()
+    depth = profile.get_stream(rs.stream.depth).as_video_stream_profile()
+    sensor = device.first_depth_sensor()
+    meta = {
+        "sensor": device.get_info(rs.camera_info.name),
+        "color_aligned_to_depth": False,
+        "consecutive_frames": True,
+        "hz": depth.fps(),
+        "fx_px": depth.get_intrinsics().fx,
+    }
+    if sensor.supports(rs.option.stereo_baseline):
+        meta["baseline_m"] = abs(sensor.get_option(rs.option.stereo_baseline)) / 1000.0
+    return meta, sensor.get_depth_scale()
+
+
+def raw_frame(frames: Any) -> RawFrame:
+    """Depth and colour of a set of frames, copied: librealsense reuses its buffers."""
+    depth, color = frames.get_depth_frame(), frames.get_color_frame()
+    return RawFrame(
+        f"frame {frames.get_frame_number()}",
+        np.array(depth.get_data()) if depth else None,
+        np.array(color.get_data()) if color else None,
+    )
+
+
+def load_pyrealsense2() -> Any:
+    """The module. Raises UserError if it, or a library of the system that it needs, is missing."""
+    try:
+        return importlib.import_module("pyrealsense2")
+    except ModuleNotFoundError as error:
+        raise UserError(f"RealSense needs pyrealsense2 ({error}): pip install -e '.[realsense]'.") from error
+    except ImportError as error:
+        raise UserError(
+            f"pyrealsense2 cannot be loaded ({error}): install the library it names, for libusb on Debian or "
+            "Ubuntu apt install libusb-1.0-0."
+        ) from error
+
+
+def _frames(rs: Any, file: Path) -> Iterator[RawFrame]:
+    pipeline, config, profile = _opened(rs, file)
+    # Before the start: what is played in real time until then is lost to a slow reader.
+    profile.get_device().as_playback().set_real_time(False)
+    pipeline.start(config)
+    try:
+        while True:
+            arrived, frames = pipeline.try_wait_for_frames(END_OF_FILE_MS)
+            if not arrived:
+                return
+            yield raw_frame(frames)
+    finally:
+        pipeline.stop()
+
+
+def _opened(rs: Any, file: Path) -> tuple[Any, Any, Any]:
+    """(pipeline, config, profile) of `file`, not started."""
+    pipeline, config = rs.pipeline(), rs.config()
+    try:
+        config.enable_device_from_file(str(file), repeat_playback=False)
+        # Without a rate (0: any), the binding takes the format for a stream's index and finds none.
+        config.enable_stream(rs.stream.depth, rs.format.z16, 0)
+        config.enable_stream(rs.stream.color, rs.format.rgb8, 0)
+        return pipeline, config, config.resolve(rs.pipeline_wrapper(pipeline))
+    except RuntimeError as error:
+        raise UserError(
+            f"{file}: no depth (z16) and colour (rgb8) of a RealSense can be read ({error}); record both, or "
+            "update pyrealsense2 if a newer one wrote the file."
+        ) from error

@@ -1,0 +1,35 @@
+"""Where recordings come from: frames in time order, as a file, a folder or a camera has them."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """One frame as its source has it."""
+
+    name: str
+    depth: np.ndarray | None
+    """(H, W) counts or floating-point lengths; None if it cannot be read."""
+    rgb: np.ndarray | None
+    """(h, w, 3) uint8; None if there is none."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Frames in time order and what is known about their camera."""
+
+    path: Path
+    frames: Callable[[], Iterator[RawFrame]]
+    depth_unit_m: float
+    """Metres per count of integer depth; for floating-point depth, metres per unit."""
+    meta: dict[str, Any]
+    """Fields of meta.json."""
+    unit_is_certain: bool = False
+    """Whether depths that cannot be a D4xx's are the scene's fault, not the unit's."""
+    closing_meta: Callable[[], dict[str, Any]] = dict
+    """Fields of meta.json that are known after the last frame alone."""
