@@ -136,8 +136,8 @@ def _folders(root: Path) -> list[Path]:
 def _read(
     recording: Recording, limit: int, config: DDGConfig, prior: Prior, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """Of the first `limit` frames: (depth (T, H, W) in metres at the generator's size, rgb (T, h, w, 3) if
-    the prior wants it, number of frames left out).
+    """The first `limit` frames: (depth (T, H, W) in metres at the generator's size, rgb (T, h, w, 3) if the
+    prior wants it, number of frames left out).
     """
     if recording.skipped:
         progress.note(recording.skipped_summary())

@@ -38,7 +38,7 @@ class Generator:
 
     config: DDGConfig
     params: Params
-    """Of the fitted network, or of the distilled one for sampler progressive."""
+    """Parameters of the fitted network, or of the distilled one for sampler progressive."""
     prior: Prior
 
     @classmethod

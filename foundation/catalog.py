@@ -26,7 +26,7 @@ class Entry:
     published: str
     """Who publishes it, and where."""
     licence: str
-    """Of the weights."""
+    """Licence of the weights."""
     used_for: str
 
 

@@ -27,7 +27,7 @@ from sensors.models.random_scenes import random_device, take_picture
 WORK = ".work"
 """Folder of unfinished training, beside the result; removed at the end."""
 TEST_SHARE = 1 / 8
-"""Of the devices: cameras, and rooms, that training never sees."""
+"""Share of the devices (cameras, and rooms) that training never sees."""
 WARMUP_STEPS = 50
 _TEST_MAPS = 768
 _SCALE_MAPS = 512

@@ -77,6 +77,7 @@ class StudentPolicy(nn.Module):
     profile: CameraProfile
 
     def setup(self) -> None:
+        """Flax: builds the parts that the configuration names."""
         check_head(self.config)
         self.encoder = DepthEncoder(self.config, self.profile)
         self.aux_hidden = nn.Dense(self.config.feature_size)

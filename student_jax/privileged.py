@@ -19,7 +19,7 @@ ERROR_PER_DISTANCE = 0.08
 FAR_ERROR_M = 0.010
 """Standard deviation of a position per axis: near + slope * distance, at most far."""
 YAW_ERROR = 0.15
-"""Of cosine and sine of the doubled angle: four degrees."""
+"""Standard deviation of cosine and sine of the doubled angle: four degrees."""
 HELD_LOGIT = 6.0
 HELD_WRONG = 0.01
 """Share of steps whose held probability is the wrong way round."""

@@ -27,6 +27,7 @@ class Run(FromPreset):
     """The whole flow: teacher, demos, record, ddg, student, export, deploy, report."""
 
     def run(self) -> None:
+        """Makes every stage that is not finished and prints the table."""
         from evaluation.report.summary import print_summary
 
         check_config_values(self.config)

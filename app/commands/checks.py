@@ -63,5 +63,6 @@ def _check_start(stage: str, init_from: str, file: str) -> None:
 
 
 def check_count(option: str, value: int) -> None:
+    """UserError unless `value` is at least 1."""
     if value < 1:
         raise UserError(f"{option} is {value}; expected at least 1.")

@@ -29,9 +29,10 @@ class StudentEval:
     trials: int = 200
     """Episodes per kind of depth."""
     seed: int = 1
-    """Of the episodes."""
+    """Seed of the episodes."""
 
     def run(self) -> None:
+        """Prints success on clean and on generated depth, with Wilson intervals."""
         from ddg_jax.sample import Generator
         from ddgrasp.progress import Progress
         from evaluation import wilson
@@ -79,6 +80,7 @@ class Deploy:
     """How long to run; inf runs until Ctrl-C."""
 
     def run(self) -> None:
+        """Runs the loop until the time is over or Ctrl-C, and prints how it kept time."""
         from deploy.session import SessionOptions, deploy, describe
 
         options = SessionOptions(self.robot, self.camera, self.recording, self.object_name, self.seconds)

@@ -34,7 +34,7 @@ JSON = "curve.json"
 POINT = "point.json"
 COLUMNS = ("sim_gt", "ddg_no_graft", "ddg")
 EVALUATIONS = 8
-"""Of the second-order sampler: what is compared is the fit, so no point is distilled."""
+"""Evaluations of the second-order sampler: what is compared is the fit, so no point is distilled."""
 
 
 def run(job: Job) -> Artifact:

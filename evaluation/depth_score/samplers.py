@@ -90,7 +90,7 @@ def _row(figures: dict[str, Any], scored: Scored, domain: str) -> dict[str, Any]
 
 
 def _frames_per_s(generator: "Generator", loads: Sequence[Load]) -> float:
-    """Of `ddg_jax.sample.generate` on TIMED_FRAMES frames, compiled before."""
+    """Speed of `ddg_jax.sample.generate` on TIMED_FRAMES frames, compiled before."""
     import jax
 
     from ddg_jax.sample import generate
