@@ -351,7 +351,7 @@ def _hash(value: Any) -> str:
 
 
 def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
-    """'student.width is 16 there, 32 here' for every differing leaf."""
+    """'student.encoder.width is 16 there, 32 here' for every differing leaf."""
     if isinstance(there, Mapping) and isinstance(here, Mapping):
         for key in sorted({*there, *here}):
             yield from _differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)

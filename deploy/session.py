@@ -168,10 +168,10 @@ def _franka(config: Config, clock: Clock) -> Robot:
 
     deploy_config = config.deploy
     return FrankaRobot(
-        deploy_config.franka_host,
+        deploy_config.franka.host,
         clock,
-        dynamics=deploy_config.franka_dynamics,
-        grip_force_n=deploy_config.franka_grip_force_n,
+        dynamics=deploy_config.franka.dynamics,
+        grip_force_n=deploy_config.franka.grip_force_n,
     )
 
 
@@ -184,4 +184,4 @@ def _realsense(config: Config, info: PolicyMetadata, clock: Clock) -> Camera:
             "with export.depth_dtype uint16_mm."
         )
     profile = contract.D455.scaled(info.depth_width / contract.D455.width_px)
-    return RealSenseCamera(clock, profile, serial=config.deploy.realsense_serial)
+    return RealSenseCamera(clock, profile, serial=config.deploy.realsense.serial)

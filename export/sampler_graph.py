@@ -17,7 +17,7 @@ def write_sampler(
     """DDIM from the noise input to the action output."""
     schedule = policy.noise_schedule(student)
     network = _Denoiser(g, cond, params, student)
-    size = student.chunk * contract.ACTION_SIZE
+    size = student.head.chunk * contract.ACTION_SIZE
     x = g.reshape(contract.ONNX_INPUT_NOISE, [0, size])
     for k, row in zip(
         diffusion.ddim_timesteps(schedule.steps, iterations),
@@ -25,7 +25,7 @@ def write_sampler(
         strict=True,
     ):
         x = _write_ddim_step(g, x, network.predict(x, int(k)), row)
-    shape = g.integers([0, student.chunk, contract.ACTION_SIZE])
+    shape = g.integers([0, student.head.chunk, contract.ACTION_SIZE])
     g.nodes.append(onnx.helper.make_node("Reshape", [x, shape], [contract.ONNX_OUTPUT_ACTION], name="action"))
 
 
@@ -49,15 +49,15 @@ class _Denoiser:
 
     def __init__(self, g: GraphBuilder, cond: str, params: Params, student: StudentConfig):
         self.g, self.params, self.student = g, params, student
-        self.film = student.conditioning == "film"
-        self.action_size = student.chunk * contract.ACTION_SIZE
-        blocks = range(student.denoiser_blocks) if self.film else []
+        self.film = student.head.conditioning == "film"
+        self.action_size = student.head.chunk * contract.ACTION_SIZE
+        blocks = range(student.head.blocks) if self.film else []
         self.films = [self._shared(cond, np.asarray(params[f"block{i}"]["film"]["kernel"])) for i in blocks]
         if not self.film:
             self.input = self._shared(cond, np.asarray(params["input"]["kernel"])[self.action_size :])
 
     def _shared(self, cond: str, kernel: np.ndarray) -> str:
-        return self.g.op("MatMul", cond, self.g.constant(kernel[: -self.student.time_features]))
+        return self.g.op("MatMul", cond, self.g.constant(kernel[: -self.student.head.time_features]))
 
     def predict(self, x: str, k: int) -> str:
         """Noise predicted for the flattened chunk x (B, chunk * 8) at diffusion step k."""
@@ -69,13 +69,13 @@ class _Denoiser:
         else:
             fixed = bias + time @ kernel[-len(time) :]
             x = g.add(g.affine(x, kernel[: self.action_size], fixed), self.input)
-        for index in range(self.student.denoiser_blocks):
+        for index in range(self.student.head.blocks):
             x = self._block(x, index, time)
         return g.dense(g.silu(self._layer_norm(x, params["norm"])), params["output"])
 
     def _time(self, k: int) -> np.ndarray:
         """The embedded step after its two Dense layers."""
-        angles = k * denoiser.time_frequencies(self.student.time_features)
+        angles = k * denoiser.time_frequencies(self.student.head.time_features)
         first, second = self.params["time_first"], self.params["time_second"]
         hidden = np.concatenate([np.sin(angles), np.cos(angles)]) @ first["kernel"] + first["bias"]
         hidden = hidden / (1.0 + np.exp(-hidden))
@@ -85,7 +85,7 @@ class _Denoiser:
         g, params = self.g, self.params[f"block{index}"]
         y = g.dense(self._layer_norm(x, params["norm"]), params["first"])
         if self.film:
-            width = self.student.denoiser_width
+            width = self.student.head.width
             fixed = (
                 np.asarray(params["film"]["bias"]) + time @ np.asarray(params["film"]["kernel"])[-len(time) :]
             )

@@ -57,8 +57,8 @@ class Trainer:
         self._restore()
         self._phase("poses", self._fit_on_poses)
         frames_io.add_noisy_demos(demos, self._store, self._generator, self._config, self._progress)
-        self._phase("demos", lambda: self._fit("demos", self._student.train_steps))
-        for i in range(1, self._student.dagger_rounds + 1):
+        self._phase("demos", lambda: self._fit("demos", self._student.training.steps))
+        for i in range(1, self._student.dagger.rounds + 1):
             self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))
         self._phase("head", self._fit_on_perception)
 
@@ -96,7 +96,7 @@ class Trainer:
             self.params["encoder"] = pretrained_encoder.load_into(self.params["encoder"], self._student)
 
     def _fit_on_poses(self) -> dict[str, float]:
-        if self._student.pose_rounds == 0:
+        if self._student.poses.rounds == 0:
             return {}
         self.params, measured = head.fit_on_poses(
             self._config, self._teacher, self.params, self._directory, self._progress
@@ -104,7 +104,7 @@ class Trainer:
         return measured
 
     def _fit_on_perception(self) -> dict[str, float]:
-        if self._student.head_steps == 0:
+        if self._student.head.train_steps == 0:
             return {}
         frames = frames_io.load(self._directory / frames_io.CACHE)
         self.params, measured = head.fit_on_perception(
@@ -115,11 +115,11 @@ class Trainer:
     def _dagger(self, number: int, demo_count: int) -> dict[str, float]:
         """One round: roll out if that was not done yet, then fit on everything."""
         student = self._student
-        wanted = demo_count + number * student.dagger_episodes
+        wanted = demo_count + number * student.dagger.episodes
         measured = {}
         if len(self._store) < wanted:
             first = len(self._store)
-            share = student.dagger_teacher_share * (1 - (number - 1) / max(1, student.dagger_rounds - 1))
+            share = student.dagger.teacher_share * (1 - (number - 1) / max(1, student.dagger.rounds - 1))
             key = jax.random.key(self._config.seed)
             rng = np.random.default_rng([self._config.seed, _DAGGER_SEED, number])
             camera = DDGCamera(self._generator, key, first=first)
@@ -134,7 +134,7 @@ class Trainer:
             frames_io.add_rollouts(self._store, episodes, actor.seen_mm)
             measured["rollout_success"] = rate = float(episodes.success.mean())
             self._progress.note(f"round {number}: {rate:.0%} success with the teacher taking {share:.0%}")
-        return measured | self._fit(f"dagger-{number}", student.dagger_steps)
+        return measured | self._fit(f"dagger-{number}", student.dagger.steps)
 
     def _fit(self, phase: str, steps: int) -> dict[str, float]:
         """`steps` optimiser steps on all frames, from the current parameters."""
@@ -149,7 +149,7 @@ class Trainer:
             task.start_at(int(state.step))
             for i in range(int(state.step), steps):
                 rng = np.random.default_rng([self._config.seed, _phase_number(phase), i])
-                index = frames.draw(rng, student.batch_size, student.held_weight)
+                index = frames.draw(rng, student.training.batch_size, student.training.held_weight)
                 batch = train.make_batch(frames, index, rng, student, profile)
                 state, terms = train.train_step(student, profile, steps, state, frozen, batch)
                 if (i + 1) % LOG_EVERY == 0:

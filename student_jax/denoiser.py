@@ -18,14 +18,16 @@ STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M]
 
 def check_denoiser(config: StudentConfig) -> None:
     """UserError for options that do not exist."""
-    if config.conditioning not in CONDITIONINGS:
-        raise unknown_name("student conditioning", config.conditioning, CONDITIONINGS)
-    if config.time_features < 2 or config.time_features % 2:
-        raise UserError(f"student.time_features is {config.time_features}; expected an even number.")
-    if not 1 <= config.ddim_steps <= config.diffusion_steps:
+    if config.head.conditioning not in CONDITIONINGS:
+        raise unknown_name("student conditioning", config.head.conditioning, CONDITIONINGS)
+    if config.head.time_features < 2 or config.head.time_features % 2:
         raise UserError(
-            f"student.ddim_steps is {config.ddim_steps}; expected 1 to {config.diffusion_steps} "
-            "(student.diffusion_steps)."
+            f"student.head.time_features is {config.head.time_features}; expected an even number."
+        )
+    if not 1 <= config.head.ddim_steps <= config.head.diffusion_steps:
+        raise UserError(
+            f"student.head.ddim_steps is {config.head.ddim_steps}; expected 1 to "
+            f"{config.head.diffusion_steps} (student.head.diffusion_steps)."
         )
 
 
@@ -53,8 +55,8 @@ class StateStream(nn.Module):
 
     @nn.compact
     def __call__(self, state: jax.Array) -> jax.Array:
-        x = nn.relu(nn.Dense(self.config.state_features, name="first")(normalise_state(state)))
-        return nn.relu(nn.Dense(self.config.state_features, name="second")(x))
+        x = nn.relu(nn.Dense(self.config.head.state_features, name="first")(normalise_state(state)))
+        return nn.relu(nn.Dense(self.config.head.state_features, name="second")(x))
 
 
 class DenoiserBlock(nn.Module):
@@ -82,15 +84,19 @@ class Denoiser(nn.Module):
         """(B, chunk, 8), (B,) int, (B, D) -> (B, chunk, 8)."""
         config = self.config
         check_denoiser(config)
-        film = config.conditioning == "film"
-        embedded = nn.Dense(config.time_features, name="time_first")(embed_time(k, config.time_features))
-        embedded = nn.Dense(config.time_features, name="time_second")(nn.silu(embedded))
+        film = config.head.conditioning == "film"
+        embedded = nn.Dense(config.head.time_features, name="time_first")(
+            embed_time(k, config.head.time_features)
+        )
+        embedded = nn.Dense(config.head.time_features, name="time_second")(nn.silu(embedded))
         condition = jnp.concatenate([cond, embedded], axis=-1)
         x = noisy_action.reshape(noisy_action.shape[0], -1)
         x = x if film else jnp.concatenate([x, condition], axis=-1)
-        x = nn.Dense(config.denoiser_width, name="input")(x)
-        for index in range(config.denoiser_blocks):
-            x = DenoiserBlock(config.denoiser_width, film, name=f"block{index}")(x, condition)
+        x = nn.Dense(config.head.width, name="input")(x)
+        for index in range(config.head.blocks):
+            x = DenoiserBlock(config.head.width, film, name=f"block{index}")(x, condition)
         x = nn.silu(nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="norm")(x))
-        x = nn.Dense(config.chunk * contract.ACTION_SIZE, name="output", kernel_init=nn.initializers.zeros)(x)
+        x = nn.Dense(
+            config.head.chunk * contract.ACTION_SIZE, name="output", kernel_init=nn.initializers.zeros
+        )(x)
         return x.reshape(noisy_action.shape)

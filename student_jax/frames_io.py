@@ -26,8 +26,8 @@ def add_noisy_demos(
     """
     ends = np.concatenate([[0], demos.ends])
     held = np.split(demos.steps("held"), ends[1:-1])
-    lengths = [useful_steps(episode, config.student.demo_held_steps) for episode in held]
-    keep_clean = np.random.default_rng(config.seed).random(len(demos)) < config.student.clean_share
+    lengths = [useful_steps(episode, config.student.training.demo_held_steps) for episode in held]
+    keep_clean = np.random.default_rng(config.seed).random(len(demos)) < config.student.training.clean_share
     chosen = np.flatnonzero(~keep_clean)
 
     def read(i: int) -> Clip:

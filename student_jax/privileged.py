@@ -75,7 +75,7 @@ class PoseActor:
         rng, action = self._rng, np.array(scene.expert)
         if self._head is not None:
             seen = noisy_seen(scene.observation, scene.held, self._bias, rng, self._config)
-            noise = np.zeros((len(action), self._config.chunk, action.shape[1]), np.float32)
+            noise = np.zeros((len(action), self._config.head.chunk, action.shape[1]), np.float32)
             chosen = train.act_on_seen(self._config, self._profile, self._head, seen, scene.state, noise)
             taught = rng.random((len(action), 1)) < self._share
             action = np.where(taught, action, np.asarray(chosen)[:, 0])

@@ -66,9 +66,9 @@ def make_batch(
     """The samples at `index` (B,), cropped at random."""
     return Batch(
         depth_mm=jnp.asarray(frames.depth_stack(index)),
-        crop_rc=jnp.asarray(random_crops(rng, len(index), profile, config.crop_shift_px)),
+        crop_rc=jnp.asarray(random_crops(rng, len(index), profile, config.training.crop_shift_px)),
         state=jnp.asarray(frames.state[index]),
-        action=jnp.asarray(sharpen_gripper(frames.action_chunks(index, config.chunk))),
+        action=jnp.asarray(sharpen_gripper(frames.action_chunks(index, config.head.chunk))),
         aux=aux_targets(frames.observation[index], frames.held[index]),
     )
 
@@ -77,16 +77,20 @@ def make_optimizer(config: StudentConfig, steps: int) -> optax.GradientTransform
     """AdamW with warm-up and cosine decay over `steps`."""
     warmup = min(WARMUP_STEPS, max(1, steps // 10))
     rate = optax.warmup_cosine_decay_schedule(
-        0.0, config.learning_rate, warmup, max(steps, warmup + 1), 0.02 * config.learning_rate
+        0.0,
+        config.training.learning_rate,
+        warmup,
+        max(steps, warmup + 1),
+        0.02 * config.training.learning_rate,
     )
     return optax.chain(
-        optax.clip_by_global_norm(MAX_GRAD_NORM), optax.adamw(rate, weight_decay=config.weight_decay)
+        optax.clip_by_global_norm(MAX_GRAD_NORM), optax.adamw(rate, weight_decay=config.training.weight_decay)
     )
 
 
 def split(config: StudentConfig, params: dict) -> tuple[dict, dict]:
     """(trained, frozen) on pictures: without an action loss the head keeps what it learnt from poses."""
-    names = set(params) if config.action_weight else set(params) - set(HEAD_PARAMS)
+    names = set(params) if config.training.action_weight else set(params) - set(HEAD_PARAMS)
     return {k: v for k, v in params.items() if k in names}, {
         k: v for k, v in params.items() if k not in names
     }
@@ -141,7 +145,7 @@ def train_step(
     key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
     key, k_noise = jax.random.split(key)
     depth_m = batch.depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
-    if config.disparity_noise_px:
+    if config.training.disparity_noise_px:
         depth_m = disparity_noise(k_noise, depth_m, profile, config)
 
     def loss_fn(params):
@@ -150,10 +154,10 @@ def train_step(
             Seen, policy.apply({"params": params}, depth_m, batch.state, batch.crop_rc, method="encode")
         )
         terms = aux_losses(seen.aux, batch.aux)
-        total = config.aux_weight * (terms["position"] + terms["yaw"] + 0.3 * terms["held"])
-        if config.action_weight:
+        total = config.training.aux_weight * (terms["position"] + terms["yaw"] + 0.3 * terms["held"])
+        if config.training.action_weight:
             terms["action"] = diffusion_loss(config, policy, params, seen, batch.state, batch.action, key)
-            total += config.action_weight * terms["action"]
+            total += config.training.action_weight * terms["action"]
         error = jnp.linalg.norm(seen.aux.position - batch.aux.position, axis=-1)
         terms["position_error_mm"] = 1000.0 * POSITION_SCALE_M * jnp.median(error)
         return total, terms
@@ -165,7 +169,7 @@ def train_step(
 def _update(config: StudentConfig, steps: int, state: TrainState, grads) -> TrainState:
     updates, opt_state = make_optimizer(config, steps).update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
-    decay = jnp.minimum(config.ema_decay, (1 + state.step) / (10 + state.step))
+    decay = jnp.minimum(config.training.ema_decay, (1 + state.step) / (10 + state.step))
     ema = jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, state.ema, params)
     return TrainState(state.step + 1, params, ema, opt_state, state.key)
 

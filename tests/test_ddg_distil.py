@@ -11,30 +11,39 @@ from ddg_jax import distil, sample, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
 from ddgrasp import artifacts
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import (
+    DDGConfig,
+    DDGDepthConfig,
+    DDGDiffusionConfig,
+    DDGTrainingConfig,
+    PriorConfig,
+    SamplingConfig,
+    UNetConfig,
+)
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress, read_curves
 from learning import diffusion
 
 TINY = DDGConfig(
-    height_px=16,
-    width_px=24,
-    widths=(8, 8),
-    blocks=(0, 1),
-    attention_heads=1,
-    diffusion_steps=100,
-    batch_size=8,
-    checkpoint_every=20,
-    sample_batch=8,
-    prior_noise=0.0,
-    learning_rate=1e-2,
+    depth=DDGDepthConfig(height_px=16, width_px=24),
+    unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
+    diffusion=DDGDiffusionConfig(steps=100),
+    training=DDGTrainingConfig(batch_size=8, checkpoint_every=20, learning_rate=1e-2),
+    sampling=SamplingConfig(batch_size=8),
+    prior=PriorConfig(noise=0.0),
 )
-DISTILLED = dataclasses.replace(TINY, sampler="progressive", sample_steps=1, distil_from=4, distil_steps=60)
+DISTILLED = dataclasses.replace(
+    TINY,
+    sampling=dataclasses.replace(TINY.sampling, sampler="progressive", steps=1),
+    training=dataclasses.replace(TINY.training, distil_from=4, distil_steps=60),
+)
 
 
 def test_log_odds_are_not_distilled():
     with pytest.raises(UserError, match="hole_loss is cross_entropy.*take sampler ddim"):
-        dataclasses.replace(DISTILLED, hole_loss="cross_entropy")
+        dataclasses.replace(
+            DISTILLED, training=dataclasses.replace(DISTILLED.training, hole_loss="cross_entropy")
+        )
 
 
 def pictures(count: int = 32) -> Frames:
@@ -56,11 +65,19 @@ def made_up_teacher():
 
 def test_halvings_end_at_the_samplers_evaluations():
     def rounds(start: int, end: int) -> list[int]:
-        return distil.rounds(dataclasses.replace(DISTILLED, distil_from=start, sample_steps=end))
+        return distil.rounds(
+            dataclasses.replace(
+                DISTILLED,
+                training=dataclasses.replace(DISTILLED.training, distil_from=start),
+                sampling=dataclasses.replace(DISTILLED.sampling, steps=end),
+            )
+        )
 
     assert (rounds(8, 4), rounds(8, 1), rounds(64, 4)) == ([4], [4, 2, 1], [32, 16, 8, 4])
     for start, end in ((8, 3), (8, 8), (12, 4), (4, 8)):
-        with pytest.raises(UserError, match=f"ddg.distil_from is {start} and ddg.sample_steps {end}"):
+        with pytest.raises(
+            UserError, match=f"ddg.training.distil_from is {start} and ddg.sampling.steps {end}"
+        ):
             rounds(start, end)
 
 
@@ -100,7 +117,11 @@ def directory(teacher, tmp_path_factory):
 
 
 def samples(config: DDGConfig, params, steps: int) -> np.ndarray:
-    generator = sample.Generator(dataclasses.replace(config, sample_steps=steps), params, make_prior(config))
+    generator = sample.Generator(
+        dataclasses.replace(config, sampling=dataclasses.replace(config.sampling, steps=steps)),
+        params,
+        make_prior(config),
+    )
     return sample.predict(jax.random.key(7), generator, pictures().prior[:8])
 
 

@@ -20,11 +20,11 @@ def check_config_values(config: Config) -> Config:
     check_objects(config.world)
     for stage, file in CHECKPOINTS.items():
         _check_start(stage, getattr(config, stage).init_from, file)
-    if config.ddg.prior_in_sim not in IN_SIMULATION:
-        raise unknown_name("ddg.prior_in_sim", config.ddg.prior_in_sim, IN_SIMULATION)
+    if config.ddg.prior.in_sim not in IN_SIMULATION:
+        raise unknown_name("ddg.prior.in_sim", config.ddg.prior.in_sim, IN_SIMULATION)
     make_prior(config.ddg)
     check_depth_dtype(config.export.depth_dtype)
-    if config.student.encoder_weights:
+    if config.student.encoder.weights:
         from student_jax import pretrained_encoder
 
         pretrained_encoder.source(config.student)

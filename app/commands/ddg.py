@@ -70,7 +70,7 @@ class DDGDistil:
     evaluations: int = 4
     """Network evaluations per map; those passed on the way (4 and 2 before 1) are kept too."""
     steps: int | None = None
-    """Optimiser steps per halving; none takes the model's ddg.distil_steps."""
+    """Optimiser steps per halving; none takes the model's ddg.training.distil_steps."""
     resume: bool = False
     """Continue what is there."""
 
@@ -78,12 +78,12 @@ class DDGDistil:
         """Distils, with checkpoints, and leaves a stage `ddg` that samples in few evaluations."""
         fitted = artifacts.read_artifact(self.model)
         config = artifacts.config_from_json(fitted.manifest.config)
+        training = config.ddg.training
         ddg = replace(
             config.ddg,
             init_from=str(self.model.resolve()),
-            sampler="progressive",
-            sample_steps=self.evaluations,
-            distil_steps=config.ddg.distil_steps if self.steps is None else self.steps,
+            sampling=replace(config.ddg.sampling, sampler="progressive", steps=self.evaluations),
+            training=training if self.steps is None else replace(training, distil_steps=self.steps),
         )
         config = replace(config, ddg=ddg)
         inputs = {"data": self.data, "model": fitted.hash}

@@ -39,7 +39,7 @@ class FrankaRobot:
         `realtime` insists on a real-time kernel, as a real arm needs; a simulated one does not.
         """
         if not 0.0 < dynamics <= 1.0:
-            raise UserError(f"deploy.franka_dynamics is {dynamics}; expected above 0 and at most 1.")
+            raise UserError(f"deploy.franka.dynamics is {dynamics}; expected above 0 and at most 1.")
         self._host, self._clock = host, clock
         self._dynamics, self._grip_force_n, self._realtime = dynamics, grip_force_n, realtime
         self._arm: Any = None
@@ -57,7 +57,7 @@ class FrankaRobot:
         except franky.Exception as error:
             raise UserError(
                 f"no Franka at {self._host!r} ({error}): unlock the joints, activate FCI in Desk and check "
-                "deploy.franka_host."
+                "deploy.franka.host."
             ) from error
         self._arm = arm
 
