@@ -24,11 +24,12 @@ from ddg_jax.train import (
     predict_clean,
     step_keys,
 )
-from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.progress import Progress
 from learning import diffusion
-from learning.loop import Params, TrainState, first_state, run_steps, updated
+from learning.loop import run_steps
+from learning.params import Params, load_params, save_params
+from learning.train_state import TrainState, first_state, updated
 
 LEARNING_RATE = 0.5
 """Relative to the fit's."""
@@ -63,10 +64,8 @@ def distil(
         path = directory / params_file(count)
         if not path.exists():
             limit = X_LIMIT if number == 0 else np.inf
-            artifacts.save_params(
-                path, _round(config, teacher, frames, directory, seed, progress, count, limit)
-            )
-        teacher = artifacts.load_params(path, teacher)
+            save_params(path, _round(config, teacher, frames, directory, seed, progress, count, limit))
+        teacher = load_params(path, teacher)
     return teacher
 
 
@@ -92,7 +91,7 @@ def _round(
         path = teacher_path(made.steps, count, number, config.sampling.spacing)
         return distil_step(config, state, teacher, limit, path, batch.x_0, batch.c)
 
-    state = run_steps(
+    state, _ = run_steps(
         first_state(teacher, make_optimizer(config, config.training.distil_steps, LEARNING_RATE), key),
         config.training.distil_steps,
         step_once,

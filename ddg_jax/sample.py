@@ -22,7 +22,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.errors import UserError
 from learning import diffusion
-from learning.loop import Params
+from learning.params import Params, load_params, save_params
 
 PARAMS_FILE = "params.msgpack"
 SHARED = 2**31 - 1
@@ -65,12 +65,12 @@ class Generator:
             config,
             sampling=replace(config.sampling, sampler=sampler, steps=steps),
         )
-        params = artifacts.load_params(file, jax.eval_shape(partial(_init_shapes, config)))
+        params = load_params(file, jax.eval_shape(partial(_init_shapes, config)))
         return cls(config, params, make_prior(config))
 
     def save(self, directory: Path | str) -> None:
         """Writes a fitted network's parameters; the manifest, written by the stage, makes them loadable."""
-        artifacts.save_params(Path(directory) / PARAMS_FILE, self.params)
+        save_params(Path(directory) / PARAMS_FILE, self.params)
 
 
 def _init_shapes(config: DDGConfig) -> Any:
@@ -142,10 +142,11 @@ def sample(
         elif config.sampling.sampler == DDPM:
             x = diffusion.ddpm_step(made, x, k, previous, eps, fresh(), X_LIMIT)
         elif config.sampling.sampler == PROGRESSIVE:
-            x = diffusion.ddim_step(made, x, k, previous, eps, None)
+            x = diffusion.ddim_step(diffusion.ddim_coefficients(made, k, previous, x), x, eps, None)
         else:
             extra = fresh() if config.sampling.eta else 0.0
-            x = diffusion.ddim_step(made, x, k, previous, eps, X_LIMIT, config.sampling.eta, extra)
+            step = diffusion.ddim_coefficients(made, k, previous, x, config.sampling.eta)
+            x = diffusion.ddim_step(step, x, eps, X_LIMIT, noise=extra)
         return (x, x_0), None
 
     start = noise(start_key)

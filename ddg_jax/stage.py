@@ -21,7 +21,7 @@ from ddgrasp.config import PROGRESSIVE, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
-from learning.loop import Params
+from learning.params import Params
 from sensors.statistics import stats
 
 STAGE = "ddg"

@@ -26,12 +26,14 @@ from ddg_jax.unet import UNet
 from ddgrasp.config import CROSS_ENTROPY, SQUARED, UNIFORM, DDGConfig
 from ddgrasp.progress import Progress
 from learning import diffusion
-from learning.loop import Params, TrainState, first_state, run_steps, updated
+from learning.loop import run_steps
+from learning.optimizers import adamw
+from learning.params import Params
+from learning.train_state import TrainState, first_state, step_key, updated
 
 WARMUP_STEPS = 50
 FINAL_LEARNING_RATE = 0.05
 """Share of the learning rate left at the end."""
-MAX_GRAD_NORM = 1.0
 LOG_ODDS_PER_OUTPUT = 4.0
 """The network's outputs are of the order of 1, log odds of what it is sure of 10."""
 CHECKPOINTS = "checkpoints"
@@ -46,12 +48,12 @@ def make_unet(config: DDGConfig) -> UNet:
 
 def make_optimizer(config: DDGConfig, steps: int, scale: float = 1.0) -> optax.GradientTransformation:
     """AdamW with warm-up and cosine decay over `steps`; `scale` times the configuration's learning rate."""
-    warmup, peak = min(WARMUP_STEPS, max(1, steps // 10)), scale * config.training.learning_rate
-    rate = optax.warmup_cosine_decay_schedule(
-        0.0, peak, warmup, max(steps, warmup + 1), peak * FINAL_LEARNING_RATE
-    )
-    return optax.chain(
-        optax.clip_by_global_norm(MAX_GRAD_NORM), optax.adamw(rate, weight_decay=config.training.weight_decay)
+    return adamw(
+        scale * config.training.learning_rate,
+        steps,
+        warmup=WARMUP_STEPS,
+        final_share=FINAL_LEARNING_RATE,
+        weight_decay=config.training.weight_decay,
     )
 
 
@@ -144,7 +146,7 @@ def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Ar
 
 def step_keys(state: TrainState) -> Array:
     """(3,) keys of the step that `state` takes next: for eps, k and the noise on c."""
-    return jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step + 1), 3)
+    return jax.random.split(step_key(state, ahead=1), 3)
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
@@ -171,7 +173,7 @@ def fit(config: DDGConfig, frames: Frames, directory: Path, seed: int, progress:
         batch = make_batch(frames, config, seed, step)
         return train_step(config, state, batch.x_0, batch.c)
 
-    state = run_steps(
+    state, _ = run_steps(
         init_state(config, jax.random.key_data(jax.random.key(seed))),
         config.training.steps,
         step_once,

@@ -1,5 +1,8 @@
 """Joint-state stream and the network that predicts the noise in an action chunk (Ho et al., 2020, eq. 14)."""
 
+from types import ModuleType
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,9 +11,9 @@ from flax import linen as nn
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError, unknown_name
+from learning.layers import sinusoids, time_frequencies
 
 CONDITIONINGS = ("film", "concat")
-MAX_PERIOD = 10_000.0
 LAYER_NORM_EPSILON = 1e-5
 STATE_LOWER = np.array([*contract.JOINT_LOWER_RAD, 0.0], np.float32)
 STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M], np.float32)
@@ -36,16 +39,9 @@ def normalise_state(state: jax.Array) -> jax.Array:
     return 2.0 * (state - STATE_LOWER) / (STATE_UPPER - STATE_LOWER) - 1.0
 
 
-def time_frequencies(features: int) -> np.ndarray:
-    """(features / 2,) float32 angular frequencies of the sinusoidal embedding (Vaswani et al., 2017, 3.5)."""
-    half = features // 2
-    return np.exp(-np.log(MAX_PERIOD) * np.arange(half) / half).astype(np.float32)
-
-
-def embed_time(k: jax.Array, features: int) -> jax.Array:
-    """(B,) diffusion steps to (B, features): sines, then cosines."""
-    angles = k.astype(jnp.float32)[:, None] * time_frequencies(features)
-    return jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], axis=-1)
+def embed_time(k: Any, features: int, xp: ModuleType = jnp) -> Any:
+    """(B,) diffusion steps to (B, features): sines, then cosines. `xp`: numpy for the exported graph."""
+    return sinusoids(k, time_frequencies(features), cosine_first=False, xp=xp)
 
 
 class StateStream(nn.Module):

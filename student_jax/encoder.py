@@ -15,6 +15,7 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError, unknown_name
+from learning.layers import space_to_depth
 from mjx_envs.camera import nominal_camera
 from student_jax import preprocess
 
@@ -146,13 +147,6 @@ class Stem(nn.Module):
         patches = space_to_depth(x, STEM_STRIDE)
         x = nn.Dense(self.width, use_bias=self.norm == "none", name="patch")(patches)
         return nn.relu(GroupNorm(name="norm")(x) if self.norm == "group" else x)
-
-
-def space_to_depth(x: jax.Array, size: int) -> jax.Array:
-    """(B, h, w, c) -> (B, h/size, w/size, size*size*c); within a patch row-major, channels last."""
-    batch, height, width, channels = x.shape
-    x = x.reshape(batch, height // size, size, width // size, size, channels)
-    return jnp.moveaxis(x, 2, 3).reshape(batch, height // size, width // size, size * size * channels)
 
 
 class CellGeometry(NamedTuple):

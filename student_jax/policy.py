@@ -19,9 +19,8 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
-from learning.diffusion import Schedule
+from learning import diffusion
 from mjx_envs import kinematics
-from student_jax import action_diffusion as diffusion
 from student_jax.denoiser import Denoiser, StateStream, normalise_state
 from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M, DepthEncoder
 from student_jax.hand_view import HandView
@@ -34,10 +33,12 @@ BESIDE_SIZE = 4
 """What the hand view adds to the auxiliary output: the object's offset from the hand, and a gate."""
 BESIDE_SCALE = 0.25
 """Network units per unit of that offset: 5 cm."""
+TERMINAL_TIME = 0.98
+"""Of the action diffusion's schedule, see `learning.diffusion.cosine_betas`."""
 HEAD_PARAMS = ("state_stream", "denoiser")
 """The parameters that act; all others see."""
 PARAMS_FILE = "params.msgpack"
-"""Name of the parameter file in the student's artefact (`artifacts.save_params`)."""
+"""Name of the parameter file in the student's artefact (`learning.params`)."""
 Numbers = jax.Array | np.ndarray
 
 
@@ -156,9 +157,9 @@ def feature_count(config: StudentConfig) -> int:
     return config.encoder.features + (config.hand_view.features if config.hand_view.size_px else 0)
 
 
-def noise_schedule(config: StudentConfig) -> Schedule:
-    """Noise schedule of the action diffusion."""
-    return diffusion.cosine_schedule(config.head.diffusion_steps)
+def noise_schedule(config: StudentConfig) -> diffusion.Schedule:
+    """Noise schedule of the action diffusion: cosine, short of pure noise."""
+    return diffusion.schedule_of(diffusion.cosine_betas(config.head.diffusion_steps, TERMINAL_TIME))
 
 
 def init_params(key: jax.Array, config: StudentConfig, profile: CameraProfile) -> dict:

@@ -10,7 +10,6 @@ import pytest
 from ddg_jax import distil, sample, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
-from ddgrasp import artifacts
 from ddgrasp.config import (
     DDGConfig,
     DDGDepthConfig,
@@ -23,6 +22,7 @@ from ddgrasp.config import (
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress, read_curves
 from learning import diffusion
+from learning.params import load_params
 
 TINY = DDGConfig(
     depth=DDGDepthConfig(height_px=16, width_px=24),
@@ -97,7 +97,8 @@ def test_one_step_to_the_target_ends_where_the_teacher_does():
     k, end = jnp.array([899, 499, 249]), jnp.array([749, 249, -1])
     x_0 = distil.one_step_target(made, x_k, k, x_end, end)
     eps = diffusion.eps_from_x_0(made, x_k, k, x_0)
-    np.testing.assert_allclose(diffusion.ddim_step(made, x_k, k, end, eps, None), x_end, atol=2e-5)
+    step = diffusion.ddim_coefficients(made, k, end, x_k)
+    np.testing.assert_allclose(diffusion.ddim_step(step, x_k, eps, None), x_end, atol=2e-5)
     np.testing.assert_allclose(x_0[2], x_end[2], atol=1e-6)  # the last step ends at x_0 itself
 
 
@@ -128,7 +129,7 @@ def samples(config: DDGConfig, params, steps: int) -> np.ndarray:
 def test_students_of_few_evaluations_follow_the_teacher_of_many(teacher, directory):
     wanted = samples(TINY, teacher, 4)
     for count in (2, 1):
-        student = artifacts.load_params(directory / distil.params_file(count))
+        student = load_params(directory / distil.params_file(count))
         mine = np.mean((samples(DISTILLED, student, count) - wanted) ** 2)
         plain = np.mean((samples(TINY, teacher, count) - wanted) ** 2)
         assert mine < 0.5 * plain, (count, mine, plain)
@@ -166,7 +167,7 @@ def test_resume_equals_an_uninterrupted_distillation(teacher, directory, tmp_pat
 
 
 def test_a_student_runs_with_its_own_evaluations_only(directory):
-    student = artifacts.load_params(directory / distil.params_file(1))
+    student = load_params(directory / distil.params_file(1))
     generator = sample.Generator(DISTILLED, student, make_prior(DISTILLED))
     with pytest.raises(UserError, match="distilled to 1 evaluations, not 4"):
         sample.predict(jax.random.key(0), generator, pictures().prior[:2], steps=4)

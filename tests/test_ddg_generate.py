@@ -26,6 +26,7 @@ from ddgrasp.config import (
 )
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
+from learning.params import save_params
 
 ROOT = Path(__file__).parents[1]
 CONFIG = Config(
@@ -55,7 +56,7 @@ def made_up_params(config: DDGConfig):
 def run(tmp_path_factory):
     """A run directory with a generator and demos, finished."""
     directory = tmp_path_factory.mktemp("run")
-    artifacts.save_params(directory / "ddg" / sample.PARAMS_FILE, made_up_params(CONFIG.ddg))
+    save_params(directory / "ddg" / sample.PARAMS_FILE, made_up_params(CONFIG.ddg))
     artifacts.finish(directory / "ddg", "ddg", CONFIG, seconds=1, metrics={})
     rng = np.random.default_rng(0)
     store = EpisodeStore(directory / "demos" / "episodes.zarr", create=True)

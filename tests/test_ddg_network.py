@@ -1,4 +1,4 @@
-"""Space-to-depth, the U-Net's shape rules, representations of depth and grafting."""
+"""The U-Net's shape rules, representations of depth and grafting."""
 
 from dataclasses import replace
 
@@ -9,17 +9,9 @@ import pytest
 
 from ddg_jax.graft import graft
 from ddg_jax.representation import LIMIT_PER_M, channels, decode, encode
-from ddg_jax.unet import UNet, depth_to_space, space_to_depth
+from ddg_jax.unet import UNet
 from ddgrasp.config import DDGConfig, DDGDepthConfig, GraftConfig
 from ddgrasp.errors import UserError
-
-
-def test_space_to_depth_orders_and_inverts():
-    x = jnp.arange(2 * 4 * 6).reshape(2, 4, 6, 1)
-    folded = space_to_depth(x, 2)
-    assert folded.shape == (2, 2, 3, 4)
-    assert folded[0, 0, 0].tolist() == [0, 1, 6, 7]
-    np.testing.assert_array_equal(depth_to_space(folded, 2), x)
 
 
 def test_unet_takes_any_size_and_sees_prior_and_step():

@@ -10,7 +10,6 @@ import pytest
 from ddg_jax import stage
 from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator, generate, predict
-from ddgrasp import artifacts
 from ddgrasp.config import (
     Config,
     DDGConfig,
@@ -25,6 +24,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress, read_curves
 from job_support import make_job
+from learning.params import load_params
 from sensors.recordings.recording import RecordingWriter
 
 CONFIG = Config(
@@ -153,7 +153,7 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
         make_job("ddg", config, tmp_path / "ddg", Progress(tmp_path / "ddg", quiet=True), data=recordings)
     )
     assert loaded.manifest.origin == "loaded"
-    before, after = (artifacts.load_params(a.directory / "params.msgpack") for a in (fitted, loaded))
+    before, after = (load_params(a.directory / "params.msgpack") for a in (fitted, loaded))
     jax.tree.map(np.testing.assert_array_equal, before, after)
     for change, message in (
         ({"depth": dataclasses.replace(CONFIG.ddg.depth, far_m=5.0)}, "ddg.depth.far_m 10.0.*5.0"),
@@ -179,7 +179,7 @@ def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings
     )
     directory = tmp_path / "ddg"
     stage.run(make_job("ddg", config, directory, Progress(directory, quiet=True), data=recordings))
-    before = artifacts.load_params(fitted.directory / "params.msgpack")
+    before = load_params(fitted.directory / "params.msgpack")
     plain = Generator.load(directory, "ddim", 50)
     jax.tree.map(np.testing.assert_array_equal, plain.params, before)
     assert (plain.config.sampling.sampler, plain.config.sampling.steps) == ("ddim", 50)
@@ -198,9 +198,7 @@ def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings
     loaded = stage.run(
         make_job("ddg", again, tmp_path / "x", Progress(tmp_path / "x", quiet=True), data=recordings)
     )
-    jax.tree.map(
-        np.testing.assert_array_equal, artifacts.load_params(loaded.directory / "params.msgpack"), before
-    )
+    jax.tree.map(np.testing.assert_array_equal, load_params(loaded.directory / "params.msgpack"), before)
 
 
 def test_flicker_is_counted_within_recordings_only():

@@ -16,6 +16,7 @@ from ddg_jax.train import init_params
 from ddgrasp import artifacts
 from ddgrasp.config import Config, DDGConfig, DDGDepthConfig, SamplingConfig, UNetConfig
 from ddgrasp.progress import Progress
+from learning.params import save_params
 from sensors.recordings.recording import RecordingWriter
 
 CONFIG = DDGConfig(
@@ -60,7 +61,7 @@ def test_the_analysis_by_hand():
 
 def test_the_command_leaves_a_table_and_a_plot(tmp_path):
     params = init_params(CONFIG, jax.random.key(0))
-    artifacts.save_params(tmp_path / "ddg" / PARAMS_FILE, params)
+    save_params(tmp_path / "ddg" / PARAMS_FILE, params)
     artifacts.finish(tmp_path / "ddg", "ddg", Config(preset="test", ddg=CONFIG), seconds=1, metrics={})
     with RecordingWriter(tmp_path / "recording", {}) as writer:
         for t in range(4):

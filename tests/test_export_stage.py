@@ -24,6 +24,7 @@ from demos.stage import STORE
 from demos.store import EpisodeStore
 from export import stage
 from job_support import make_job
+from learning.params import save_params
 from student_jax import policy
 
 CONFIG = Config(
@@ -40,7 +41,7 @@ CONFIG = Config(
 
 def finish_student(run_dir, config):
     params = policy.init_params(jax.random.key(0), config.student, config.world.profile)
-    artifacts.save_params(run_dir / "student" / policy.PARAMS_FILE, params)
+    save_params(run_dir / "student" / policy.PARAMS_FILE, params)
     return artifacts.finish(run_dir / "student", "student", config, seconds=0.0, metrics={})
 
 

@@ -184,7 +184,11 @@ def _changed(config, path, values):
             r"snr_limits is \(5.0, 1.0\); expected two numbers above",
         ),
         ("ddg.prior", {"in_sim": "deph"}, "Unknown ddg.prior.in_sim 'deph'. Did you mean 'depth'"),
-        ("ddg.prior", {"source": "depth_anything_v2", "weights": "no"}, "no holds no converted weights"),
+        (
+            "ddg.prior",
+            {"source": "depth_anything_v2", "weights": "no"},
+            "no holds no converted weights",
+        ),
         (
             "export",
             {"depth_dtype": "uint8"},

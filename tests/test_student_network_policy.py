@@ -13,7 +13,6 @@ from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import nominal_camera
-from student_jax import action_diffusion as diffusion
 from student_jax import denoiser, encoder, hand_view, policy, preprocess
 
 PROFILE = contract.D455.scaled(0.25)
@@ -72,11 +71,6 @@ def test_group_norm_matches_flax():
     np.testing.assert_allclose(ours, flax_norm.apply(flax_norm.init(jax.random.key(1), x), x), atol=1e-5)
 
 
-def test_space_to_depth_by_hand():
-    x = jnp.arange(2 * 4 * 1).reshape(1, 2, 4, 1)
-    assert np.asarray(encoder.space_to_depth(x, 2))[0, 0].tolist() == [[0, 1, 4, 5], [2, 3, 6, 7]]
-
-
 def test_stages_stop_striding_at_the_output_stride():
     resnet = replace(
         CONFIG,
@@ -116,39 +110,6 @@ def test_resnet18_has_the_published_number_of_parameters():
 def test_state_limits_map_to_minus_one_and_one():
     state = jnp.stack([denoiser.STATE_LOWER, denoiser.STATE_UPPER])
     np.testing.assert_allclose(denoiser.normalise_state(state), [[-1.0] * 8, [1.0] * 8], atol=1e-6)
-
-
-def test_time_embedding_by_value():
-    embedded = denoiser.embed_time(jnp.array([0, 3]), 4)
-    np.testing.assert_allclose(embedded[0], [0, 0, 1, 1], atol=1e-6)
-    np.testing.assert_allclose(embedded[1], [np.sin(3), np.sin(0.03), np.cos(3), np.cos(0.03)], atol=1e-6)
-
-
-def test_schedule_falls_from_almost_one_to_almost_zero():
-    schedule = diffusion.cosine_schedule(50).alpha_bars
-    assert schedule[0] > 0.99 and np.all(np.diff(schedule) < 0)
-    assert np.sqrt(schedule[-1]) == pytest.approx(0.0310, abs=1e-3)
-
-
-@pytest.mark.parametrize("iterations", [1, 3, 10])
-def test_ddim_with_perfect_noise_prediction_returns_the_clean_sample(iterations):
-    schedule = diffusion.cosine_schedule(50)
-    x0 = jax.random.uniform(jax.random.key(0), (5, 4, 8), minval=-1, maxval=1)
-
-    def predict(x, k):
-        a = jnp.asarray(schedule.alpha_bars)[k][:, None, None]
-        return (x - jnp.sqrt(a) * x0) / jnp.sqrt(1 - a)
-
-    noise = jax.random.normal(jax.random.key(1), x0.shape)
-    sampled = diffusion.ddim_sample(predict, noise, schedule, iterations)
-    np.testing.assert_allclose(sampled, x0, atol=1e-4)
-
-
-def test_ddim_step_clips_and_keeps_explaining_x():
-    row = jnp.array([2.0, np.sqrt(3.0), 0.8, 0.6])  # a = 1/4, a' = 0.64
-    x, eps = jnp.array([1.0]), jnp.array([-1.0])  # x0 = 2 + 1.73, clipped to 1
-    # eps' = (2 * 1 - 1) / sqrt(3); x' = 0.8 * 1 + 0.6 * eps'
-    np.testing.assert_allclose(diffusion.ddim_step(x, eps, row), [0.8 + 0.6 / np.sqrt(3.0)], rtol=1e-6)
 
 
 def test_the_condition_is_joints_then_pose_then_offset_from_the_hand():

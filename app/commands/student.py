@@ -36,6 +36,7 @@ class StudentEval:
         from ddg_jax.sample import Generator
         from ddgrasp.progress import Progress
         from evaluation import wilson
+        from learning.params import load_params
         from ppo.policy import load_policy
         from student_jax.evaluate import closed_loop
         from student_jax.policy import PARAMS_FILE
@@ -44,7 +45,7 @@ class StudentEval:
         config = load_config(self.run_dir, "student")
         evaluation = replace(config.evaluation, student_trials=self.trials)
         config = replace(config, seed=self.seed, evaluation=evaluation)
-        params = artifacts.load_params(self.run_dir / "student" / PARAMS_FILE)
+        params = load_params(self.run_dir / "student" / PARAMS_FILE)
         generator = Generator.load(self.run_dir / "ddg")
         teacher = load_policy(self.run_dir / "teacher")
         result = closed_loop(config, teacher, generator, params, Progress(name="student eval"))
