@@ -16,11 +16,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ddg_jax import data
-from ddg_jax.representation import DEPTH
 from ddg_jax.sample import Generator, grafted, predict
 from ddg_jax.stage import hole_statistics
 from ddgrasp import artifacts
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import DEPTH, DDGConfig
 from ddgrasp.progress import Progress
 
 THRESHOLDS = tuple(round(-0.9 + 0.1 * i, 1) for i in range(9))

@@ -116,10 +116,10 @@ def init_state(config: StudentConfig, steps: int, seed: int, params: dict) -> Tr
 def diffusion_loss(config, policy, params, seen, state, action, key) -> Array:
     """mean |eps - eps_theta(a_k, k, s)|^2 (paper Eq. 6) over `noise_draws` noises for each sample."""
     cond = policy.apply({"params": params}, seen, state, method="condition")
-    draws = config.noise_draws
+    draws = config.training.noise_draws
     cond, action = (jnp.repeat(x, draws, axis=0) for x in (cond, action))
     k_step, k_noise = jax.random.split(key)
-    k = jax.random.randint(k_step, (len(cond),), 0, config.diffusion_steps)
+    k = jax.random.randint(k_step, (len(cond),), 0, config.head.diffusion_steps)
     eps = jax.random.normal(k_noise, action.shape)
     noisy = q_sample(noise_schedule(config), action, k, eps)
     predicted = policy.apply({"params": params}, noisy, k, cond, method="denoise")

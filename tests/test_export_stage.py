@@ -7,6 +7,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 
+from config_support import unchecked
 from ddgrasp import artifacts
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import (
@@ -59,7 +60,7 @@ def test_a_student_becomes_a_file_that_describes_itself(tmp_path):
 
 
 def test_a_missed_bound_writes_nothing_and_keeps_the_old_file(tmp_path):
-    config = replace(CONFIG, export=replace(CONFIG.export, max_abs_diff=-1.0))
+    config = replace(CONFIG, export=unchecked(CONFIG.export, max_abs_diff=-1.0))
     finish_student(tmp_path, config)
     old = tmp_path / "export" / stage.POLICY_FILE
     artifacts.atomic_write_bytes(old, b"old")

@@ -7,9 +7,10 @@ from typing import Annotated
 import tyro
 
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config
-from app.commands.checks import check_count
+from app.commands.checks import check_objects
 from ddgrasp import artifacts
-from ddgrasp.config import Config
+from ddgrasp.config import Camera, Config, Robot
+from ddgrasp.config.checks import Count, Seed
 from ddgrasp.presets import get_preset
 
 
@@ -26,9 +27,9 @@ class StudentEval:
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run."""
-    trials: int = 200
+    trials: Count = 200
     """Episodes per kind of depth."""
-    seed: int = 1
+    seed: Seed = 1
     """Of the episodes."""
 
     def run(self) -> None:
@@ -39,7 +40,6 @@ class StudentEval:
         from student_jax.evaluate import closed_loop
         from student_jax.policy import PARAMS_FILE
 
-        check_count("--trials", self.trials)
         config = load_config(self.run_dir, "student")
         evaluation = replace(config.evaluation, student_trials=self.trials)
         config = replace(config, seed=self.seed, evaluation=evaluation)
@@ -67,9 +67,9 @@ class Deploy:
     """Without --preset: the configuration of the run that the policy lies in."""
     policy: Path
     """ONNX file that `ddgrasp export` wrote."""
-    robot: str = "sim"
+    robot: Robot = "sim"
     """sim (the pseudo-real rig) or franka."""
-    camera: str = "stereo"
+    camera: Camera = "stereo"
     """stereo (the rig's own), realsense, or replay (a recording)."""
     recording: Path | None = None
     """Recording for camera replay."""
@@ -81,6 +81,7 @@ class Deploy:
     def run(self) -> None:
         from deploy.session import SessionOptions, deploy, describe
 
+        check_objects(self.config.world)
         options = SessionOptions(self.robot, self.camera, self.recording, self.object_name, self.seconds)
         print(describe(deploy(self.config, self.policy, options)))
 
