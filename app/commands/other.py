@@ -6,8 +6,9 @@ from typing import Annotated
 
 import tyro
 
-from ddgrasp import artifacts, contract
+from ddgrasp import contract
 from ddgrasp.config.checks import Range
+from ddgrasp.files import atomic_write_bytes
 
 
 @dataclass(frozen=True)
@@ -97,5 +98,5 @@ class ObjectsSheet:
         from mjx_envs.objects import OBJECTS
 
         everything = tuple(dict.fromkeys((*contract.SEEN_OBJECTS, *contract.UNSEEN_OBJECTS, *OBJECTS)))
-        artifacts.atomic_write_bytes(self.out, draw(self.objects or everything))
+        atomic_write_bytes(self.out, draw(self.objects or everything))
         print(self.out)
