@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ddgrasp import contract
-from ddgrasp.config import Config
+from ddgrasp.config import CAMERAS, ROBOTS, Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.policy_metadata import PolicyMetadata
 from deploy.clock import RealClock
@@ -19,9 +19,6 @@ from deploy.interfaces import Camera, Clock, Robot
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
-
-ROBOTS = ("sim", "franka")
-CAMERAS = ("stereo", "realsense", "replay")
 
 
 @dataclass(frozen=True)

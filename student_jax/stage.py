@@ -17,14 +17,12 @@ from demos.store import EpisodeStore
 from ppo import policy as teacher_policy
 from student_jax import evaluate, frames_io, pretrained_encoder
 from student_jax.dagger import Trainer
-from student_jax.data import check_chunk
 from student_jax.head import POSES
 
 
 def run(job: Job) -> Artifact:
     """Trains the student and evaluates it closed-loop on clean and on generated depth."""
     config, directory, progress, parents = job.config, job.directory, job.progress, job.parents
-    check_chunk(config.student)
     encoder_weights = pretrained_encoder.source(config.student)
     generator = Generator.load(parents["ddg"].directory)
     teacher = teacher_policy.load(parents["teacher"].directory)
