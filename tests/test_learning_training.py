@@ -136,7 +136,6 @@ def test_the_newest_two_are_kept_and_restored_to_the_bit(tmp_path):
         equal(again.restore(jax.eval_shape(fresh)), state)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Orbax leaves reads unawaited
 @pytest.mark.parametrize("other", [{"w": jnp.zeros(3)}, {"v": jnp.zeros(2)}])
 def test_a_checkpoint_of_another_training_is_refused_in_one_line(tmp_path, other):
     with Checkpoints(tmp_path) as saved:
