@@ -142,14 +142,13 @@ def _devices(
 def _rig(config: Config, options: SessionOptions, info: PolicyMetadata, clock: Clock) -> tuple[Robot, Camera]:
     from deploy.devices.rig_camera import StereoCamera
     from deploy.devices.rig_robot import SimRobot
-    from deploy.trials import camera_pose
     from mjx_envs.objects import get_object
-    from rig.camera import RigCamera
-    from rig.world import RigWorld
+    from rig.camera import camera_pose, make_camera
+    from rig.world import make_world
 
     name = get_object(options.object_name or config.world.objects[0]).name
     rng = np.random.default_rng(config.seed)
-    world = RigWorld((name,), randomise=True, random=config.world.random)
+    world = make_world(config.world, (name,))
     world.reset(config.seed, name)
     robot = SimRobot(world, clock, 1.0 / info.control_hz)
     if options.camera == "realsense":
@@ -159,7 +158,7 @@ def _rig(config: Config, options: SessionOptions, info: PolicyMetadata, clock: C
 
         assert options.recording is not None
         return robot, ReplayCamera.open(options.recording, clock)
-    rig_camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+    rig_camera = make_camera(config, world)
     return robot, StereoCamera(world, rig_camera, camera_pose(config, rng), rng, robot.catch_up, name)
 
 

@@ -15,16 +15,8 @@ from evaluation import object_sheet
 from mjx_envs import grasp_math, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import GraspEnv
-from mjx_envs.objects import (
-    DEFAULT_SLOTS,
-    OBJECTS,
-    Box,
-    Capsule,
-    ObjectSpec,
-    SlotLayout,
-    get_object,
-    slot_layout,
-)
+from mjx_envs.object_spec import DEFAULT_SLOTS, Box, Capsule, ObjectSpec, SlotLayout, slot_layout
+from mjx_envs.objects import OBJECTS, get_object
 from mjx_envs.randomize import ObjectTable, sample_params
 from mjx_envs.render import raycast_numpy
 from mjx_envs.render.visual import Viewer
