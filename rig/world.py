@@ -117,6 +117,5 @@ def _units(rng: np.random.Generator) -> draws.Units:
     arm = scene.N_ARM
     size, mass, friction = (rng.uniform(-1.0, 1.0, ()) for _ in range(3))
     link_mass, damping = rng.uniform(-1.0, 1.0, arm), rng.uniform(-1.0, 1.0, arm)
-    return draws.Units(
-        size, mass, friction, link_mass, damping, rng.uniform(size=arm), rng.uniform(-1, 1, arm)
-    )
+    joint_friction, stiffness = rng.uniform(size=arm), rng.uniform(-1.0, 1.0, arm)
+    return draws.Units(size, mass, friction, link_mass, damping, joint_friction, stiffness)
