@@ -321,6 +321,10 @@ class KinectConfig:
     """Disparity is reported in 1/8 of a pixel."""
 
 
+SENSORS = ("ideal", "dextrah", "kinect", "stereo", "learned")
+"""Camera models (ddg_jax/sensor.py)."""
+
+
 @dataclass(frozen=True)
 class SensorConfig:
     """A model of a depth camera: clean depth to what the camera would report."""
@@ -638,8 +642,13 @@ class StudentConfig:
     """Samples per head step."""
     init_from: str = ""
     """Run directory or pretrained folder whose student to start from; empty starts from nothing."""
+    depth_source: str = "learned"
+    """What gives the demos' clean depth a camera's artefacts: learned (the run's generator), ideal (nothing),
+    dextrah, kinect or stereo (the rig's camera on the clean picture; needs demos.rgb)."""
 
     def __post_init__(self) -> None:
+        if self.depth_source not in SENSORS:
+            raise unknown_name("student.depth_source", self.depth_source, SENSORS)
         _check_counts(
             "student", self, "chunk", "execute_steps", "diffusion_steps",
             "ddim_steps", "batch_size", "noise_draws", "head_batch_size",

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import serialization
 
-from ddg_jax.sample import Generator
 from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
@@ -23,7 +22,8 @@ from demos.rollout import Roller
 from demos.store import EpisodeStore
 from ppo.policy import TeacherPolicy
 from student_jax import frames_io, head, pretrained_encoder, train
-from student_jax.act import DDGCamera, StudentActor
+from student_jax.act import SourceCamera, StudentActor
+from student_jax.depth_source import DepthSource
 from student_jax.policy import PARAMS_FILE, init_params
 
 PLAN = "plan.json"
@@ -40,12 +40,12 @@ class Trainer:
         self,
         config: Config,
         teacher: TeacherPolicy,
-        generator: Generator,
+        source: DepthSource,
         directory: Path,
         progress: Progress,
     ):
         self._config, self._student, self._profile = config, config.student, config.world.profile
-        self._teacher, self._generator = teacher, generator
+        self._teacher, self._source = teacher, source
         self._directory, self._progress = directory, progress
         self._store = EpisodeStore(directory / frames_io.CACHE, create=True)
         self._done: list[str] = []
@@ -56,7 +56,7 @@ class Trainer:
         """Every phase that is not finished; `params` is then the student."""
         self._restore()
         self._phase("poses", self._fit_on_poses)
-        frames_io.add_noisy_demos(demos, self._store, self._generator, self._config, self._progress)
+        frames_io.add_noisy_demos(demos, self._store, self._source, self._config, self._progress)
         self._phase("demos", lambda: self._fit("demos", self._student.train_steps))
         for i in range(1, self._student.dagger_rounds + 1):
             self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))
@@ -120,14 +120,12 @@ class Trainer:
         if len(self._store) < wanted:
             first = len(self._store)
             share = student.dagger_teacher_share * (1 - (number - 1) / max(1, student.dagger_rounds - 1))
-            key = jax.random.key(self._config.seed)
             rng = np.random.default_rng([self._config.seed, _DAGGER_SEED, number])
-            camera = DDGCamera(self._generator, key, first=first)
+            camera = SourceCamera(self._source, first)
             actor = StudentActor(
                 self.params, student, self._profile, camera, rng, self._config.deploy.noise, share
             )
-            with_rgb = self._generator.prior.needs_sim_rgb
-            roller = Roller(self._config, self._teacher, wanted - first, with_rgb)
+            roller = Roller(self._config, self._teacher, wanted - first, self._source.needs_rgb)
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
                 key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
                 episodes = roller.run(key, actor, lambda _: task.advance())

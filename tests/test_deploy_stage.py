@@ -149,10 +149,8 @@ def test_camera_stands_within_the_calibration_error():
 def test_sim_robot_moves_one_period_per_period_and_holds_where_it_is():
     from rig.world import RigWorld
 
-    world, clock = (
-        RigWorld(objects=("cube",), random=RandomConfig(friction_nm=0.0, joint_rad=0.0)),
-        SimClock(),
-    )
+    quiet = RandomConfig(friction_nm=0.0, joint_rad=0.0)
+    world, clock = RigWorld(objects=("cube",), random=quiet), SimClock()
     world.reset(0, "cube")
     robot = SimRobot(world, clock)
     robot.start()

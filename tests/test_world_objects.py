@@ -205,7 +205,7 @@ def test_the_scene_has_as_many_slots_as_the_chosen_objects_need():
     assert ObjectTable(("cube", "wheel")).layout == SlotLayout(capsules=8, cylinders=2)
     twelve = ObjectTable(TWELVE)
     assert twelve.layout == SlotLayout(capsules=8, cylinders=2, plates=5)
-    assert twelve.slot_size.shape == (12 + len(BOTH_POSES), 16, 3) and twelve.rgb.shape == (12, 16, 3)
+    assert twelve.model.slot_size.shape == (12 + len(BOTH_POSES), 16, 3) and twelve.rgb.shape == (12, 16, 3)
     model = scene.build_model(layout=twelve.layout)
     assert [model.geom(i).name for i in scene.slot_ids(model)] == list(twelve.layout.names)
 

@@ -16,13 +16,14 @@ def check_config_values(config: Config) -> Config:
     from ddg_jax.network_prior import IN_SIMULATION
     from ddg_jax.prior import make_prior
     from ddgrasp.policy_metadata import check_depth_dtype
+    from student_jax.depth_source import check_source
 
     check_objects(config.world)
     for stage, file in CHECKPOINTS.items():
         _check_start(stage, getattr(config, stage).init_from, file)
     if config.ddg.prior_in_sim not in IN_SIMULATION:
         raise unknown_name("ddg.prior_in_sim", config.ddg.prior_in_sim, IN_SIMULATION)
-    make_prior(config.ddg)
+    check_source(config, make_prior(config.ddg))
     check_depth_dtype(config.export.depth_dtype)
     if config.student.encoder_weights:
         from student_jax import pretrained_encoder

@@ -22,7 +22,7 @@ class StudentTrain(OneStage):
 
 @dataclass(frozen=True)
 class StudentEval:
-    """Measure a trained student again, closed loop in simulation: clean and generated depth, same seeds."""
+    """Measure a trained student again, closed loop in simulation: clean and sensed depth, same seeds."""
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run."""
@@ -32,10 +32,10 @@ class StudentEval:
     """Of the episodes."""
 
     def run(self) -> None:
-        from ddg_jax.sample import Generator
         from ddgrasp.progress import Progress
         from evaluation import wilson
         from ppo.policy import load_policy
+        from student_jax.depth_source import make_source
         from student_jax.evaluate import closed_loop
         from student_jax.policy import PARAMS_FILE
 
@@ -44,9 +44,9 @@ class StudentEval:
         evaluation = replace(config.evaluation, student_trials=self.trials)
         config = replace(config, seed=self.seed, evaluation=evaluation)
         params = artifacts.load_params(self.run_dir / "student" / PARAMS_FILE)
-        generator = Generator.load(self.run_dir / "ddg")
+        source = make_source(config, self.run_dir / "ddg")
         teacher = load_policy(self.run_dir / "teacher")
-        result = closed_loop(config, teacher, generator, params, Progress(name="student eval"))
+        result = closed_loop(config, teacher, source, params, Progress(name="student eval"))
         for name, counts in result.items():
             success = counts["success"]
             print(f"{name:<14} {wilson.describe(wilson.success(success['successes'], success['n']))}")
