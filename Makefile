@@ -34,7 +34,7 @@ test: setup  ## run the tests (trains the debug preset end to end); with ARGS th
 	$(BIN)/python -m pytest $(ARGS)
 
 test-parity: setup  ## networks and equations against recorded values (PARITY_DIR=folder of fixtures)
-	$(BIN)/python -m pytest tests/test_foundation_parity.py tests/test_evaluation_distances.py tests/test_ddg_schedule.py $(ARGS)
+	$(BIN)/python -m pytest tests/test_foundation_parity.py tests/test_evaluation_distances.py tests/test_learning_diffusion.py $(ARGS)
 
 bench-networks: setup  ## frames/s of the foundation networks, against onnxruntime
 	$(BIN)/python -m benchmarks.networks $(ARGS)

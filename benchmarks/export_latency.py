@@ -22,10 +22,14 @@ PROFILE = WorldConfig().profile
 DEFAULT = StudentConfig()
 STUDENTS = {
     "default": DEFAULT,
-    "default, 4 DDIM steps": replace(DEFAULT, ddim_steps=4),
-    "ResNet-18, width 16, stride 16": replace(DEFAULT, stage_blocks=(2, 2, 2, 2), output_stride=16),
+    "default, 4 DDIM steps": replace(DEFAULT, head=replace(DEFAULT.head, ddim_steps=4)),
+    "ResNet-18, width 16, stride 16": replace(
+        DEFAULT,
+        encoder=replace(DEFAULT.encoder, stage_blocks=(2, 2, 2, 2), output_stride=16),
+    ),
     "ResNet-18, width 64, conv7 (paper)": replace(
-        DEFAULT, stage_blocks=(2, 2, 2, 2), output_stride=16, width=64, stem="conv7"
+        DEFAULT,
+        encoder=replace(DEFAULT.encoder, stage_blocks=(2, 2, 2, 2), output_stride=16, width=64, stem="conv7"),
     ),
 }
 

@@ -34,22 +34,28 @@ DDPM_STEPS = 50
 
 def samplers(config: DDGConfig) -> list[tuple[str, int]]:
     """(name, evaluations): SAMPLERS that the configuration can have, and its own."""
-    found = [pair for pair in SAMPLERS if pair[0] != PROGRESSIVE or config.hole_loss != CROSS_ENTROPY]
-    own = (config.sampler, config.sample_steps)
+    found = [
+        pair for pair in SAMPLERS if pair[0] != PROGRESSIVE or config.training.hole_loss != CROSS_ENTROPY
+    ]
+    own = (config.sampling.sampler, config.sampling.steps)
     return found if own in found else [*found, own]
 
 
 def scenes(config: DDGConfig, count: int) -> np.ndarray:
     """(count, H, W) metres: a table with a box that moves."""
-    depth = np.full((count, config.height_px, config.width_px), 0.9, np.float32)
+    depth = np.full((count, config.depth.height_px, config.depth.width_px), 0.9, np.float32)
     for i in range(count):
-        depth[i, config.height_px // 3 : config.height_px // 2, 20 + i : 60 + i] = 0.7
+        depth[i, config.depth.height_px // 3 : config.depth.height_px // 2, 20 + i : 60 + i] = 0.7
     return depth
 
 
 def make_generator(config: DDGConfig, params: Any, batch: int, sampler: str, steps: int) -> Generator:
     """The configuration's network with that sampler, `batch` frames at once."""
-    changed = replace(config, sampler=sampler, sample_steps=steps, sample_batch=batch, distil_from=16)
+    changed = replace(
+        config,
+        sampling=replace(config.sampling, sampler=sampler, steps=steps, batch_size=batch),
+        training=replace(config.training, distil_from=16),
+    )
     return Generator(changed, params, make_prior(changed))
 
 
@@ -63,7 +69,7 @@ def measure(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
         return compare.Contender(partial(generate, key, generator, depth), work)
 
     contenders = {f"{sampler} {steps}": contender(sampler, steps) for sampler, steps in samplers(config)}
-    every_step = config.diffusion_steps
+    every_step = config.diffusion.steps
     timed = min(DDPM_STEPS, every_step)
     contenders[f"ddpm {every_step}"] = contender("ddpm", timed, count * timed / every_step)
     rates = compare.measure(contenders, rounds)
@@ -78,7 +84,7 @@ def parts(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
     generator = make_generator(config, params, batch, "ddim", 1)
     depth, number = scenes(config, batch), jnp.arange(batch)
     c = condition(generator, depth, None, one_episode=True)
-    shape = (config.height_px, config.width_px, channels(config))
+    shape = (config.depth.height_px, config.depth.width_px, channels(config))
     x = np.zeros((batch, *shape), np.float32)
     network = jax.jit(lambda p, x, c: predict_noise(config, p, x, c, jnp.full(batch, 500)))
     noise = jax.jit(partial(frame_noise, shape=shape, correlation=correlations(config)))
@@ -104,7 +110,10 @@ def main() -> None:
     arguments = parser.parse_args()
     config = get_preset(arguments.preset).ddg
     params = init_params(config, jax.random.key(0))
-    print(f"{config.width_px} x {config.height_px}, {jax.local_device_count()} x {jax.default_backend()}")
+    print(
+        f"{config.depth.width_px} x {config.depth.height_px}, "
+        f"{jax.local_device_count()} x {jax.default_backend()}"
+    )
     print(f"{'sampler':<16}{'batch':>6}{'frames/s':>10}{'x ddim 50':>12}")
     for batch in arguments.batches:
         measure(config, params, batch, arguments.rounds)

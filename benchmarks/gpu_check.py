@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp import artifacts, contract
+from ddgrasp.config import Backend
 from ddgrasp.progress import Progress
 
 TOTAL_S = 530.0
@@ -37,7 +38,7 @@ Save = Callable[..., None]
 class Sizes:
     """How much to run."""
 
-    physics: str
+    physics: Backend
     conformance: tuple[str, ...]
     renderers: tuple[str, ...]
     env_counts: tuple[int, ...]

@@ -62,8 +62,8 @@ class Frames:
         held = max(1, round(len(self) * holdout_fraction))
         if held >= len(self):
             raise UserError(
-                f"ddg.holdout_fraction {holdout_fraction:g} of {len(self)} frame(s) leaves none to fit on: "
-                "record more, or hold out less."
+                f"ddg.training.holdout_fraction {holdout_fraction:g} of {len(self)} frame(s) leaves none to "
+                "fit on: record more, or hold out less."
             )
         return self.part(slice(0, len(self) - held)), self.part(slice(len(self) - held, len(self)))
 
@@ -107,7 +107,7 @@ def load_frames(
     noisy = np.concatenate(depth)
     return Frames(
         noisy,
-        surfaces(noisy, config.surface, progress),
+        surfaces(noisy, config.depth.surface, progress),
         np.concatenate(priors),
         np.concatenate(index),
         skipped,
@@ -136,12 +136,12 @@ def _folders(root: Path) -> list[Path]:
 def _read(
     recording: Recording, limit: int, config: DDGConfig, prior: Prior, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """Of the first `limit` frames: (depth (T, H, W) in metres at the generator's size, rgb (T, h, w, 3) if
-    the prior wants it, number of frames left out).
+    """The first `limit` frames: (depth (T, H, W) in metres at the generator's size, rgb (T, h, w, 3) if the
+    prior wants it, number of frames left out).
     """
     if recording.skipped:
         progress.note(recording.skipped_summary())
-    size = (config.height_px, config.width_px)
+    size = (config.depth.height_px, config.depth.width_px)
     count = min(limit, len(recording))
     frames = np.stack([resize_nearest(recording.depth_m(i), size) for i in range(count)])
     usable = np.flatnonzero((frames > 0).any(axis=(1, 2)))
@@ -157,12 +157,17 @@ def _read(
 
 
 def _tell_of_crop(recording: Recording, config: DDGConfig, progress: Progress) -> None:
-    height, width, rows, columns = recording.height_px, recording.width_px, config.height_px, config.width_px
+    height, width, rows, columns = (
+        recording.height_px,
+        recording.width_px,
+        config.depth.height_px,
+        config.depth.width_px,
+    )
     kept = min(height / rows, width / columns) ** 2 * rows * columns / (height * width)
     if kept < LEAST_KEPT:
         progress.note(
             f"{recording.path}: the generator sees {kept:.0%} of each {width}x{height} frame, a centred "
-            f"window of {columns}:{rows}, the simulated camera's shape; --ddg.height-px "
+            f"window of {columns}:{rows}, the simulated camera's shape; --ddg.depth.height-px "
             f"{round(columns * height / width)} takes all of it"
         )
 
@@ -194,13 +199,15 @@ def make_batch(frames: Frames, config: DDGConfig, seed: int, step: int) -> Batch
     Frames are never mirrored left to right: stereo shadows lie on one side.
     """
     rng = np.random.default_rng((seed, step))
-    chosen = rng.integers(len(frames), size=config.batch_size)
-    flip = rng.random(config.batch_size) < 0.5
+    chosen = rng.integers(len(frames), size=config.training.batch_size)
+    flip = rng.random(config.training.batch_size) < 0.5
     depth_m, surface_m, c = (
         np.where(flip[:, None, None], values[chosen, ::-1], values[chosen])
         for values in (frames.depth_m, frames.surface_m, frames.prior)
     )
-    scale, shift = rng.uniform(-config.prior_jitter, config.prior_jitter, (2, config.batch_size, 1, 1))
+    scale, shift = rng.uniform(
+        -config.prior.jitter, config.prior.jitter, (2, config.training.batch_size, 1, 1)
+    )
     c = ((1 + scale) * c + shift).astype(np.float32)
     return Batch(np.asarray(_encode(config, depth_m, surface_m)), c)
 

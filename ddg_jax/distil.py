@@ -1,8 +1,8 @@
 """Progressive distillation: a sampler of few network evaluations learnt from one of many.
 
 A student of n evaluations learns to do in one DDIM step what its teacher does in two of 2n. The first teacher
-is the fitted network with `DDGConfig.distil_from` evaluations, the second step of every two of second order.
-Every further one is the student before it, until `DDGConfig.sample_steps` are left (Salimans & Ho 2022,
+is the fitted network with `ddg.training.distil_from` evaluations, the second step of every two of second
+order. Every further one is the student before it, until `ddg.sampling.steps` are left (Salimans & Ho 2022,
 algorithm 2). Noise levels are only those that the student's sampler visits, so that all of its capacity goes
 to them.
 """
@@ -24,11 +24,12 @@ from ddg_jax.train import (
     predict_clean,
     step_keys,
 )
-from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.progress import Progress
 from learning import diffusion
-from learning.loop import Params, TrainState, first_state, run_steps, updated
+from learning.loop import run_steps
+from learning.params import Params, load_params, save_params
+from learning.train_state import TrainState, first_state, updated
 
 LEARNING_RATE = 0.5
 """Relative to the fit's."""
@@ -44,8 +45,8 @@ def params_file(steps: int) -> str:
 
 def rounds(config: DDGConfig) -> list[int]:
     """Network evaluations of each student, in the order of training, the last `config.sample_steps`."""
-    counts = [config.sample_steps]
-    while 2 * counts[-1] < config.distil_from:
+    counts = [config.sampling.steps]
+    while 2 * counts[-1] < config.training.distil_from:
         counts.append(2 * counts[-1])
     return counts[::-1]
 
@@ -63,10 +64,8 @@ def distil(
         path = directory / params_file(count)
         if not path.exists():
             limit = X_LIMIT if number == 0 else np.inf
-            artifacts.save_params(
-                path, _round(config, teacher, frames, directory, seed, progress, count, limit)
-            )
-        teacher = artifacts.load_params(path, teacher)
+            save_params(path, _round(config, teacher, frames, directory, seed, progress, count, limit))
+        teacher = load_params(path, teacher)
     return teacher
 
 
@@ -85,17 +84,19 @@ def _round(
 
     def step_once(state: TrainState, step: int) -> tuple[TrainState, dict[str, Array]]:
         # Batches of its own, whatever the fit and the other rounds drew.
-        batch = make_batch(frames, config, seed, config.train_steps + count * config.distil_steps + step)
-        number = np.random.default_rng((seed, count, step)).integers(count, size=config.batch_size)
-        path = teacher_path(made.steps, count, number, config.sample_spacing)
+        batch = make_batch(
+            frames, config, seed, config.training.steps + count * config.training.distil_steps + step
+        )
+        number = np.random.default_rng((seed, count, step)).integers(count, size=config.training.batch_size)
+        path = teacher_path(made.steps, count, number, config.sampling.spacing)
         return distil_step(config, state, teacher, limit, path, batch.x_0, batch.c)
 
-    state = run_steps(
-        first_state(teacher, make_optimizer(config, config.distil_steps, LEARNING_RATE), key),
-        config.distil_steps,
+    state, _ = run_steps(
+        first_state(teacher, make_optimizer(config, config.training.distil_steps, LEARNING_RATE), key),
+        config.training.distil_steps,
         step_once,
         directory / f"distil_{count}",
-        every=config.checkpoint_every,
+        every=config.training.checkpoint_every,
         label=f"distilling to {count}",
         progress=progress,
         curve=f"distil_{count}/",
@@ -125,7 +126,7 @@ def distil_step(
     """
     eps_key, _, prior_key = step_keys(state)
     made = config_schedule(config)
-    c = c + config.prior_noise * jax.random.normal(prior_key, c.shape)
+    c = c + config.prior.noise * jax.random.normal(prior_key, c.shape)
     path = jnp.asarray(path)
     k, _, end = path
     x_k = diffusion.q_sample(made, x_0, k, jax.random.normal(eps_key, x_0.shape))
@@ -141,15 +142,15 @@ def distil_step(
     before = jnp.stack([k, jnp.where(jnp.isfinite(limit), k, path[1])])
     (x, _), _ = jax.lax.scan(teacher_step, (x_k, x_k), (before, path[:2], path[1:]))
     target = jax.lax.stop_gradient(one_step_target(made, x_k, k, x, end))
-    weight = jnp.clip(diffusion.signal_to_noise(made, k), *config.snr_limits)
+    weight = jnp.clip(diffusion.signal_to_noise(made, k), *config.training.snr_limits)
 
     def loss_of(params: Params) -> Array:
         error = (target - predict_clean(config, params, x_k, c, k)) ** 2
         return jnp.mean(weight * jnp.mean(error, axis=(1, 2, 3)))
 
     loss, grads = jax.value_and_grad(loss_of)(state.params)
-    optimizer = make_optimizer(config, config.distil_steps, LEARNING_RATE)
-    state = updated(state, optimizer, grads, config.ema_decay)
+    optimizer = make_optimizer(config, config.training.distil_steps, LEARNING_RATE)
+    state = updated(state, optimizer, grads, config.training.ema_decay)
     return state, {"loss": loss, "grad_norm": optax.global_norm(grads)}
 
 

@@ -92,7 +92,7 @@ def run(job: Job) -> Artifact:
     ends = np.concatenate([[0], clean.ends])
     if generator.prior.needs_sim_rgb and "rgb" not in clean.fields:
         raise UserError(
-            f"{clean.path} holds no colour, which the prior needs: ddg.prior_in_sim depth does not."
+            f"{clean.path} holds no colour, which the prior needs: ddg.prior.in_sim depth does not."
         )
 
     def read(i: int) -> Clip:

@@ -1,6 +1,6 @@
 """The geometric prior c from a pretrained depth network on RGB: the paper's own choice (III-B1).
 
-What the paper leaves open is c in simulation. Both readings are here (`DDGConfig.prior_in_sim`): the network
+What the paper leaves open is c in simulation. Both readings are here (`DDGConfig.prior.in_sim`): the network
 on simulated RGB, or simulated depth itself, inverted and normalised as the network's output is.
 """
 
@@ -25,7 +25,7 @@ _BATCH = 8
 
 def weights_folder(config: DDGConfig) -> Path:
     """Where the network's converted weights are looked for."""
-    return Path(config.prior_weights or store.WEIGHTS_DIR / f"{config.prior}_small")
+    return Path(config.prior.weights or store.WEIGHTS_DIR / f"{config.prior.source}_small")
 
 
 class DepthNetworkPrior:
@@ -34,17 +34,19 @@ class DepthNetworkPrior:
     needs_rgb = True
 
     def __init__(self, config: DDGConfig):
-        if config.prior_in_sim not in IN_SIMULATION:
-            raise unknown_name("ddg.prior_in_sim", config.prior_in_sim, IN_SIMULATION)
-        self.name, self._config = config.prior, config
-        self.needs_sim_rgb = config.prior_in_sim == "rgb"
+        if config.prior.in_sim not in IN_SIMULATION:
+            raise unknown_name("ddg.prior.in_sim", config.prior.in_sim, IN_SIMULATION)
+        self.name, self._config = config.prior.source, config
+        self.needs_sim_rgb = config.prior.in_sim == "rgb"
         self._directory = weights_folder(config)
         manifest = store.read_manifest(self._directory)
-        if not manifest.network.startswith(config.prior):
-            raise UserError(f"{self._directory} holds {manifest.network}; ddg.prior is {config.prior}.")
+        if not manifest.network.startswith(config.prior.source):
+            raise UserError(
+                f"{self._directory} holds {manifest.network}; ddg.prior.source is {config.prior.source}."
+            )
         if manifest.max_depth_m:
             raise UserError(f"{self._directory} holds a metric model; the prior is relative inverse depth.")
-        self.source: str | dict[str, str] = manifest.summary() | {"in_simulation": config.prior_in_sim}
+        self.source: str | dict[str, str] = manifest.summary() | {"in_simulation": config.prior.in_sim}
 
     def from_recording(
         self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator
@@ -55,14 +57,14 @@ class DepthNetworkPrior:
 
     def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None = None) -> np.ndarray:
         """See `Prior`."""
-        if self._config.prior_in_sim == "depth":
+        if self._config.prior.in_sim == "depth":
             return normalise(invert(depth_m))
         return self._from_rgb(rgb, depth_m.shape[1:])
 
     def _from_rgb(self, rgb: np.ndarray | None, size: tuple[int, ...]) -> np.ndarray:
         if rgb is None:
             raise UserError(
-                f"ddg.prior {self.name} was given no RGB: keep it, or set ddg.prior_in_sim depth."
+                f"ddg.prior.source {self.name} was given no RGB: keep it, or set ddg.prior.in_sim depth."
             )
         return normalise(np.stack([at_size(frame, (size[0], size[1])) for frame in self._infer(rgb)]))
 
@@ -74,8 +76,8 @@ class DepthNetworkPrior:
         from foundation.video import stream
 
         manifest, variables = store.load(self._directory, NETWORKS)
-        network = depth_network(manifest.network, dtype=self._config.prior_dtype)
-        params, side = variables["params"], self._config.prior_input_px
+        network = depth_network(manifest.network, dtype=self._config.prior.dtype)
+        params, side = variables["params"], self._config.prior.input_px
 
         def video(rgb: np.ndarray) -> np.ndarray:
             if len(rgb) == 1:  # a frame by itself needs no window of 32

@@ -117,14 +117,14 @@ _BUILT_IN = (InverseDepthPrior, MetricInverseDepthPrior)
 
 def make_prior(config: DDGConfig) -> Prior:
     """The prior that the configuration names; UserError for another name, or weights that are not there."""
-    if config.surface not in SURFACES:
-        raise unknown_name("ddg.surface", config.surface, SURFACES)
-    if config.prior in NETWORKS:
+    if config.depth.surface not in SURFACES:
+        raise unknown_name("ddg.depth.surface", config.depth.surface, SURFACES)
+    if config.prior.source in NETWORKS:
         return DepthNetworkPrior(config)
     for kind in _BUILT_IN:
-        if config.prior == kind.name:
-            return kind(config.prior_blur_px, config.decoy_holes, config.surface)
-    raise unknown_name("prior", config.prior, (*(kind.name for kind in _BUILT_IN), *NETWORKS))
+        if config.prior.source == kind.name:
+            return kind(config.prior.blur_px, config.prior.decoy_holes, config.depth.surface)
+    raise unknown_name("prior", config.prior.source, (*(kind.name for kind in _BUILT_IN), *NETWORKS))
 
 
 def decoy_holes(holes: np.ndarray, rng: np.random.Generator) -> np.ndarray:

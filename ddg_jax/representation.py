@@ -1,4 +1,4 @@
-"""Depth maps <-> the arrays x (..., C) in which the diffusion model works (`ddg.representation`).
+"""Depth maps <-> the arrays x (..., C) in which the diffusion model works (`ddg.depth.representation`).
 
 deviation, C = 2: what the sensor did to the surface that it looked at.
     x[0] = -1 hole, +1 valid
@@ -43,20 +43,20 @@ class Decoded(NamedTuple):
 
 def channels(config: DDGConfig) -> int:
     """C, the length of x's last axis; UserError for an unknown representation."""
-    if config.representation not in REPRESENTATIONS:
-        raise unknown_name("ddg.representation", config.representation, REPRESENTATIONS)
-    return 2 if config.representation == DEVIATION else 1
+    if config.depth.representation not in REPRESENTATIONS:
+        raise unknown_name("ddg.depth.representation", config.depth.representation, REPRESENTATIONS)
+    return 2 if config.depth.representation == DEVIATION else 1
 
 
 def correlations(config: DDGConfig) -> tuple[float, ...]:
     """Per channel of x: share of its initial noise that an episode's frames have in common."""
-    return (config.frame_correlation, config.deviation_correlation)[: channels(config)]
+    return (config.sampling.frame_correlation, config.sampling.deviation_correlation)[: channels(config)]
 
 
 def encode(config: DDGConfig, depth_m: ArrayLike, surface_m: ArrayLike) -> Array:
     """Measured planar metres (0 = hole) of surfaces at `surface_m`, same shape -> x (..., C) float32."""
     depth_m = jnp.asarray(depth_m)
-    if config.representation == DEPTH:
+    if config.depth.representation == DEPTH:
         return _depth_to_x(depth_m, config)[..., None]
     valid = depth_m > 0
     deviation = jnp.where(valid, _inverse(depth_m) - _inverse(surface_m), 0.0)
@@ -70,13 +70,13 @@ def decode(config: DDGConfig, x: ArrayLike, surface_m: ArrayLike) -> Decoded:
     An artefact is a hole or, in `deviation`, a deviation of `deviation_threshold` or more.
     """
     x, surface_m = jnp.asarray(x), jnp.asarray(surface_m)
-    hole = x[..., 0] < config.noise_threshold
-    if config.representation == DEPTH:
+    hole = x[..., 0] < config.graft.noise_threshold
+    if config.depth.representation == DEPTH:
         return Decoded(jnp.where(hole, 0.0, _x_to_depth(x[..., 0], config)).astype(jnp.float32), hole)
     deviation = _expanded(x[..., 1])
     inverse = jnp.maximum(_inverse(surface_m) + deviation, 1 / FARTHEST_M)
     depth_m = jnp.where(hole | (surface_m <= 0), 0.0, 1 / inverse).astype(jnp.float32)
-    return Decoded(depth_m, hole | (jnp.abs(deviation) >= config.deviation_threshold))
+    return Decoded(depth_m, hole | (jnp.abs(deviation) >= config.graft.deviation_threshold))
 
 
 def _inverse(depth_m: ArrayLike) -> Array:
@@ -94,9 +94,11 @@ def _expanded(x: Array) -> Array:
 
 def _depth_to_x(depth_m: Array, config: DDGConfig) -> Array:
     inverse = 1 / jnp.maximum(depth_m, 1e-6)
-    x = (inverse - 1 / config.far_m) / (1 / config.near_m - 1 / config.far_m)
+    x = (inverse - 1 / config.depth.far_m) / (1 / config.depth.near_m - 1 / config.depth.far_m)
     return jnp.where(depth_m > 0, jnp.clip(x, 0, 1), HOLE).astype(jnp.float32)
 
 
 def _x_to_depth(x: Array, config: DDGConfig) -> Array:
-    return 1 / (1 / config.far_m + jnp.clip(x, 0, 1) * (1 / config.near_m - 1 / config.far_m))
+    return 1 / (
+        1 / config.depth.far_m + jnp.clip(x, 0, 1) * (1 / config.depth.near_m - 1 / config.depth.far_m)
+    )

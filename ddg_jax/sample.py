@@ -22,7 +22,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.errors import UserError
 from learning import diffusion
-from learning.loop import Params
+from learning.params import Params, load_params, save_params
 
 PARAMS_FILE = "params.msgpack"
 SHARED = 2**31 - 1
@@ -38,7 +38,7 @@ class Generator:
 
     config: DDGConfig
     params: Params
-    """Of the fitted network, or of the distilled one for sampler progressive."""
+    """Parameters of the fitted network, or of the distilled one for sampler progressive."""
     prior: Prior
 
     @classmethod
@@ -54,20 +54,23 @@ class Generator:
         if manifest.stage != "ddg":
             raise UserError(f"{directory} holds a {manifest.stage!r} artefact; expected one of stage 'ddg'.")
         config = artifacts.config_from_json(manifest.config).ddg
-        sampler, steps = sampler or config.sampler, steps or config.sample_steps
+        sampler, steps = sampler or config.sampling.sampler, steps or config.sampling.steps
         file = directory / (params_file(steps) if sampler == PROGRESSIVE else PARAMS_FILE)
         if sampler == PROGRESSIVE and not file.exists():
             raise UserError(
                 f"{directory} holds no {file.name}: distil one with `ddgrasp ddg distil --model {directory} "
                 f"--evaluations {steps}`."
             )
-        config = replace(config, sampler=sampler, sample_steps=steps)
-        params = artifacts.load_params(file, jax.eval_shape(partial(_init_shapes, config)))
+        config = replace(
+            config,
+            sampling=replace(config.sampling, sampler=sampler, steps=steps),
+        )
+        params = load_params(file, jax.eval_shape(partial(_init_shapes, config)))
         return cls(config, params, make_prior(config))
 
     def save(self, directory: Path | str) -> None:
         """Writes a fitted network's parameters; the manifest, written by the stage, makes them loadable."""
-        artifacts.save_params(Path(directory) / PARAMS_FILE, self.params)
+        save_params(Path(directory) / PARAMS_FILE, self.params)
 
 
 def _init_shapes(config: DDGConfig) -> Any:
@@ -114,33 +117,36 @@ def sample(
       key: the whole data set's key; c: (B, H, W); episode, frame: see `frame_noise`.
       steps: network evaluations per map.
     """
-    if config.sampler == PROGRESSIVE and steps != config.sample_steps:
+    if config.sampling.sampler == PROGRESSIVE and steps != config.sampling.steps:
         raise UserError(
-            f"This generator was distilled to {config.sample_steps} evaluations, not {steps}: load the one "
+            f"This generator was distilled to {config.sampling.steps} evaluations, not {steps}: load the one "
             "for those, or sampler ddim."
         )
     made = config_schedule(config)
-    visited = diffusion.timesteps(made.steps, steps, config.sample_spacing)
+    visited = diffusion.timesteps(made.steps, steps, config.sampling.spacing)
     size = c.shape[1], c.shape[2]
     numbered = partial(frame_noise, episode=episode, frame=frame)
     noise = partial(numbered, shape=(*size, channels(config)), correlation=correlations(config))
     prior_key, start_key, step_key = jax.random.split(key, 3)
-    c = c + config.prior_noise * numbered(prior_key, shape=size, correlation=config.frame_correlation)
+    c = c + config.prior.noise * numbered(
+        prior_key, shape=size, correlation=config.sampling.frame_correlation
+    )
 
     def body(last: tuple[Array, Array], now: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
         (x, x_0_before), (before, k, previous) = last, now
         eps = predict_noise(config, params, x, c, jnp.full(x.shape[:1], k))
         fresh = partial(noise, jax.random.fold_in(step_key, k))
         x_0 = jnp.clip(diffusion.predict_x_0(made, x, k, eps), -X_LIMIT, X_LIMIT)
-        if config.sampler == DPM_SOLVER:
+        if config.sampling.sampler == DPM_SOLVER:
             x = diffusion.dpm_solver_step(made, x, k, previous, x_0, before, x_0_before)
-        elif config.sampler == DDPM:
+        elif config.sampling.sampler == DDPM:
             x = diffusion.ddpm_step(made, x, k, previous, eps, fresh(), X_LIMIT)
-        elif config.sampler == PROGRESSIVE:
-            x = diffusion.ddim_step(made, x, k, previous, eps, None)
+        elif config.sampling.sampler == PROGRESSIVE:
+            x = diffusion.ddim_step(diffusion.ddim_coefficients(made, k, previous, x), x, eps, None)
         else:
-            extra = fresh() if config.eta else 0.0
-            x = diffusion.ddim_step(made, x, k, previous, eps, X_LIMIT, config.eta, extra)
+            extra = fresh() if config.sampling.eta else 0.0
+            step = diffusion.ddim_coefficients(made, k, previous, x, config.sampling.eta)
+            x = diffusion.ddim_step(step, x, eps, X_LIMIT, noise=extra)
         return (x, x_0), None
 
     start = noise(start_key)
@@ -200,7 +206,7 @@ def condition(
     """
     config, prior = generator.config, generator.prior
     _check_depth(depth_m, config)
-    clean = _at_size(depth_m, (config.height_px, config.width_px))
+    clean = _at_size(depth_m, (config.depth.height_px, config.depth.width_px))
     if one_episode:
         return prior.from_sim(clean, rgb)
     pictures = [None] * len(clean) if rgb is None else [picture[None] for picture in rgb]
@@ -222,7 +228,7 @@ def _graft(config: DDGConfig, depth_m: Array, x: Array) -> tuple[Array, Array, A
 
 def batch_size(config: DDGConfig) -> int:
     """Frames that one call of the network takes, over all devices of this process."""
-    return config.sample_batch * jax.local_device_count()
+    return config.sampling.batch_size * jax.local_device_count()
 
 
 def predict(
@@ -253,7 +259,7 @@ def predict(
             jax.device_put(_filled_up(c[now], size), split),
             jnp.asarray(number) if number.ndim == 0 else jax.device_put(_filled_up(number[now], size), split),
             jax.device_put(_filled_up(frame[now], size), split),
-            steps=steps or config.sample_steps,
+            steps=steps or config.sampling.steps,
         )
         parts.append(np.asarray(x)[: len(c[now])])
     return np.concatenate(parts)
@@ -268,10 +274,10 @@ def _filled_up(values: np.ndarray, size: int) -> np.ndarray:
 def check_aspect(size: tuple[int, ...], config: DDGConfig) -> None:
     """UserError if depth of (H, W) `size` is not of the generator's shape."""
     height, width = size
-    if abs(width / height / (config.width_px / config.height_px) - 1) > _ASPECT_TOLERANCE:
+    if abs(width / height / (config.depth.width_px / config.depth.height_px) - 1) > _ASPECT_TOLERANCE:
         raise UserError(
             f"Simulated depth is {width}x{height}; the generator was fitted at "
-            f"{config.width_px}x{config.height_px}: render with that aspect ratio."
+            f"{config.depth.width_px}x{config.depth.height_px}: render with that aspect ratio."
         )
 
 

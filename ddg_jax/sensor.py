@@ -52,10 +52,10 @@ def learned(generator: Generator) -> Sense:
     config = generator.config
     if generator.prior.needs_sim_rgb:
         raise UserError(
-            f"A learned sensor with the prior {config.prior!r} on rgb cannot be jitted: fit with "
-            "--ddg.prior-in-sim depth, or use ddg_jax.sample.generate."
+            f"A learned sensor with the prior {config.prior.source!r} on rgb cannot be jitted: fit with "
+            "--ddg.prior.in-sim depth, or use ddg_jax.sample.generate."
         )
-    size = (config.height_px, config.width_px)
+    size = (config.depth.height_px, config.depth.width_px)
 
     def prior_on_host(depth_m) -> np.ndarray:
         depth = np.asarray(depth_m)
@@ -68,7 +68,7 @@ def learned(generator: Generator) -> Sense:
         shape = jax.ShapeDtypeStruct(size, jnp.float32)
         c = jax.pure_callback(prior_on_host, shape, clean, vmap_method="broadcast_all")[None]
         first = jnp.zeros(1, jnp.int32)
-        x = sample(config, key, generator.params, c, first[0], first, steps=config.sample_steps)[0]
+        x = sample(config, key, generator.params, c, first[0], first, steps=config.sampling.steps)[0]
         sized = jax.image.resize(x, (*depth_m.shape, x.shape[-1]), "nearest")
         predicted = decode(config, sized, depth_m)
         return graft(depth_m, predicted.depth_m, predicted.mask)

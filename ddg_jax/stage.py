@@ -1,6 +1,7 @@
 """Stage `ddg`: recordings -> a fitted generator, its statistics and its pictures."""
 
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from ddgrasp.config import PROGRESSIVE, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
-from learning.loop import Params
+from learning.params import Params
 from sensors.statistics import stats
 
 STAGE = "ddg"
@@ -41,7 +42,7 @@ def run(job: Job) -> Artifact:
     root = job.inputs["data"] if "data" in job.inputs else job.parents["record"].directory
     prior = make_prior(config.ddg)
     frames = data.load_frames(root, config.ddg, prior, config.seed, progress)
-    training, held_out = frames.split(config.ddg.holdout_fraction)
+    training, held_out = frames.split(config.ddg.training.holdout_fraction)
     generator = fitted_generator(config.ddg, prior, training, directory, config.seed, progress)
     scored = held_out.part(slice(-SCORED_FRAMES, None))
     metrics = {
@@ -84,7 +85,7 @@ def fitted_generator(
     fitted = _loaded(config) if config.init_from else fit(config, frames, directory, seed, progress)
     generator = Generator(config, fitted, prior)
     generator.save(directory)
-    if config.sampler != PROGRESSIVE:
+    if config.sampling.sampler != PROGRESSIVE:
         return generator
     return replace(generator, params=distil(config, fitted, frames, directory, seed, progress))
 
@@ -94,11 +95,11 @@ def _loaded(config: DDGConfig) -> Params:
     source = Path(config.init_from)
     generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source, sampler="ddim")
     for name in (
-        "height_px", "width_px", "representation", "hole_loss", "surface", "near_m", "far_m", "prior",
-        "space_to_depth", "widths", "blocks", "attention_heads", "diffusion_steps", "schedule",
-        "log_snr_shift",
+        "depth.height_px", "depth.width_px", "depth.representation", "training.hole_loss", "depth.surface",
+        "depth.near_m", "depth.far_m", "prior.source", "unet.space_to_depth", "unet.widths", "unet.blocks",
+        "unet.attention_heads", "diffusion.steps", "diffusion.schedule", "diffusion.log_snr_shift",
     ):  # fmt: skip
-        there, here = getattr(generator.config, name), getattr(config, name)
+        there, here = map(attrgetter(name), (generator.config, config))
         if there != here:
             raise UserError(
                 f"The generator in {source} has ddg.{name} {there!r}, this configuration {here!r}: "

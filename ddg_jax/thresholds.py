@@ -52,7 +52,7 @@ class Masked:
 def masked(config: DDGConfig, x: np.ndarray, frames: data.Frames, threshold: float) -> Masked:
     """Statistics of maps x (N, H, W, C) on the surfaces of `frames`."""
     clean_m = frames.surface_m
-    made = grafted(replace(config, noise_threshold=threshold), clean_m, x)
+    made = grafted(replace(config, graft=replace(config.graft, noise_threshold=threshold)), clean_m, x)
     mask = made.predicted_m == 0
     holes = hole_statistics(np.where(mask, 0.0, 1.0), frames.recording)
     recorded = frames.depth_m == 0
@@ -75,18 +75,22 @@ def analyse(
 ) -> list[Masked]:
     """Writes `out`/thresholds.json and .png for the last `count` frames of the recordings at or below `root`.
 
-    Those the model was fitted on are at the front (`DDGConfig.holdout_fraction`).
+    Those the model was fitted on are at the front (`DDGConfig.training.holdout_fraction`).
     """
     generator = Generator.load(model)
     config = generator.config
     frames = data.load_frames(root, config, generator.prior, seed, progress).part(slice(-count, None))
     x = predict(jax.random.key(seed), generator, frames.prior, episode=frames.recording, frame=frames.number)
-    thresholds = THRESHOLDS if config.representation == DEPTH else WIDE_THRESHOLDS
+    thresholds = THRESHOLDS if config.depth.representation == DEPTH else WIDE_THRESHOLDS
     rows = [masked(config, x, frames, threshold) for threshold in thresholds]
     recorded = hole_statistics(frames.depth_m, frames.recording)
-    value = {"recorded": recorded, "used": config.noise_threshold, "thresholds": [asdict(r) for r in rows]}
+    value = {
+        "recorded": recorded,
+        "used": config.graft.noise_threshold,
+        "thresholds": [asdict(r) for r in rows],
+    }
     artifacts.atomic_write_json(out / f"{FILE}.json", value)
-    artifacts.atomic_write_bytes(out / f"{FILE}.png", _drawn(rows, recorded, config.noise_threshold))
+    artifacts.atomic_write_bytes(out / f"{FILE}.png", _drawn(rows, recorded, config.graft.noise_threshold))
     return rows
 
 

@@ -1,6 +1,6 @@
 """DDPM training of the generator (paper III-B1): a pure step on x_0 and c; learning/loop.py repeats it.
 
-What the network's first channel is depends on `ddg.hole_loss`:
+What the network's first channel is depends on `ddg.training.hole_loss`:
 
 squared, the paper's equation 4: the clean value, trained by its squared error like every other channel.
 
@@ -26,12 +26,14 @@ from ddg_jax.unet import UNet
 from ddgrasp.config import CROSS_ENTROPY, SQUARED, UNIFORM, DDGConfig
 from ddgrasp.progress import Progress
 from learning import diffusion
-from learning.loop import Params, TrainState, first_state, run_steps, updated
+from learning.loop import run_steps
+from learning.optimizers import adamw
+from learning.params import Params
+from learning.train_state import TrainState, first_state, step_key, updated
 
 WARMUP_STEPS = 50
 FINAL_LEARNING_RATE = 0.05
 """Share of the learning rate left at the end."""
-MAX_GRAD_NORM = 1.0
 LOG_ODDS_PER_OUTPUT = 4.0
 """The network's outputs are of the order of 1, log odds of what it is sure of 10."""
 CHECKPOINTS = "checkpoints"
@@ -39,23 +41,25 @@ CHECKPOINTS = "checkpoints"
 
 def make_unet(config: DDGConfig) -> UNet:
     """The noise-prediction network of the configuration."""
-    return UNet(config.widths, config.blocks, config.attention_heads, config.space_to_depth)
+    return UNet(
+        config.unet.widths, config.unet.blocks, config.unet.attention_heads, config.unet.space_to_depth
+    )
 
 
 def make_optimizer(config: DDGConfig, steps: int, scale: float = 1.0) -> optax.GradientTransformation:
     """AdamW with warm-up and cosine decay over `steps`; `scale` times the configuration's learning rate."""
-    warmup, peak = min(WARMUP_STEPS, max(1, steps // 10)), scale * config.learning_rate
-    rate = optax.warmup_cosine_decay_schedule(
-        0.0, peak, warmup, max(steps, warmup + 1), peak * FINAL_LEARNING_RATE
-    )
-    return optax.chain(
-        optax.clip_by_global_norm(MAX_GRAD_NORM), optax.adamw(rate, weight_decay=config.weight_decay)
+    return adamw(
+        scale * config.training.learning_rate,
+        steps,
+        warmup=WARMUP_STEPS,
+        final_share=FINAL_LEARNING_RATE,
+        weight_decay=config.training.weight_decay,
     )
 
 
 def init_params(config: DDGConfig, key: Array) -> Params:
     """Fresh parameters of the network."""
-    c = jnp.zeros((1, config.height_px, config.width_px))
+    c = jnp.zeros((1, config.depth.height_px, config.depth.width_px))
     x = jnp.zeros((*c.shape, channels(config)))
     return make_unet(config).init(key, x, c, jnp.zeros((1,), jnp.int32))["params"]
 
@@ -64,18 +68,20 @@ def init_params(config: DDGConfig, key: Array) -> Params:
 def init_state(config: DDGConfig, key: Array) -> TrainState:
     """State before the first step. `key` is raw key data."""
     params = init_params(config, jax.random.fold_in(jax.random.wrap_key_data(key), 0))
-    return first_state(params, make_optimizer(config, config.train_steps), key)
+    return first_state(params, make_optimizer(config, config.training.steps), key)
 
 
 def config_schedule(config: DDGConfig) -> diffusion.Schedule:
     """The forward process of the configuration."""
-    return diffusion.make_schedule(config.schedule, config.diffusion_steps, config.log_snr_shift)
+    return diffusion.make_schedule(
+        config.diffusion.schedule, config.diffusion.steps, config.diffusion.log_snr_shift
+    )
 
 
 def predict_clean(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
     """The clean map x_0 (B, H, W, C) that the network sees in x_k; c (B, H, W), step (B,) int."""
     out = _output(config, params, x_k, c, step)
-    if config.hole_loss == SQUARED:
+    if config.training.hole_loss == SQUARED:
         return out
     valid = jnp.tanh(valid_log_odds(config, out, x_k, step) / 2)  # E[x_0]: 2 sigmoid(log odds) - 1
     return jnp.concatenate([valid[..., None], out[..., 1:]], axis=-1)
@@ -114,10 +120,10 @@ def loss_weight(config: DDGConfig, step: Array) -> Array:
     "uniform" is the paper's 1. "truncated" is clip(SNR, *config.snr_limits) / SNR: per unit of error in x_0
     no step weighs less than the floor (Salimans & Ho 2022, section 4) nor more than a cap (Hang et al. 2023).
     """
-    if config.loss_weight == UNIFORM:
+    if config.training.loss_weight == UNIFORM:
         return jnp.ones(step.shape)
     snr = diffusion.signal_to_noise(config_schedule(config), step)
-    return jnp.clip(snr, *config.snr_limits) / snr
+    return jnp.clip(snr, *config.training.snr_limits) / snr
 
 
 def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Array, eps: Array) -> Array:
@@ -131,7 +137,7 @@ def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Ar
     x_k = diffusion.q_sample(made, x_0, step, eps)
     out = _output(config, params, x_k, c, step)
     error = (x_0 - out) ** 2
-    if config.hole_loss == CROSS_ENTROPY:
+    if config.training.hole_loss == CROSS_ENTROPY:
         wrong = -jnp.sign(x_0[..., 0]) * valid_log_odds(config, out, x_k, step)
         error = error.at[..., 0].set(2 * jax.nn.softplus(wrong))
     weight = loss_weight(config, step) * diffusion.signal_to_noise(made, step)
@@ -140,7 +146,7 @@ def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Ar
 
 def step_keys(state: TrainState) -> Array:
     """(3,) keys of the step that `state` takes next: for eps, k and the noise on c."""
-    return jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step + 1), 3)
+    return jax.random.split(step_key(state, ahead=1), 3)
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
@@ -150,10 +156,10 @@ def train_step(
     """One optimiser step on x_0 (B, H, W, C), c (B, H, W). Pure: its noise comes from `step_keys`."""
     eps_key, step_key, prior_key = step_keys(state)
     eps = jax.random.normal(eps_key, x_0.shape)
-    k = jax.random.randint(step_key, x_0.shape[:1], 0, config.diffusion_steps)
-    c = c + config.prior_noise * jax.random.normal(prior_key, c.shape)
+    k = jax.random.randint(step_key, x_0.shape[:1], 0, config.diffusion.steps)
+    c = c + config.prior.noise * jax.random.normal(prior_key, c.shape)
     loss, grads = jax.value_and_grad(lambda p: noise_loss(config, p, x_0, c, k, eps))(state.params)
-    state = updated(state, make_optimizer(config, config.train_steps), grads, config.ema_decay)
+    state = updated(state, make_optimizer(config, config.training.steps), grads, config.training.ema_decay)
     return state, {"loss": loss, "grad_norm": optax.global_norm(grads)}
 
 
@@ -167,12 +173,12 @@ def fit(config: DDGConfig, frames: Frames, directory: Path, seed: int, progress:
         batch = make_batch(frames, config, seed, step)
         return train_step(config, state, batch.x_0, batch.c)
 
-    state = run_steps(
+    state, _ = run_steps(
         init_state(config, jax.random.key_data(jax.random.key(seed))),
-        config.train_steps,
+        config.training.steps,
         step_once,
         directory / CHECKPOINTS,
-        every=config.checkpoint_every,
+        every=config.training.checkpoint_every,
         label="fitting the generator",
         progress=progress,
     )

@@ -12,29 +12,9 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
 
+from learning.layers import depth_to_space, sinusoids, space_to_depth, time_frequencies
+
 GROUPS = 8
-MAX_PERIOD = 10_000.0
-
-
-def space_to_depth(x: Array, factor: int) -> Array:
-    """(B, H, W, C) -> (B, H/f, W/f, f*f*C); H and W divisible by `factor`."""
-    b, h, w, c = x.shape
-    x = x.reshape(b, h // factor, factor, w // factor, factor, c)
-    return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, h // factor, w // factor, factor * factor * c)
-
-
-def depth_to_space(x: Array, factor: int) -> Array:
-    """(B, H, W, f*f*C) -> (B, H*f, W*f, C): inverse of `space_to_depth`."""
-    b, h, w, c = x.shape
-    x = x.reshape(b, h, w, factor, factor, c // factor**2)
-    return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, h * factor, w * factor, c // factor**2)
-
-
-def time_features(step: Array, size: int) -> Array:
-    """Sinusoids of the step k: (B,) -> (B, size) (Vaswani et al. 2017, section 3.5)."""
-    frequencies = jnp.exp(-math.log(MAX_PERIOD) * jnp.arange(size // 2) / (size // 2))
-    angles = step.astype(jnp.float32)[:, None] * frequencies
-    return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], axis=-1)
 
 
 class ResBlock(nn.Module):
@@ -111,7 +91,7 @@ class UNet(nn.Module):
 
     def _time_embedding(self, step: Array) -> Array:
         size = 4 * self.widths[0]
-        time = nn.Dense(size)(time_features(step, size))
+        time = nn.Dense(size)(sinusoids(step, time_frequencies(size, jnp), cosine_first=True))
         return nn.silu(nn.Dense(size)(nn.silu(time)))
 
     def _encode(self, h: Array, time: Array) -> tuple[Array, list[Array]]:

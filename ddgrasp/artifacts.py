@@ -2,8 +2,7 @@
 
 A stage's directory is finished once it holds `manifest.json`, which is written last. Every file goes to a
 temporary name in the same directory, reaches the disk (fsync), then takes its name (os.replace): a crash, a
-full disk or Ctrl-C leaves the previous file as it was. This module imports no JAX; `save_params` and
-`load_params` import it when called.
+full disk or Ctrl-C leaves the previous file as it was. This module imports no JAX.
 """
 
 import contextlib
@@ -29,7 +28,6 @@ STARTED = "started.json"
 
 _LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
 _TEMPORARY = ".tmp-"
-_PARAMS_MAGIC = b"DDGRASP-PARAMS-1\n"
 
 
 # --- atomic files ------------------------------------------------------------------------------
@@ -351,67 +349,9 @@ def _hash(value: Any) -> str:
 
 
 def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
-    """'student.width is 16 there, 32 here' for every differing leaf."""
+    """'student.encoder.width is 16 there, 32 here' for every differing leaf."""
     if isinstance(there, Mapping) and isinstance(here, Mapping):
         for key in sorted({*there, *here}):
             yield from _differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)
     elif there != here:
         yield f"{name} is {there!r} there, {here!r} here"
-
-
-# --- parameters --------------------------------------------------------------------------------
-
-
-def save_params(path: Path | str, pytree: Any) -> None:
-    """Writes a pytree of arrays (nested dicts, Flax or Brax parameters) as checksummed msgpack."""
-    import jax
-    import numpy as np
-    from flax import serialization
-
-    state = jax.tree.map(np.asarray, serialization.to_state_dict(pytree))
-    payload = serialization.msgpack_serialize(state)
-    atomic_write_bytes(path, _PARAMS_MAGIC + hashlib.sha256(payload).digest() + payload)
-
-
-def load_params(path: Path | str, target: Any = None) -> Any:
-    """What `save_params` wrote: nested dicts of NumPy arrays, or shaped like `target` if one is given.
-
-    Raises UserError if the file is absent, not ours, damaged, or does not fit `target`.
-    """
-    from flax import serialization
-
-    path = Path(path)
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise UserError(f"Parameter file {path} does not exist.") from None
-    if not data.startswith(_PARAMS_MAGIC):
-        raise UserError(f"{path} is no parameter file of this project: expected one written by save_params.")
-    digest, payload = data[len(_PARAMS_MAGIC) :][:32], data[len(_PARAMS_MAGIC) + 32 :]
-    if hashlib.sha256(payload).digest() != digest:
-        raise UserError(f"Parameter file {path} is damaged or truncated: make it again, or restore a copy.")
-    state: Any = serialization.msgpack_restore(payload)
-    if target is None:
-        return state
-    try:
-        restored = serialization.from_state_dict(target, state)
-        if difference := _shape_difference(restored, target):
-            raise ValueError(difference)
-    except (ValueError, KeyError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"{path} does not fit this configuration's network ({reason}).") from None
-    return restored
-
-
-def _shape_difference(given: Any, wanted: Any) -> str:
-    """The first array of two trees of the same structure whose shapes differ, in words; empty if none."""
-    import jax
-    import numpy as np
-
-    pairs = zip(
-        jax.tree_util.tree_leaves_with_path(given), jax.tree_util.tree_leaves_with_path(wanted), strict=True
-    )
-    for (path, here), (_, there) in pairs:
-        if np.shape(here) != np.shape(there):
-            return f"{jax.tree_util.keystr(path)} is {np.shape(here)}, the network's {np.shape(there)}"
-    return ""

@@ -10,9 +10,11 @@ class RealClock:
     """The machine's monotonic clock."""
 
     def now(self) -> float:
+        """Seconds since some fixed moment."""
         return time.monotonic()
 
     def sleep_until(self, deadline_s: float) -> None:
+        """Returns when `now` reaches the deadline, at once if it has passed."""
         remaining = deadline_s - time.monotonic()
         if remaining > _SPIN_S:
             time.sleep(remaining - _SPIN_S)
@@ -27,7 +29,9 @@ class SimClock:
         self._now_s = 0.0
 
     def now(self) -> float:
+        """Seconds slept so far."""
         return self._now_s
 
     def sleep_until(self, deadline_s: float) -> None:
+        """Moves the clock to the deadline, never back."""
         self._now_s = max(self._now_s, deadline_s)

@@ -42,6 +42,7 @@ class SafetyCounts:
     by_cause: Counter[str] = field(default_factory=Counter)
 
     def as_dict(self) -> dict[str, int]:
+        """Commands in all, and how many were changed for which cause."""
         causes = ("action", "joint_position", "joint_velocity", "joint_acceleration", "workspace")
         return {"commands": self.commands} | {cause: self.by_cause[cause] for cause in causes}
 

@@ -27,19 +27,19 @@ def write_condition(
     centre = g.constant(encoder.POSITION_CENTER_M)
     grip = g.op("Div", g.op("Sub", grip_m, centre), g.constant(encoder.POSITION_SCALE_M))
     known = [joints]
-    if student.hand_view_px:
+    if student.hand_view.size_px:
         beside = write_hand_view(g, picture, grip_m, params["hand_view"], student, profile)
         features = g.concat([features, beside], axis=1)
         known.append(grip)
     stream = params["state_stream"]
     parts = [g.relu(g.dense(g.relu(g.dense(joints, stream["first"])), stream["second"]))]
-    if student.features_to_head:
+    if student.head.features_to_head:
         parts.append(features)
-    if student.aux_to_head:
+    if student.head.aux_to_head:
         hidden = g.relu(g.dense(g.concat([features, *known], axis=1), params["aux_hidden"]))
         raw = g.dense(hidden, params["aux_output"])
         position = g.columns(raw, 0, 3)
-        if student.hand_view_px:
+        if student.hand_view.size_px:
             offset = g.mul(g.columns(raw, 6, 9), g.constant(policy.BESIDE_SCALE))
             near = g.op("Sigmoid", g.columns(raw, 9, 10))
             far = g.op("Sub", g.constant(1.0), near)

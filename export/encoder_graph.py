@@ -20,17 +20,17 @@ def write_encoder(
     profile: CameraProfile,
 ) -> str:
     """Picture to features (B, feature_size)."""
-    x = layers.write_stem(g, picture, params["stem"], student.stem)
+    x = layers.write_stem(g, picture, params["stem"], student.encoder.stem)
     for index, (_, stride) in enumerate(encoder.stage_plan(student)):
-        for block in range(student.stage_blocks[index]):
+        for block in range(student.encoder.stage_blocks[index]):
             x = layers.write_block(g, x, params[f"stage{index}_block{block}"], stride if block == 0 else 1)
-    if student.pooling == "mean":
+    if student.encoder.pooling == "mean":
         pooled = g.op("Flatten", g.op("GlobalAveragePool", x))
         return g.relu(g.dense(pooled, params["features"]))
     kernel, bias = params["cells"]["kernel"], params["cells"]["bias"]
     cells = g.conv(x, np.asarray(kernel)[None, None], bias)
-    cells = g.reshape(cells, [0, student.keypoints, -1])  # (B, K, P)
-    if student.pooling == "tokens":
+    cells = g.reshape(cells, [0, student.encoder.keypoints, -1])  # (B, K, P)
+    if student.encoder.pooling == "tokens":
         return _write_tokens(g, cells, params["features"], profile)
     points = _write_keypoints(g, cells, planes, student, profile)
     return g.relu(g.dense(points, params["features"]))
@@ -63,7 +63,7 @@ def _write_keypoints(
 def _write_cell_relief(g: GraphBuilder, planes: tuple[str, str], student: StudentConfig) -> str:
     """(B, 1, P) mean relief of the newest frame's valid pixels in each cell, as `encoder.cell_relief`."""
     stride = encoder.map_stride(student)
-    below, right = -student.input_height_px % stride, -student.input_width_px % stride
+    below, right = -student.picture.height_px % stride, -student.picture.width_px % stride
 
     newest = contract.DEPTH_FRAMES - 1
 

@@ -47,9 +47,9 @@ def build_model(
     picture, planes = write_picture(g, contract.ONNX_INPUT_DEPTH, student, export, profile)
     features = write_encoder(g, picture, planes, params["encoder"], student, profile)
     cond = write_condition(g, features, picture, contract.ONNX_INPUT_STATE, params, student, profile)
-    write_sampler(g, cond, params["denoiser"], student, export.ddim_steps or student.ddim_steps)
+    write_sampler(g, cond, params["denoiser"], student, export.ddim_steps or student.head.ddim_steps)
     depth_type = TensorProto.UINT16 if export.depth_dtype == "uint16_mm" else TensorProto.FLOAT
-    chunk = ["batch", student.chunk, contract.ACTION_SIZE]
+    chunk = ["batch", student.head.chunk, contract.ACTION_SIZE]
     frames = ["batch", contract.DEPTH_FRAMES, profile.height_px, profile.width_px]
     return g.model(
         [
@@ -73,9 +73,11 @@ def check_options(student: StudentConfig, export: ExportConfig) -> None:
     hand_view.check_hand_view(student)
     denoiser.check_denoiser(student)
     check_depth_dtype(export.depth_dtype)
-    steps = export.ddim_steps or student.ddim_steps
-    if not 1 <= steps <= student.diffusion_steps:
-        raise UserError(f"ddim_steps is {steps}; expected 1 to {student.diffusion_steps} (diffusion_steps).")
+    steps = export.ddim_steps or student.head.ddim_steps
+    if not 1 <= steps <= student.head.diffusion_steps:
+        raise UserError(
+            f"ddim_steps is {steps}; expected 1 to {student.head.diffusion_steps} (diffusion_steps)."
+        )
 
 
 def check_params(params: Params, student: StudentConfig, profile: CameraProfile) -> None:
@@ -111,19 +113,23 @@ def write_picture(
     depth = g.slice(raw, first.tolist(), last.tolist(), [2, 3])
     if export.depth_dtype == "uint16_mm":
         depth = g.mul(g.op("Cast", depth, to=TensorProto.FLOAT), g.constant(contract.DEPTH_UNIT_M))
-    near = g.op("GreaterOrEqual", depth, g.constant(student.min_depth_m))
-    usable = g.op("And", near, g.op("LessOrEqual", depth, g.constant(student.max_depth_m)))
+    near = g.op("GreaterOrEqual", depth, g.constant(student.picture.min_depth_m))
+    usable = g.op("And", near, g.op("LessOrEqual", depth, g.constant(student.picture.max_depth_m)))
     depth = g.op("Where", usable, depth, g.constant(0.0))
     valid = g.op("Cast", usable, to=TensorProto.FLOAT)
-    table = preprocess.table_depth(profile, student.max_depth_m)[first[0] : last[0], first[1] : last[1]]
+    table = preprocess.table_depth(profile, student.picture.max_depth_m)[
+        first[0] : last[0], first[1] : last[1]
+    ]
     relief = g.op("Sub", g.constant(table[None, None]), depth)
     relief = g.op("Div", relief, g.constant(preprocess.RELIEF_SCALE_M))
     relief, depth, valid = _write_resize(g, relief, depth, valid, window)
     relief = g.op("Clip", relief, g.constant(preprocess.RELIEF_MIN), g.constant(preprocess.RELIEF_MAX))
     planes = {"relief": g.mul(relief, valid), "valid": valid, "depth": depth}
-    stacked = g.concat([g.op("Unsqueeze", planes[c], g.integers([2])) for c in student.channels], axis=2)
-    count = contract.DEPTH_FRAMES * len(student.channels)
-    picture = g.reshape(stacked, [0, count, student.input_height_px, student.input_width_px])
+    stacked = g.concat(
+        [g.op("Unsqueeze", planes[c], g.integers([2])) for c in student.picture.channels], axis=2
+    )
+    count = contract.DEPTH_FRAMES * len(student.picture.channels)
+    picture = g.reshape(stacked, [0, count, student.picture.height_px, student.picture.width_px])
     return picture, (planes["relief"], planes["valid"])
 
 

@@ -30,7 +30,7 @@ def write_hand_view(
     """Picture (B, C, h, w) and grip point (B, 3) to (B, hand_view_features)."""
     view = _write_cut(g, picture, grip, student, profile)
     x = layers.write_stem(g, view, params["stem"], hand_view.STEM)
-    for block in range(student.hand_view_blocks):
+    for block in range(student.hand_view.blocks):
         x = layers.write_block(g, x, params[f"block{block}"], 1)
     kernel, bias = params["cells"]["kernel"], params["cells"]["bias"]
     cells = g.relu(g.conv(x, np.asarray(kernel)[None, None], bias))
@@ -47,7 +47,7 @@ def _write_cut(
     depth = g.op("Max", g.columns(point, 2, 3), g.constant(hand_view.MIN_CAMERA_DEPTH_M))
     origin = np.array(profile.crop_origin_px) * view.shrink
     samples = []
-    for axis, (column, length) in enumerate(((1, student.input_height_px), (0, student.input_width_px))):
+    for axis, (column, length) in enumerate(((1, student.picture.height_px), (0, student.picture.width_px))):
         per_metre = g.op("Div", g.constant(view.focal_px[axis]), depth)  # (B, 1)
         centre = g.mul(g.columns(point, column, column + 1), per_metre)
         centre = g.add(centre, g.constant(view.centre_px[axis] - origin[axis]))
@@ -56,9 +56,9 @@ def _write_cut(
     seen = g.op("MatMul", g.op("Unsqueeze", rows, g.integers([1])), picture)  # (B, C, n, w)
     columns = g.op("Unsqueeze", g.op("Transpose", columns, perm=[0, 2, 1]), g.integers([1]))
     seen = g.op("MatMul", seen, columns)  # (B, C, n, n)
-    count, kinds = student.hand_view_px, len(student.channels)
+    count, kinds = student.hand_view.size_px, len(student.picture.channels)
     frames = g.reshape(seen, [0, contract.DEPTH_FRAMES, kinds, count, count])
-    valid = student.channels.index("valid")
+    valid = student.picture.channels.index("valid")
     coverage = g.slice(frames, [valid], [valid + 1], [2])
     divisor = g.op("Max", coverage, g.constant(hand_view.MIN_COVERAGE))
     parts = [
@@ -70,10 +70,10 @@ def _write_cut(
 
 def _write_sampling(g: GraphBuilder, centre: str, per_metre: str, length: int, student: StudentConfig) -> str:
     """(B, n, length) weights from centre and scale (B, 1), as `hand_view.sampling_matrix`."""
-    count = student.hand_view_px
-    offsets = (np.arange(count) - (count - 1) / 2) * student.hand_view_pitch_m
+    count = student.hand_view.size_px
+    offsets = (np.arange(count) - (count - 1) / 2) * student.hand_view.pitch_m
     place = g.add(centre, g.mul(per_metre, g.constant(offsets[None])))  # (B, n)
-    support = g.op("Max", g.mul(per_metre, g.constant(student.hand_view_pitch_m)), g.constant(1.0))
+    support = g.op("Max", g.mul(per_metre, g.constant(student.hand_view.pitch_m)), g.constant(1.0))
     support = g.op("Unsqueeze", support, g.integers([2]))  # (B, 1, 1)
     pixels = (np.arange(length) + 0.5)[None, None]
     distance = g.op("Abs", g.op("Sub", g.op("Unsqueeze", place, g.integers([2])), g.constant(pixels)))

@@ -11,6 +11,7 @@ Params = Mapping
 
 
 def write_stem(g: GraphBuilder, x: str, params: Params, kind: str) -> str:
+    """The first layer, `conv7` or patches of STEM_STRIDE pixels (student_jax/encoder.py, Stem)."""
     if kind == "conv7":
         x = g.relu(write_conv_norm(g, x, params["conv7"], 2))
         return g.op("MaxPool", x, kernel_shape=[3, 3], strides=[2, 2], pads=[1, 1, 1, 1])
@@ -22,6 +23,7 @@ def write_stem(g: GraphBuilder, x: str, params: Params, kind: str) -> str:
 
 
 def write_block(g: GraphBuilder, x: str, params: Params, stride: int) -> str:
+    """A basic residual block (He et al. 2016, figure 2), its shortcut projected where shapes differ."""
     y = g.relu(write_conv_norm(g, x, params["first"], stride))
     y = write_conv_norm(g, y, params["second"], 1)
     shortcut = write_conv_norm(g, x, params["shortcut"], stride) if "shortcut" in params else x
@@ -29,6 +31,7 @@ def write_block(g: GraphBuilder, x: str, params: Params, stride: int) -> str:
 
 
 def write_conv_norm(g: GraphBuilder, x: str, params: Params, stride: int) -> str:
+    """Convolution with half-kernel padding, then its normalisation."""
     kernel = np.asarray(params["conv"]["kernel"])
     x = g.conv(x, kernel, params["conv"].get("bias"), stride=stride, pad=kernel.shape[0] // 2)
     return write_norm(g, x, params.get("norm"))

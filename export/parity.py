@@ -107,7 +107,7 @@ def random_inputs(
             spoilt = rng.random(frames_m.shape) < 0.01
             frames_m[spoilt] = rng.choice(np.array(NOT_FINITE, np.float32), int(spoilt.sum()))
     state = rng.uniform(denoiser.STATE_LOWER, denoiser.STATE_UPPER, (batch, contract.STATE_SIZE))
-    noise = rng.standard_normal((batch, student.chunk, contract.ACTION_SIZE))
+    noise = rng.standard_normal((batch, student.head.chunk, contract.ACTION_SIZE))
     return Inputs(raw_depth(frames_m, depth_dtype), state.astype(np.float32), noise.astype(np.float32))
 
 

@@ -37,9 +37,10 @@ def run(job: Job) -> Artifact:
 
 def load_student(directory: Path) -> dict:
     """The student's parameters: nested dicts of NumPy arrays."""
+    from learning.params import load_params
     from student_jax.policy import PARAMS_FILE
 
-    return artifacts.load_params(directory / PARAMS_FILE)
+    return load_params(directory / PARAMS_FILE)
 
 
 def export_policy(config: Config, params: dict, student_manifest_hash: str = "") -> bytes:

@@ -26,7 +26,7 @@ class Entry:
     published: str
     """Who publishes it, and where."""
     licence: str
-    """Of the weights."""
+    """Licence of the weights."""
     used_for: str
 
 
@@ -44,7 +44,7 @@ ENTRIES = {
                 size,
                 f"Hugging Face, depth-anything/Video-Depth-Anything-{size.capitalize()}",
                 f"video_depth_anything_vit{size[0]}.pth",
-                "the generator's prior (--ddg.prior video_depth_anything)",
+                "the generator's prior (--ddg.prior.source video_depth_anything)",
             )
             for size in SIZES
         ),
@@ -54,7 +54,7 @@ ENTRIES = {
                 size,
                 f"Hugging Face, depth-anything/Depth-Anything-V2-{size.capitalize()}",
                 f"depth_anything_v2_vit{size[0]}.pth",
-                "the generator's prior (--ddg.prior depth_anything_v2)",
+                "the generator's prior (--ddg.prior.source depth_anything_v2)",
             )
             for size in SIZES
         ),
@@ -63,7 +63,7 @@ ENTRIES = {
             "resnet18-f37072fd.pth",
             "torchvision, ResNet18_Weights.IMAGENET1K_V1",
             "none of its own; torchvision's code is BSD-3-Clause, trained on ImageNet under its terms",
-            "the student's first encoder weights (--student.encoder-weights), features for metrics",
+            "the student's first encoder weights (--student.encoder.weights), features for metrics",
         ),
         Entry(
             FID_INCEPTION,

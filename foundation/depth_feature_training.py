@@ -22,19 +22,22 @@ from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from foundation import depth_features
 from foundation.depth_feature_data import MEASURED, TREATMENTS, Batch, Pool, make_batch
+from learning.loop import Metrics, run_steps
+from learning.optimizers import adamw
+from learning.params import save_params
+from learning.train_state import TrainState, first_state, updated
 from sensors.models.random_scenes import random_device, take_picture
 
 WORK = ".work"
 """Folder of unfinished training, beside the result; removed at the end."""
 TEST_SHARE = 1 / 8
-"""Of the devices: cameras, and rooms, that training never sees."""
+"""Share of the devices (cameras, and rooms) that training never sees."""
 WARMUP_STEPS = 50
 _TEST_MAPS = 768
 _SCALE_MAPS = 512
 _HIDDEN = 128
 
-State = dict[str, Any]
-"""`step`, `params` (trunk and heads), `optimiser`."""
+CHECKPOINTS = "checkpoints"
 
 
 class Heads(nn.Module):
@@ -60,7 +63,7 @@ def train(config: DepthFeatureConfig, out: Path, *, quiet: bool = False) -> dict
     scale = _target_scale(training, config.seed)
     params = _optimise(config, training, scale, work, progress)
     result, tested = _frozen(params, training, config.seed), _test(params, test, scale, config.seed)
-    artifacts.save_params(out / depth_features.PARAMS_FILE, result)
+    save_params(out / depth_features.PARAMS_FILE, result)
     manifest = {
         "name": depth_features.NAME,
         "sha256": depth_features.file_digest(out / depth_features.PARAMS_FILE),
@@ -149,31 +152,23 @@ def loss(params: Any, depth_m: Array, family: Array, target: Array) -> Array:
 
 
 def _optimizer(config: DepthFeatureConfig) -> optax.GradientTransformation:
-    warmup = min(WARMUP_STEPS, max(1, config.steps // 10))
-    rate = optax.warmup_cosine_decay_schedule(
-        0.0, config.learning_rate, warmup, max(config.steps, warmup + 1)
-    )
-    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
+    return adamw(config.learning_rate, config.steps, warmup=WARMUP_STEPS)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, donate_argnums=1)
 def _step(
-    config: DepthFeatureConfig, state: State, depth_m: Array, family: Array, target: Array
-) -> tuple[State, Array]:
-    value, grads = jax.value_and_grad(loss)(state["params"], depth_m, family, target)
-    updates, optimiser = _optimizer(config).update(grads, state["optimiser"], state["params"])
-    params = optax.apply_updates(state["params"], updates)
-    return {"step": state["step"] + 1, "params": params, "optimiser": optimiser}, value
+    config: DepthFeatureConfig, state: TrainState, depth_m: Array, family: Array, target: Array
+) -> tuple[TrainState, Metrics]:
+    value, grads = jax.value_and_grad(loss)(state.params, depth_m, family, target)
+    return updated(state, _optimizer(config), grads, ema_decay=0.0), {"loss": value}
 
 
-def _init(config: DepthFeatureConfig) -> State:
+def _init(config: DepthFeatureConfig) -> TrainState:
     keys = jax.random.split(jax.random.key(config.seed))
     trunk = depth_features.Trunk().init(keys[0], jnp.zeros((1, 32, 32)))["params"]
     heads = Heads().init(keys[1], jnp.zeros((1, depth_features.FEATURES)))["params"]
     params = {"trunk": trunk, "heads": heads}
-    return {
-        "step": jnp.zeros((), jnp.int32), "params": params, "optimiser": _optimizer(config).init(params),
-    }  # fmt: skip
+    return first_state(params, _optimizer(config), jax.random.key_data(keys[0]))
 
 
 def _optimise(
@@ -182,20 +177,17 @@ def _optimise(
 ) -> Any:  # fmt: skip
     """Parameters after `config.steps`; batch n is a function of (seed, n) alone, so a resumed run equals an
     uninterrupted one."""
-    file, state = work / "state.msgpack", _init(config)
-    if file.exists():
-        state = artifacts.load_params(file, state)
-    with progress.task("training", config.steps) as task:
-        task.start_at(int(state["step"]))
-        for number in range(int(state["step"]), config.steps):
-            batch = _draw(pool, config.batch_size, config.seed, 2, number)
-            target = (batch.measured - scale[0]) / scale[1]
-            state, value = _step(config, state, batch.depth_m, batch.family, target)
-            if (number + 1) % config.checkpoint_every == 0:
-                artifacts.save_params(file, state)
-                progress.scalars(number + 1, loss=float(value))
-            task.advance(loss=float(value))
-    return state["params"]
+
+    def step_once(state: TrainState, number: int) -> tuple[TrainState, Metrics]:
+        batch = _draw(pool, config.batch_size, config.seed, 2, number)
+        target = (batch.measured - scale[0]) / scale[1]
+        return _step(config, state, batch.depth_m, batch.family, target)
+
+    state, _ = run_steps(
+        _init(config), config.steps, step_once, work / CHECKPOINTS,
+        every=config.checkpoint_every, label="training", progress=progress,
+    )  # fmt: skip
+    return state.params
 
 
 def _frozen(params: Any, pool: Pool, seed: int) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from jax import Array
 
 from ddgrasp import artifacts
 from ddgrasp.errors import UserError
+from learning.params import load_params
 
 NAME = "depthfeat-v1"
 DIRECTORY = Path(__file__).parents[1] / "pretrained" / NAME
@@ -118,7 +119,7 @@ def load(directory: Path = DIRECTORY) -> DepthFeatures:
             f"{directory / PARAMS_FILE} has SHA-256 {digest[:16]}, its manifest says "
             f"{manifest['sha256'][:16]}: restore both from the repository."
         )
-    params = artifacts.load_params(directory / PARAMS_FILE, jax.eval_shape(empty_params))
+    params = load_params(directory / PARAMS_FILE, jax.eval_shape(empty_params))
     return DepthFeatures(manifest["name"], {"network": manifest["name"], "sha256": digest}, params)
 
 

@@ -11,7 +11,7 @@ from foundation.resample import resize_cubic
 from foundation.sizes import PATCH_PX
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
-"""Of RGB in [0, 1]."""
+"""Mean of RGB in [0, 1]."""
 IMAGENET_STD = (0.229, 0.224, 0.225)
 INPUT_SIZE = 518
 """The depth networks' training size."""

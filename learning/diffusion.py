@@ -1,16 +1,19 @@
 """Discrete diffusion: noise schedules and the forward, DDPM, DDIM and DPM-Solver++ equations.
 
-One equation, one function; noise is always an argument. Everything is generic over the shape of x, so the
-student's action head uses this module too. Notation: step k in 0..K-1, beta_k, alpha_bar_k = prod (1 - beta),
-x_k the noised sample, eps the noise; `previous` = -1 stands for the clean sample (alpha_bar = 1).
+One equation, one function; noise is always an argument. Everything is generic over the shape of x: depth maps
+of the generator, action chunks of the student. Notation: step k in 0..K-1, beta_k, alpha_bar_k =
+prod (1 - beta), x_k the noised sample, eps the noise; `previous` = -1 stands for the clean sample
+(alpha_bar = 1).
 
 Sources: Ho et al. 2020 (DDPM), Song et al. 2021 (DDIM), Nichol & Dhariwal 2021 (cosine schedule),
 Lu et al. 2022 (DPM-Solver++), Lin et al. 2024 (trailing steps), Hoogeboom et al. 2023 (shifted schedule).
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -23,6 +26,8 @@ COSINE_OFFSET = 0.008
 """s of Nichol & Dhariwal, eq. 17."""
 MAX_BETA = 0.999
 VARIANCE_FLOOR = 1e-20
+PREDICTED, CONSISTENT = "predicted", "consistent"
+"""Which eps a DDIM step goes on with after x_0 was clipped: see `ddim_step`."""
 
 
 class Schedule(NamedTuple):
@@ -42,9 +47,14 @@ def linear_betas(steps: int, first: float = 1e-4, last: float = 0.02) -> np.ndar
     return np.linspace(first, last, steps)
 
 
-def cosine_betas(steps: int) -> np.ndarray:
-    """beta_k = 1 - f((k+1)/K) / f(k/K), f(u) = cos^2(pi/2 (u+s)/(1+s)), (K,) (N. & D. 2021, eq. 17)."""
-    u = np.arange(steps + 1) / steps
+def cosine_betas(steps: int, terminal_time: float = 1.0) -> np.ndarray:
+    """beta_k = 1 - f(T(k+1)/K) / f(Tk/K), f(u) = cos^2(pi/2 (u+s)/(1+s)), (K,) (N. & D. 2021, eq. 17, T = 1).
+
+    With `terminal_time` T below 1 the last sample keeps some signal. At T = 1 alpha_bar reaches zero, and
+    DDIM's first division by its root amplifies rounding a thousandfold; at 0.98 the root is 0.03, still
+    indistinguishable from noise.
+    """
+    u = np.arange(steps + 1) / steps * terminal_time
     f = np.cos((u + COSINE_OFFSET) / (1 + COSINE_OFFSET) * math.pi / 2) ** 2
     return np.minimum(1 - f[1:] / f[:-1], MAX_BETA)
 
@@ -72,6 +82,11 @@ def make_schedule(name: str, steps: int, log_snr_shift: float = 0.0) -> Schedule
     betas = _BETAS[name](steps)
     if log_snr_shift:
         betas = shifted_betas(betas, log_snr_shift)
+    return schedule_of(betas)
+
+
+def schedule_of(betas: np.ndarray) -> Schedule:
+    """The schedule with these betas, (K,) float64."""
     return Schedule(betas.astype(np.float32), np.cumprod(1 - betas).astype(np.float32))
 
 
@@ -173,28 +188,95 @@ def ddpm_step(
     return posterior_mean(schedule, x_k, x_0, step, previous) + jnp.sqrt(variance) * noise
 
 
-def ddim_step(
-    schedule: Schedule,
-    x_k: ArrayLike,
-    step: ArrayLike,
-    previous: ArrayLike,
-    eps: ArrayLike,
-    clip: ArrayLike | None,
-    eta: float = 0.0,
-    noise: ArrayLike = 0.0,
-) -> Array:
-    """One DDIM step x_k -> x_previous from predicted `eps` (Song et al. 2021, eq. 12; sigma by eq. 16).
+class DDIMCoefficients(NamedTuple):
+    """One step x_k -> x_k' of DDIM, with a = alpha_bar at k and a' at k'.
 
-    eta = 0 is deterministic, eta = 1 injects the DDPM's variance through `noise` (standard normal).
-    `clip`: |x_0| is limited to it; the direction towards x_k keeps the predicted eps.
+    x_k explains itself by `x` x_k = `x_0` x_0 + `eps` eps; x_k' = `next_x_0` x_0 + `next_eps` eps + `sigma`
+    noise.
     """
-    x_0 = predict_x_0(schedule, x_k, step, eps)
-    x_0 = x_0 if clip is None else jnp.clip(x_0, -jnp.asarray(clip), clip)
-    a_prev = alpha_bar_at(schedule, previous, x_k)
-    sigma = eta * jnp.sqrt(posterior_variance(schedule, step, previous, x_k))
+
+    x: ArrayLike
+    eps: ArrayLike
+    next_x_0: ArrayLike
+    next_eps: ArrayLike
+    x_0: ArrayLike = 1.0
+    sigma: ArrayLike = 0.0
+
+
+def ddim_coefficients(
+    schedule: Schedule, step: ArrayLike, previous: ArrayLike, x: ArrayLike, eta: float = 0.0
+) -> DDIMCoefficients:
+    """Of `q_sample` as it stands: 1 x_k = sqrt(a) x_0 + sqrt(1 - a) eps, computed in x's precision.
+
+    Steps may be traced and have any leading shape of x. sigma is eta times the DDPM's (Song et al. 2021,
+    eq. 16): eta = 0 is deterministic, eta = 1 injects the DDPM's variance.
+    """
+    a, a_prev = alpha_bar_at(schedule, step, x), alpha_bar_at(schedule, previous, x)
+    sigma = eta * jnp.sqrt(posterior_variance(schedule, step, previous, x))
     # A step from pure noise has sigma^2 = 1 - alpha_bar_previous, and rounding may push the rest below 0.
     remainder = jnp.maximum(1 - a_prev - sigma**2, 0.0)
-    return jnp.sqrt(a_prev) * x_0 + jnp.sqrt(remainder) * eps + sigma * noise
+    return DDIMCoefficients(1.0, jnp.sqrt(1 - a), jnp.sqrt(a_prev), jnp.sqrt(remainder), jnp.sqrt(a), sigma)
+
+
+def ddim_table(schedule: Schedule, visited: np.ndarray) -> np.ndarray:
+    """(len(visited), 4) float32: the first four of `DDIMCoefficients` for each visited step, eta = 0.
+
+    Of `q_sample` solved for x_0, 1/sqrt(a) x_k = x_0 + sqrt(1 - a)/sqrt(a) eps, so that an exported graph
+    multiplies by constants; computed in float64, rounded once.
+    """
+    a = schedule.alpha_bars.astype(np.float64)[visited]
+    after = np.append(a[1:], 1.0)
+    columns = 1 / np.sqrt(a), np.sqrt(1 - a) / np.sqrt(a), np.sqrt(after), np.sqrt(1 - after)
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def ddim_step(
+    c: DDIMCoefficients,
+    x_k: ArrayLike,
+    eps: ArrayLike,
+    clip: ArrayLike | None,
+    *,
+    noise: ArrayLike = 0.0,
+    after_clip: str = PREDICTED,
+) -> Array:
+    """One DDIM step x_k -> x_k' from predicted `eps` (Song et al. 2021, eq. 12).
+
+    Args:
+      clip: |x_0| is limited to it.
+      noise: standard normal, shaped like x_k; unused where `c.sigma` is 0.
+      after_clip: PREDICTED keeps the direction towards x_k as predicted, like `clip_sample` of Hugging Face
+        diffusers; CONSISTENT takes the eps that explains x_k together with the clipped x_0 (diffusers'
+        `use_clipped_model_output`, GLIDE by Nichol et al. 2022).
+    """
+    x_k, eps = jnp.asarray(x_k), jnp.asarray(eps)
+    x_0 = (c.x * x_k - c.eps * eps) / c.x_0
+    if clip is not None:
+        x_0 = jnp.clip(x_0, -jnp.asarray(clip), clip)
+        if after_clip == CONSISTENT:
+            eps = (c.x * x_k - c.x_0 * x_0) / c.eps
+    return jnp.asarray(c.next_x_0 * x_0 + c.next_eps * eps + c.sigma * noise)
+
+
+def ddim_sample(
+    predict: Callable[[Array, Array], Array],
+    noise: Array,
+    schedule: Schedule,
+    count: int,
+    clip: float = 1.0,
+) -> Array:
+    """Deterministic DDIM from noise (B, ...) to samples within `clip`; `predict(x, k (B,)) -> eps`.
+
+    `count` trailing steps, eps consistent with the clipped x_0: an exported graph unrolls the same.
+    """
+    visited = timesteps(schedule.steps, count, "trailing")
+
+    def body(x: Array, step: tuple[Array, Array]) -> tuple[Array, None]:
+        k, row = step
+        eps = predict(x, jnp.full((x.shape[0],), k))
+        return ddim_step(DDIMCoefficients(*row), x, eps, clip, after_clip=CONSISTENT), None
+
+    steps = jnp.asarray(visited), jnp.asarray(ddim_table(schedule, visited))
+    return jax.lax.scan(body, noise, steps)[0]
 
 
 def log_snr_half(schedule: Schedule, step: ArrayLike, x: ArrayLike) -> Array:

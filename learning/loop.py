@@ -1,118 +1,80 @@
-"""The optimiser's loop that fitting and distillation share: whole-state checkpoints, exact resume, curves."""
+"""The loop of optimiser steps: whole-state checkpoints, exact resume, curves."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import flax.struct
-import jax
-import jax.numpy as jnp
-import optax
-import orbax.checkpoint as ocp
 from jax import Array
 
 from ddgrasp.progress import Progress, Task
+from learning.checkpoints import Checkpoints, intact
+from learning.train_state import TrainState
 
-Params = Any
-"""Nested dict of arrays."""
 LOG_EVERY = 10
-_CHECKPOINTS_KEPT = 2
-
-
-@flax.struct.dataclass
-class TrainState:
-    """Everything training needs to go on: this is what a checkpoint holds."""
-
-    step: Array
-    params: Params
-    ema: Params
-    """Exponential moving average of `params`: the weights that are used."""
-    opt_state: optax.OptState
-    key: Array
-    """Raw key data (uint32); the step's key is fold_in(key, step)."""
-
+SAVE_EVERY = 200
 
 Metrics = dict[str, Array]
 StepFunction = Callable[[TrainState, int], tuple[TrainState, Metrics]]
 """(state, step number) -> (next state, scalars for the curves)."""
 
 
-def first_state(params: Params, optimizer: optax.GradientTransformation, key: Array) -> TrainState:
-    """State before the first step. `key` is raw key data."""
-    # Copies: a donated state must not take the caller's parameters, or its own average, with it.
-    own, average = (jax.tree.map(jnp.array, params) for _ in range(2))
-    return TrainState(jnp.zeros((), jnp.int32), own, average, optimizer.init(params), key)
-
-
-def updated(
-    state: TrainState, optimizer: optax.GradientTransformation, grads: Params, ema_decay: float
-) -> TrainState:
-    """`state` after one optimiser step along `grads`."""
-    updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
-    params = optax.apply_updates(state.params, updates)
-    ema = averaged(state.ema, params, state.step, ema_decay)
-    return TrainState(state.step + 1, params, ema, opt_state, state.key)
-
-
-def averaged(ema: Params, params: Params, step: Array, decay: float) -> Params:
-    """EMA update; the decay starts small so that the first, random weights are forgotten."""
-    now = jnp.minimum(decay, (1 + step) / (10 + step))
-    return jax.tree.map(lambda old, new: now * old + (1 - now) * new, ema, params)
-
-
 def run_steps(
     state: TrainState,
     steps: int,
     step_function: StepFunction,
-    checkpoints: Path,
+    checkpoints: Path | None,
     *,
-    every: int,
     label: str,
     progress: Progress,
+    every: int = SAVE_EVERY,
     curve: str = "",
-) -> TrainState:
+    first_point: int = 0,
+    log_every: int = LOG_EVERY,
+    shown: Sequence[str] = ("loss",),
+) -> tuple[TrainState, dict[str, float]]:
     """Takes `state` to `steps` steps.
 
-    If `checkpoints` holds any, continues after the latest and ends with the state an uninterrupted run would
-    have; writes one every `every` steps, at the end, and on Ctrl-C. Curves are named `curve` + scalar.
+    If the folder `checkpoints` holds any, continues after the latest and ends with the state an uninterrupted
+    run would have; writes one every `every` steps, at the end, and on Ctrl-C. None: none are written, for
+    steps that are quicker to repeat or whose draws depend on those before.
+
+    Args:
+      curve, first_point: curves are named `curve` + scalar, their points `first_point` + steps done.
+      log_every: steps between two points; the last step has one.
+      shown: scalars beside the bar.
+
+    Returns:
+      The state, and the scalars of the last step; none if there was nothing left to do.
     """
-    options = ocp.CheckpointManagerOptions(max_to_keep=_CHECKPOINTS_KEPT, enable_async_checkpointing=False)
-    with ocp.CheckpointManager(checkpoints.absolute(), options=options) as manager:
-        state = _latest(manager, state)
+    metrics: Metrics = {}
+    with contextlib.ExitStack() as stack:
+        saved = None if checkpoints is None else stack.enter_context(Checkpoints(checkpoints))
+        state = state if saved is None else saved.restore_or(state)
         done = int(state.step)
-        with progress.task(label, steps) as task:
-            task.start_at(done)
-            try:
-                for step in range(done, steps):
-                    state, metrics = step_function(state, step)
-                    _report(step + 1, steps, metrics, task, progress, curve)
-                    if (step + 1) % every == 0:
-                        _save(manager, state)
-            finally:
-                # Donated buffers of an interrupted step are gone: then the last checkpoint stands.
-                if not any(leaf.is_deleted() for leaf in jax.tree.leaves(state)):
-                    _save(manager, state)
-    return state
+        task = stack.enter_context(progress.task(label, steps))
+        task.start_at(done)
+        try:
+            for step in range(done, steps):
+                state, metrics = step_function(state, step)
+                if (step + 1) % log_every == 0 or step + 1 == steps:
+                    _report(first_point + step + 1, metrics, task, progress, curve, shown)
+                else:
+                    task.advance()
+                if saved is not None and (step + 1) % every == 0:
+                    saved.save(step + 1, state)
+        finally:
+            if saved is not None and intact(state):
+                saved.save(int(state.step), state)
+    return state, _floats(metrics)
 
 
-def _report(step: int, steps: int, metrics: Metrics, task: Task, progress: Progress, curve: str) -> None:
-    if step % LOG_EVERY and step != steps:
-        task.advance()
-        return
-    values = {name: float(value) for name, value in metrics.items()}
-    progress.scalars(step, **{curve + name: value for name, value in values.items()})
-    task.advance(loss=values["loss"])
+def _report(
+    point: int, metrics: Metrics, task: Task, progress: Progress, curve: str, shown: Sequence[str]
+) -> None:
+    values = _floats(metrics)
+    progress.scalars(point, **{curve + name: value for name, value in values.items()})
+    task.advance(1, **{name: values[name] for name in shown})
 
 
-def _latest(manager: ocp.CheckpointManager, state: TrainState) -> TrainState:
-    step = manager.latest_step()
-    if step is None:
-        return state
-    restored: Any = manager.restore(step, args=ocp.args.StandardRestore(state))
-    return restored
-
-
-def _save(manager: ocp.CheckpointManager, state: TrainState) -> None:
-    if manager.latest_step() != int(state.step):
-        manager.save(int(state.step), args=ocp.args.StandardSave(state), force=True)
-        manager.wait_until_finished()
+def _floats(metrics: Metrics) -> dict[str, float]:
+    return {name: float(value) for name, value in metrics.items()}

@@ -14,7 +14,7 @@ from mjx_envs.grasp_env import AutoReset
 from ppo import learner
 
 EXPERIENCE_COPIES = 5
-"""Of the experience in an iteration at its peak: 41 kB an environment, where 20 steps are 8 kB (XLA's own
+"""Copies of an iteration's experience at its peak: 41 kB an environment, where 20 steps are 8 kB (XLA's own
 analysis on a CPU, 512 and 4096 environments)."""
 _CGROUP = Path("/sys/fs/cgroup")
 _SIGNS = ("RESOURCE_EXHAUSTED", "Out of memory", "MemoryError", "out of memory")

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ddgrasp import artifacts, contract
+from ddgrasp import contract
 from ddgrasp.errors import UserError
+from learning.params import load_params, save_params
 
 PARAMS_FILE = "policy.msgpack"
 ACTIVATION = "elu"
@@ -32,7 +33,7 @@ class TeacherPolicy:
 def save(path: Path, normalizer, policy_params) -> None:
     """Writes what `load` reads. `policy_params`: Brax's policy network parameters."""
     layers = policy_params["params"]
-    artifacts.save_params(
+    save_params(
         path,
         {
             "mean": np.asarray(normalizer.mean),
@@ -63,7 +64,7 @@ def find(directory: Path | str) -> Path:
 def load_state(directory: Path | str) -> dict:
     """The saved parameters: normaliser's mean and std, and the layers."""
     path = find(directory)
-    state = artifacts.load_params(path)
+    state = load_params(path)
     if state["mean"].shape != (contract.OBSERVATION_SIZE,):
         raise UserError(
             f"The teacher in {path} takes {state['mean'].shape[0]} inputs, this contract "

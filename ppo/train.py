@@ -6,11 +6,11 @@ from functools import partial
 from pathlib import Path
 
 import jax
-import orbax.checkpoint as ocp
 
 from ddgrasp import artifacts
 from ddgrasp.config import Config, WorldConfig
 from ddgrasp.progress import Progress
+from learning.checkpoints import Checkpoints
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import health, hosts, learner, memory
@@ -21,7 +21,6 @@ from ppo.warmup import clone_guide
 CHECKPOINTS = "checkpoints"
 BEST_RATE = "best.json"
 LOG_EVERY = 5
-_KEPT = 2
 _EVAL_SEED = 10_000
 
 
@@ -34,20 +33,18 @@ def train(config: Config, directory: Path, progress: Progress) -> learner.Learne
     """
     mesh = devices.make_mesh()
     learner.check_divisible(config.teacher, mesh.size)
-    options = ocp.CheckpointManagerOptions(max_to_keep=_KEPT, enable_async_checkpointing=False)
-    path = (directory / CHECKPOINTS).absolute()
-    with memory.explained(config), ocp.CheckpointManager(path, options=options) as manager:
-        return _train(config, directory, AutoReset(GraspEnv(training_world(config)), mesh), manager, progress)
+    with memory.explained(config), Checkpoints(directory / CHECKPOINTS) as saved:
+        return _train(config, directory, AutoReset(GraspEnv(training_world(config)), mesh), saved, progress)
 
 
 def _train(
-    config: Config, directory: Path, env: AutoReset, manager: ocp.CheckpointManager, progress: Progress
+    config: Config, directory: Path, env: AutoReset, saved: Checkpoints, progress: Progress
 ) -> learner.LearnerState:
     teacher = config.teacher
     test_env = GraspEnv(config.world)
     total = learner.iterations(teacher)
     iterate = compile_iteration(config, env)
-    state = _start(config, env, manager, progress)
+    state = _start(config, env, saved, progress)
     best = _Best(directory)
     if int(state.iteration) == 0:
         best.offer(_evaluate(test_env, state, config, 0, progress), state)
@@ -55,7 +52,7 @@ def _train(
         task.start_at(int(state.iteration))
         for i in range(int(state.iteration) + 1, total + 1):
             state, metrics, watched = iterate(state)
-            health.check(i, watched, manager.latest_step(), directory)
+            health.check(i, watched, saved.latest, directory)
             if i % LOG_EVERY == 0 or i == total:
                 _log(i, metrics, progress, task)
             task.advance()
@@ -64,7 +61,7 @@ def _train(
                 best.offer(rate, state)
                 state = learner.with_evaluation(state, rate >= teacher.stop_at)
             if i % teacher.checkpoint_every == 0 or i == total:
-                _save(manager, i, state)
+                saved.save(i, state)
             if int(state.good_evaluations) >= 2:
                 progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
                 break
@@ -97,7 +94,7 @@ def compile_iteration(config: Config, env: AutoReset) -> jax.stages.Compiled:
     return compiled
 
 
-def restore(config: Config, env: AutoReset, manager: ocp.CheckpointManager) -> learner.LearnerState:
+def restore(config: Config, env: AutoReset, saved: Checkpoints) -> learner.LearnerState:
     """The newest checkpoint, laid on the mesh of `env`; it may have been made on another."""
     shapes = jax.eval_shape(initial(config, env))
     target = jax.tree.map(
@@ -105,9 +102,7 @@ def restore(config: Config, env: AutoReset, manager: ocp.CheckpointManager) -> l
         shapes,
         jax.tree.broadcast(learner.shardings(env.mesh), shapes),
     )
-    restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore(target))
-    assert isinstance(restored, learner.LearnerState)
-    return restored
+    return saved.restore(target)
 
 
 class _Best:
@@ -137,25 +132,18 @@ def policy_of(state: learner.LearnerState) -> TeacherPolicy:
     return from_learner(state.normalizer, state.params.policy)
 
 
-def _start(
-    config: Config, env: AutoReset, manager: ocp.CheckpointManager, progress: Progress
-) -> learner.LearnerState:
+def _start(config: Config, env: AutoReset, saved: Checkpoints, progress: Progress) -> learner.LearnerState:
     """The newest checkpoint; else a fresh learner, with the guide cloned if asked for."""
-    if manager.latest_step() is not None:
-        return restore(config, env, manager)
+    if saved.latest is not None:
+        return restore(config, env, saved)
     state, places = initial(config, env)(), learner.shardings(env.mesh)
     if config.teacher.init_from:
         return jax.device_put(learner.warm_start(state, load_state(config.teacher.init_from)), places)
     if config.teacher.clone_rounds:
         cloned = clone_guide(config.teacher, GraspEnv(config.world), state, config.seed, progress)
         state = jax.device_put(learner.with_policy(state, *hosts.from_leader(cloned)), places)
-        _save(manager, 0, state)
+        saved.save(0, state)
     return state
-
-
-def _save(manager: ocp.CheckpointManager, i: int, state: learner.LearnerState) -> None:
-    manager.save(i, args=ocp.args.StandardSave(state), force=True)
-    manager.wait_until_finished()
 
 
 def _log(i: int, metrics, progress: Progress, task) -> None:

@@ -18,7 +18,7 @@ ABOVE_M = 0.06
 """The hand is above the object while its grip point is at least this far over the object's centre."""
 LIFTED_M = 0.1
 PICTURE_SCALE = 0.5
-"""Of pictures for people, relative to 1280 x 720."""
+"""Size of pictures for people, relative to 1280 x 720."""
 _PICTURE_ROWS, _PICTURE_COLUMNS = slice(60, 360), slice(170, 470)
 """What they show at that scale: workspace and lift target."""
 _BACK, _UP_M = 0.3, 0.18

@@ -62,10 +62,10 @@ class StudentActor:
     def __call__(self, scene: Scene) -> np.ndarray:
         """(B, 8) actions for the scene."""
         self.seen_mm.append(self._corrupt(scene))
-        position = scene.step % self._config.execute_steps
+        position = scene.step % self._config.head.execute_steps
         if position == 0:
             frames = [self.seen_mm[max(0, scene.step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)]
-            shape = (len(scene.state), self._config.chunk, contract.ACTION_SIZE)
+            shape = (len(scene.state), self._config.head.chunk, contract.ACTION_SIZE)
             noise = self._noise_scale * self._rng.standard_normal(shape)
             self._chunk = np.asarray(
                 self._act(np.stack(frames, axis=1), scene.state, noise.astype(np.float32))

@@ -38,7 +38,7 @@ def disparity_noise(
     coarse = (batch, frames, -(-height // CORRELATION_PX), -(-width // CORRELATION_PX))
     shared = jax.random.normal(k_shared, (batch, 1, *coarse[2:]))
     field = (shared + jax.random.normal(k_own, coarse)) / jnp.sqrt(2.0)
-    strength = config.disparity_noise_px * jax.random.uniform(k_strength, (batch, 1, 1, 1))
+    strength = config.training.disparity_noise_px * jax.random.uniform(k_strength, (batch, 1, 1, 1))
     wrong = jax.random.bernoulli(k_where, SPURIOUS_SHARE, coarse)
     field = strength * field + wrong * jax.random.uniform(k_wrong, coarse, minval=-1.0) * SPURIOUS_PX
     field = jnp.repeat(jnp.repeat(field, CORRELATION_PX, axis=2), CORRELATION_PX, axis=3)

@@ -1,25 +1,27 @@
 """The student's training plan: the head on poses, perception on demos and DAgger, the head on perception.
 
 Phases in order: `poses`, `demos`, `dagger-1` ... `dagger-n` (Ross et al. 2011), `head`. `plan.json` names
-the finished ones; within a fit on pictures the optimiser's state is saved now and then. All draws are
+the finished ones; a fit on pictures goes on from its own checkpoints (`learning.loop`). All draws are
 keyed by seed, phase and step, so a resumed plan goes the way an uninterrupted one would.
 """
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import serialization
 
 from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
 from demos.rollout import Roller
 from demos.store import EpisodeStore
+from learning.loop import Metrics, run_steps
+from learning.params import load_params, save_params
+from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
 from student_jax import frames_io, head, pretrained_encoder, train
 from student_jax.act import SourceCamera, StudentActor
@@ -27,9 +29,11 @@ from student_jax.depth_source import DepthSource
 from student_jax.policy import PARAMS_FILE, init_params
 
 PLAN = "plan.json"
-PARTIAL = "partial.msgpack"
-SAVE_EVERY = 200
+CHECKPOINTS = "checkpoints"
+"""Folder of the unfinished fit on pictures; a folder in it per phase."""
 LOG_EVERY = 20
+_POINTS_PER_PHASE = 100_000
+"""A phase's curves begin at its number times this."""
 _DAGGER_SEED = 40_000
 
 
@@ -57,8 +61,8 @@ class Trainer:
         self._restore()
         self._phase("poses", self._fit_on_poses)
         frames_io.add_noisy_demos(demos, self._store, self._source, self._config, self._progress)
-        self._phase("demos", lambda: self._fit("demos", self._student.train_steps))
-        for i in range(1, self._student.dagger_rounds + 1):
+        self._phase("demos", lambda: self._fit("demos", self._student.training.steps))
+        for i in range(1, self._student.dagger.rounds + 1):
             self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))
         self._phase("head", self._fit_on_perception)
 
@@ -75,28 +79,28 @@ class Trainer:
         measured = work()
         self._done.append(name)
         self.history.append({"phase": name, "frames": self.frame_count} | measured)
-        artifacts.save_params(self._directory / PARAMS_FILE, self.params)
+        save_params(self._directory / PARAMS_FILE, self.params)
         artifacts.atomic_write_json(self._directory / PLAN, {"done": self._done, "history": self.history})
-        (self._directory / PARTIAL).unlink(missing_ok=True)
+        shutil.rmtree(self._directory / CHECKPOINTS, ignore_errors=True)
 
     def _restore(self) -> None:
         plan = self._directory / PLAN
         if plan.exists():
             state = json.loads(plan.read_text())
             self._done, self.history = state["done"], state["history"]
-            self.params = artifacts.load_params(self._directory / PARAMS_FILE)
+            self.params = load_params(self._directory / PARAMS_FILE)
             self._progress.note(f"going on after phase {self._done[-1]!r}")
             return
         self.params = init_params(jax.random.key(self._config.seed), self._student, self._profile)
         if self._student.init_from:
             source = Path(self._student.init_from)
             source = source if (source / PARAMS_FILE).exists() else source / "student"
-            self.params = artifacts.load_params(source / PARAMS_FILE, self.params)
+            self.params = load_params(source / PARAMS_FILE, self.params)
         else:
             self.params["encoder"] = pretrained_encoder.load_into(self.params["encoder"], self._student)
 
     def _fit_on_poses(self) -> dict[str, float]:
-        if self._student.pose_rounds == 0:
+        if self._student.poses.rounds == 0:
             return {}
         self.params, measured = head.fit_on_poses(
             self._config, self._teacher, self.params, self._directory, self._progress
@@ -104,7 +108,7 @@ class Trainer:
         return measured
 
     def _fit_on_perception(self) -> dict[str, float]:
-        if self._student.head_steps == 0:
+        if self._student.head.train_steps == 0:
             return {}
         frames = frames_io.load(self._directory / frames_io.CACHE)
         self.params, measured = head.fit_on_perception(
@@ -115,11 +119,11 @@ class Trainer:
     def _dagger(self, number: int, demo_count: int) -> dict[str, float]:
         """One round: roll out if that was not done yet, then fit on everything."""
         student = self._student
-        wanted = demo_count + number * student.dagger_episodes
+        wanted = demo_count + number * student.dagger.episodes
         measured = {}
         if len(self._store) < wanted:
             first = len(self._store)
-            share = student.dagger_teacher_share * (1 - (number - 1) / max(1, student.dagger_rounds - 1))
+            share = student.dagger.teacher_share * (1 - (number - 1) / max(1, student.dagger.rounds - 1))
             rng = np.random.default_rng([self._config.seed, _DAGGER_SEED, number])
             camera = SourceCamera(self._source, first)
             actor = StudentActor(
@@ -132,7 +136,7 @@ class Trainer:
             frames_io.add_rollouts(self._store, episodes, actor.seen_mm)
             measured["rollout_success"] = rate = float(episodes.success.mean())
             self._progress.note(f"round {number}: {rate:.0%} success with the teacher taking {share:.0%}")
-        return measured | self._fit(f"dagger-{number}", student.dagger_steps)
+        return measured | self._fit(f"dagger-{number}", student.dagger.steps)
 
     def _fit(self, phase: str, steps: int) -> dict[str, float]:
         """`steps` optimiser steps on all frames, from the current parameters."""
@@ -141,44 +145,27 @@ class Trainer:
         student, profile = self._student, self._profile
         frames = frames_io.load(self._directory / frames_io.CACHE)
         trained, frozen = train.split(student, self.params)
-        state = self._load_partial(phase, train.init_state(student, steps, self._config.seed, trained))
-        terms = {}
-        with self._progress.task(f"student, {phase}", steps) as task:
-            task.start_at(int(state.step))
-            for i in range(int(state.step), steps):
-                rng = np.random.default_rng([self._config.seed, _phase_number(phase), i])
-                index = frames.draw(rng, student.batch_size, student.held_weight)
-                batch = train.make_batch(frames, index, rng, student, profile)
-                state, terms = train.train_step(student, profile, steps, state, frozen, batch)
-                if (i + 1) % LOG_EVERY == 0:
-                    self._log(phase, i + 1, terms, task)
-                task.advance()
-                if (i + 1) % SAVE_EVERY == 0:
-                    self._save_partial(phase, state)
+        number = _phase_number(phase)
+
+        def step_once(state: TrainState, step: int) -> tuple[TrainState, Metrics]:
+            rng = np.random.default_rng([self._config.seed, number, step])
+            index = frames.draw(rng, student.training.batch_size, student.training.held_weight)
+            batch = train.make_batch(frames, index, rng, student, profile)
+            return train.train_step(student, profile, steps, state, frozen, batch)
+
+        state, terms = run_steps(
+            train.init_state(student, steps, self._config.seed, trained),
+            steps,
+            step_once,
+            self._directory / CHECKPOINTS / phase,
+            label=f"student, {phase}",
+            progress=self._progress,
+            first_point=number * _POINTS_PER_PHASE,
+            log_every=LOG_EVERY,
+            shown=("position_error_mm", "yaw", "held"),
+        )
         self.params = frozen | jax.tree.map(np.asarray, state.ema)
-        return {name: float(value) for name, value in terms.items()}
-
-    # --- within a fit ---
-
-    def _log(self, phase: str, step: int, terms, task) -> None:
-        values = {name: float(value) for name, value in terms.items()}
-        self._progress.scalars(_phase_number(phase) * 100_000 + step, **values)
-        task.advance(0, position_mm=values["position_error_mm"], yaw=values["yaw"], held=values["held"])
-
-    def _save_partial(self, phase: str, state: train.TrainState) -> None:
-        saved = serialization.to_state_dict(state) | {"phase": np.int32(_phase_number(phase))}
-        artifacts.save_params(self._directory / PARTIAL, saved)
-
-    def _load_partial(self, phase: str, fresh: train.TrainState) -> train.TrainState:
-        path = self._directory / PARTIAL
-        if not path.exists():
-            return fresh
-        saved = artifacts.load_params(path)
-        if int(saved.pop("phase")) != _phase_number(phase):
-            return fresh
-        restored = serialization.from_state_dict(fresh, jax.tree.map(jnp.asarray, saved))
-        assert isinstance(restored, train.TrainState)
-        return restored
+        return terms
 
 
 def _phase_number(phase: str) -> int:

@@ -120,7 +120,8 @@ def random_crops(
 
 def check_chunk(config: StudentConfig) -> None:
     """UserError if more actions are to be executed than a chunk holds."""
-    if not 1 <= config.execute_steps <= config.chunk:
+    if not 1 <= config.head.execute_steps <= config.head.chunk:
         raise UserError(
-            f"student.execute_steps is {config.execute_steps}: expected 1 to student.chunk = {config.chunk}."
+            f"student.head.execute_steps is {config.head.execute_steps}: expected 1 to student.head.chunk = "
+            f"{config.head.chunk}."
         )

@@ -1,5 +1,8 @@
 """Joint-state stream and the network that predicts the noise in an action chunk (Ho et al., 2020, eq. 14)."""
 
+from types import ModuleType
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,9 +11,9 @@ from flax import linen as nn
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError, unknown_name
+from learning.layers import sinusoids, time_frequencies
 
 CONDITIONINGS = ("film", "concat")
-MAX_PERIOD = 10_000.0
 LAYER_NORM_EPSILON = 1e-5
 STATE_LOWER = np.array([*contract.JOINT_LOWER_RAD, 0.0], np.float32)
 STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M], np.float32)
@@ -18,14 +21,16 @@ STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M]
 
 def check_denoiser(config: StudentConfig) -> None:
     """UserError for options that do not exist."""
-    if config.conditioning not in CONDITIONINGS:
-        raise unknown_name("student conditioning", config.conditioning, CONDITIONINGS)
-    if config.time_features < 2 or config.time_features % 2:
-        raise UserError(f"student.time_features is {config.time_features}; expected an even number.")
-    if not 1 <= config.ddim_steps <= config.diffusion_steps:
+    if config.head.conditioning not in CONDITIONINGS:
+        raise unknown_name("student conditioning", config.head.conditioning, CONDITIONINGS)
+    if config.head.time_features < 2 or config.head.time_features % 2:
         raise UserError(
-            f"student.ddim_steps is {config.ddim_steps}; expected 1 to {config.diffusion_steps} "
-            "(student.diffusion_steps)."
+            f"student.head.time_features is {config.head.time_features}; expected an even number."
+        )
+    if not 1 <= config.head.ddim_steps <= config.head.diffusion_steps:
+        raise UserError(
+            f"student.head.ddim_steps is {config.head.ddim_steps}; expected 1 to "
+            f"{config.head.diffusion_steps} (student.head.diffusion_steps)."
         )
 
 
@@ -34,16 +39,9 @@ def normalise_state(state: jax.Array) -> jax.Array:
     return 2.0 * (state - STATE_LOWER) / (STATE_UPPER - STATE_LOWER) - 1.0
 
 
-def time_frequencies(features: int) -> np.ndarray:
-    """(features / 2,) float32 angular frequencies of the sinusoidal embedding (Vaswani et al., 2017, 3.5)."""
-    half = features // 2
-    return np.exp(-np.log(MAX_PERIOD) * np.arange(half) / half).astype(np.float32)
-
-
-def embed_time(k: jax.Array, features: int) -> jax.Array:
-    """(B,) diffusion steps to (B, features): sines, then cosines."""
-    angles = k.astype(jnp.float32)[:, None] * time_frequencies(features)
-    return jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], axis=-1)
+def embed_time(k: Any, features: int, xp: ModuleType = jnp) -> Any:
+    """(B,) diffusion steps to (B, features): sines, then cosines. `xp`: numpy for the exported graph."""
+    return sinusoids(k, time_frequencies(features), cosine_first=False, xp=xp)
 
 
 class StateStream(nn.Module):
@@ -53,8 +51,8 @@ class StateStream(nn.Module):
 
     @nn.compact
     def __call__(self, state: jax.Array) -> jax.Array:
-        x = nn.relu(nn.Dense(self.config.state_features, name="first")(normalise_state(state)))
-        return nn.relu(nn.Dense(self.config.state_features, name="second")(x))
+        x = nn.relu(nn.Dense(self.config.head.state_features, name="first")(normalise_state(state)))
+        return nn.relu(nn.Dense(self.config.head.state_features, name="second")(x))
 
 
 class DenoiserBlock(nn.Module):
@@ -82,15 +80,19 @@ class Denoiser(nn.Module):
         """(B, chunk, 8), (B,) int, (B, D) -> (B, chunk, 8)."""
         config = self.config
         check_denoiser(config)
-        film = config.conditioning == "film"
-        embedded = nn.Dense(config.time_features, name="time_first")(embed_time(k, config.time_features))
-        embedded = nn.Dense(config.time_features, name="time_second")(nn.silu(embedded))
+        film = config.head.conditioning == "film"
+        embedded = nn.Dense(config.head.time_features, name="time_first")(
+            embed_time(k, config.head.time_features)
+        )
+        embedded = nn.Dense(config.head.time_features, name="time_second")(nn.silu(embedded))
         condition = jnp.concatenate([cond, embedded], axis=-1)
         x = noisy_action.reshape(noisy_action.shape[0], -1)
         x = x if film else jnp.concatenate([x, condition], axis=-1)
-        x = nn.Dense(config.denoiser_width, name="input")(x)
-        for index in range(config.denoiser_blocks):
-            x = DenoiserBlock(config.denoiser_width, film, name=f"block{index}")(x, condition)
+        x = nn.Dense(config.head.width, name="input")(x)
+        for index in range(config.head.blocks):
+            x = DenoiserBlock(config.head.width, film, name=f"block{index}")(x, condition)
         x = nn.silu(nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="norm")(x))
-        x = nn.Dense(config.chunk * contract.ACTION_SIZE, name="output", kernel_init=nn.initializers.zeros)(x)
+        x = nn.Dense(
+            config.head.chunk * contract.ACTION_SIZE, name="output", kernel_init=nn.initializers.zeros
+        )(x)
         return x.reshape(noisy_action.shape)

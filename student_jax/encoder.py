@@ -15,6 +15,7 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError, unknown_name
+from learning.layers import space_to_depth
 from mjx_envs.camera import nominal_camera
 from student_jax import preprocess
 
@@ -34,22 +35,27 @@ POSITION_CENTER_M = (*contract.WORKSPACE_CENTER_M, 0.0)
 def check_encoder(config: StudentConfig) -> None:
     """UserError for options that do not exist."""
     for kind, value, known in (
-        ("student stem", config.stem, STEMS),
-        ("student norm", config.norm, NORMS),
-        ("student pooling", config.pooling, POOLINGS),
+        ("student stem", config.encoder.stem, STEMS),
+        ("student norm", config.encoder.norm, NORMS),
+        ("student pooling", config.encoder.pooling, POOLINGS),
     ):
         if value not in known:
             raise unknown_name(kind, value, known)
-    if config.output_stride not in OUTPUT_STRIDES:
-        raise UserError(f"student.output_stride is {config.output_stride}; expected one of {OUTPUT_STRIDES}.")
-    if config.pooling == "spatial_softmax":
+    if config.encoder.output_stride not in OUTPUT_STRIDES:
+        raise UserError(
+            f"student.encoder.output_stride is {config.encoder.output_stride}; "
+            f"expected one of {OUTPUT_STRIDES}."
+        )
+    if config.encoder.pooling == "spatial_softmax":
         for name in ("relief", "valid"):
             newest_channel_index(config, name)
-    if config.norm == "group" and config.width % GROUP_CHANNELS:
-        raise UserError(f"student.width is {config.width}; expected a multiple of {GROUP_CHANNELS}.")
-    if config.input_height_px % STEM_STRIDE or config.input_width_px % STEM_STRIDE:
+    if config.encoder.norm == "group" and config.encoder.width % GROUP_CHANNELS:
         raise UserError(
-            f"The student's input is {config.input_height_px} x {config.input_width_px} pixels; "
+            f"student.encoder.width is {config.encoder.width}; expected a multiple of {GROUP_CHANNELS}."
+        )
+    if config.picture.height_px % STEM_STRIDE or config.picture.width_px % STEM_STRIDE:
+        raise UserError(
+            f"The student's input is {config.picture.height_px} x {config.picture.width_px} pixels; "
             f"expected multiples of {STEM_STRIDE}."
         )
 
@@ -57,10 +63,10 @@ def check_encoder(config: StudentConfig) -> None:
 def stage_plan(config: StudentConfig) -> list[tuple[int, int]]:
     """(channels, stride) of the first block of each stage; the stride stops at `output_stride`."""
     plan, total = [], STEM_STRIDE
-    for index in range(len(config.stage_blocks)):
-        stride = 2 if index > 0 and total * 2 <= config.output_stride else 1
+    for index in range(len(config.encoder.stage_blocks)):
+        stride = 2 if index > 0 and total * 2 <= config.encoder.output_stride else 1
         total *= stride
-        plan.append((min(config.width * 2**index, config.max_channels), stride))
+        plan.append((min(config.encoder.width * 2**index, config.encoder.max_channels), stride))
     return plan
 
 
@@ -143,13 +149,6 @@ class Stem(nn.Module):
         return nn.relu(GroupNorm(name="norm")(x) if self.norm == "group" else x)
 
 
-def space_to_depth(x: jax.Array, size: int) -> jax.Array:
-    """(B, h, w, c) -> (B, h/size, w/size, size*size*c); within a patch row-major, channels last."""
-    batch, height, width, channels = x.shape
-    x = x.reshape(batch, height // size, size, width // size, size, channels)
-    return jnp.moveaxis(x, 2, 3).reshape(batch, height // size, width // size, size * size * channels)
-
-
 class CellGeometry(NamedTuple):
     """Affine and projective constants that turn a cell of the feature map into a place in the world."""
 
@@ -198,7 +197,7 @@ def _maps_from_origin(xp, origin, profile: CameraProfile, config: StudentConfig)
         -1,
     )
     ray = ray_cam @ rotation.T  # world direction with unit planar depth
-    depth = xp.minimum(position[2] / xp.maximum(-ray[..., 2], 1e-6), config.max_depth_m)[..., None]
+    depth = xp.minimum(position[2] / xp.maximum(-ray[..., 2], 1e-6), config.picture.max_depth_m)[..., None]
     table = (position + depth * ray - np.asarray(POSITION_CENTER_M, np.float32)) / POSITION_SCALE_M
     per_relief = ray * (-preprocess.RELIEF_SCALE_M / POSITION_SCALE_M)
     coordinates = xp.stack([2 * v_px / profile.height_px - 1, 2 * u_px / profile.width_px - 1], -1)
@@ -228,12 +227,12 @@ def newest_channel(picture: jax.Array, config: StudentConfig, name: str) -> jax.
 
 def newest_channel_index(config: StudentConfig, name: str) -> int:
     """Index of that channel among the picture's 3 * channels."""
-    if name not in config.channels:
+    if name not in config.picture.channels:
         raise UserError(
-            f"student.channels is {config.channels}; student.pooling {config.pooling!r} or the hand view "
-            f"needs {name!r} among them."
+            f"student.picture.channels is {config.picture.channels}; student.encoder.pooling "
+            f"{config.encoder.pooling!r} or the hand view needs {name!r} among them."
         )
-    return (contract.DEPTH_FRAMES - 1) * len(config.channels) + config.channels.index(name)
+    return (contract.DEPTH_FRAMES - 1) * len(config.picture.channels) + config.picture.channels.index(name)
 
 
 def spatial_softmax(logits: jax.Array, relief: jax.Array, maps: jax.Array) -> jax.Array:
@@ -264,29 +263,31 @@ class DepthEncoder(nn.Module):
     def __call__(self, picture: jax.Array, origin_rc: jax.Array) -> jax.Array:
         config = self.config
         check_encoder(config)
-        x = Stem(config.stem, config.width, config.norm, name="stem")(picture)
+        x = Stem(config.encoder.stem, config.encoder.width, config.encoder.norm, name="stem")(picture)
         for index, (channels, stride) in enumerate(stage_plan(config)):
-            for block in range(config.stage_blocks[index]):
+            for block in range(config.encoder.stage_blocks[index]):
                 stride_here = stride if block == 0 else 1
-                x = BasicBlock(channels, stride_here, config.norm, name=f"stage{index}_block{block}")(x)
+                x = BasicBlock(channels, stride_here, config.encoder.norm, name=f"stage{index}_block{block}")(
+                    x
+                )
         return self._pool(x, picture, origin_rc)
 
     def _pool(self, x: jax.Array, picture: jax.Array, origin_rc: jax.Array) -> jax.Array:
         config = self.config
         cells = x.reshape(x.shape[0], -1, x.shape[-1])
-        if config.pooling == "mean":
+        if config.encoder.pooling == "mean":
             pooled = cells.mean(1)
         else:
-            cells = nn.Dense(config.keypoints, name="cells")(cells)
+            cells = nn.Dense(config.encoder.keypoints, name="cells")(cells)
             pooled = cells.reshape(cells.shape[0], -1)
-        if config.pooling == "tokens":
+        if config.encoder.pooling == "tokens":
             centre = crop_centre(origin_rc, self.profile)
             pooled = jnp.concatenate([nn.relu(pooled), centre], axis=-1)
-        if config.pooling == "spatial_softmax":
+        if config.encoder.pooling == "spatial_softmax":
             maps = cell_maps(origin_rc, self.profile, config)
             points = spatial_softmax(cells, cell_relief(picture, config), maps)
             pooled = points.reshape(points.shape[0], -1)
-        return nn.relu(nn.Dense(config.feature_size, name="features")(pooled))
+        return nn.relu(nn.Dense(config.encoder.features, name="features")(pooled))
 
 
 def crop_centre(origin_rc: jax.Array, profile: CameraProfile) -> jax.Array:

@@ -21,14 +21,14 @@ def add_noisy_demos(
 ) -> None:
     """Copies the demos into `frames` with the source's artefacts on their depth, going on from what is there.
 
-    A share of `config.student.clean_share` keeps clean depth. Steps long after the grasp are left out.
-    UserError if the source needs colour that the demos lack.
+    A share of `config.student.training.clean_share` keeps clean depth. Steps long after the grasp are left
+    out. UserError if the source needs colour that the demos lack.
     """
     check_colour(source, demos)
     ends = np.concatenate([[0], demos.ends])
     held = np.split(demos.steps("held"), ends[1:-1])
-    lengths = [useful_steps(episode, config.student.demo_held_steps) for episode in held]
-    keep_clean = np.random.default_rng(config.seed).random(len(demos)) < config.student.clean_share
+    lengths = [useful_steps(episode, config.student.training.demo_held_steps) for episode in held]
+    keep_clean = np.random.default_rng(config.seed).random(len(demos)) < config.student.training.clean_share
     chosen = np.flatnonzero(~keep_clean)
 
     def read(i: int) -> Clip:

@@ -46,12 +46,12 @@ class Projection(NamedTuple):
 
 def check_hand_view(config: StudentConfig) -> None:
     """UserError for sizes that do not work."""
-    if config.hand_view_px % STEM_STRIDE or config.hand_view_px < 0:
+    if config.hand_view.size_px % STEM_STRIDE or config.hand_view.size_px < 0:
         raise UserError(
-            f"student.hand_view_px is {config.hand_view_px}; "
+            f"student.hand_view.size_px is {config.hand_view.size_px}; "
             f"expected a multiple of {STEM_STRIDE}, or 0 for none."
         )
-    if config.hand_view_px:
+    if config.hand_view.size_px:
         newest_channel_index(config, "valid")
 
 
@@ -120,15 +120,15 @@ def cut(picture: jax.Array, centre: jax.Array, per_metre: jax.Array, config: Stu
 
     Measures are averaged over valid pixels alone; the valid channel becomes the share of them.
     """
-    count, pitch = config.hand_view_px, config.hand_view_pitch_m
-    rows = sampling_matrix(centre[:, 0], pitch * per_metre[:, 0], count, config.input_height_px)
-    columns = sampling_matrix(centre[:, 1], pitch * per_metre[:, 1], count, config.input_width_px)
+    count, pitch = config.hand_view.size_px, config.hand_view.pitch_m
+    rows = sampling_matrix(centre[:, 0], pitch * per_metre[:, 0], count, config.picture.height_px)
+    columns = sampling_matrix(centre[:, 1], pitch * per_metre[:, 1], count, config.picture.width_px)
     seen = jnp.einsum("bij,bjkc,blk->bilc", rows, picture, columns)
-    frames = seen.reshape(*seen.shape[:3], -1, len(config.channels))
-    valid = config.channels.index("valid")
+    frames = seen.reshape(*seen.shape[:3], -1, len(config.picture.channels))
+    valid = config.picture.channels.index("valid")
     coverage = frames[..., valid : valid + 1]
     scale = jnp.where(
-        jnp.arange(len(config.channels)) == valid, 1.0, 1.0 / jnp.maximum(coverage, MIN_COVERAGE)
+        jnp.arange(len(config.picture.channels)) == valid, 1.0, 1.0 / jnp.maximum(coverage, MIN_COVERAGE)
     )
     return (frames * scale).reshape(seen.shape)
 
@@ -144,8 +144,8 @@ class HandView(nn.Module):
         config = self.config
         check_hand_view(config)
         view = cut(picture, *place(grip_m, origin_rc, self.profile, config), config)
-        x = Stem(STEM, config.hand_view_width, config.norm, name="stem")(view)
-        for block in range(config.hand_view_blocks):
-            x = BasicBlock(config.hand_view_width, 1, config.norm, name=f"block{block}")(x)
-        cells = nn.relu(nn.Dense(config.hand_view_channels, name="cells")(x))
-        return nn.relu(nn.Dense(config.hand_view_features, name="features")(cells.reshape(len(cells), -1)))
+        x = Stem(STEM, config.hand_view.width, config.encoder.norm, name="stem")(view)
+        for block in range(config.hand_view.blocks):
+            x = BasicBlock(config.hand_view.width, 1, config.encoder.norm, name=f"block{block}")(x)
+        cells = nn.relu(nn.Dense(config.hand_view.channels, name="cells")(x))
+        return nn.relu(nn.Dense(config.hand_view.features, name="features")(cells.reshape(len(cells), -1)))

@@ -6,10 +6,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
 from demos.rollout import Roller
+from learning.loop import Metrics, run_steps
+from learning.params import load_params, save_params
+from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
 from student_jax import train
 from student_jax.data import Frames, make_frames, random_crops, sharpen_gripper
@@ -35,74 +37,76 @@ def fit_on_poses(
     Returns:
         `params` with the head trained, and {"rollout_success", "head_loss"} of the last round.
     """
-    student, rounds = config.student, config.student.pose_rounds
-    steps = rounds * student.pose_steps
+    student, rounds = config.student, config.student.poses.rounds
+    steps = rounds * student.poses.steps
     state = train.init_state(student, steps, config.seed, train.head_of(params))
-    roller = Roller(config, teacher, student.pose_episodes, with_depth=False)
+    roller = Roller(config, teacher, student.poses.episodes, with_depth=False)
     rng = np.random.default_rng([config.seed, _SEED])
     columns: dict[str, list[np.ndarray]] = {name: [] for name in _COLUMNS}
-    rate, loss = 0.0, np.float32(0.0)
+    rate, metrics = 0.0, {"loss": np.float32(0.0)}
     with progress.task("head, on poses", steps) as task:
         for i in range(rounds):
             head = jax.tree.map(np.asarray, state.ema) if i else None
             share = 0.5**i if i < rounds - 1 else 0.0
-            actor = PoseActor(head, student, config.world.profile, rng, student.pose_episodes, share)
+            actor = PoseActor(head, student, config.world.profile, rng, student.poses.episodes, share)
             episodes = roller.run(jax.random.PRNGKey(_SEED + 100 * config.seed + i), actor)
             for name in _COLUMNS:
                 whole = getattr(episodes, name)
                 columns[name] += [whole[j, :n].astype(np.float32) for j, n in enumerate(episodes.length)]
             rate = float(episodes.success.mean())
             poses = _poses(columns)
-            for _ in range(student.pose_steps):
-                samples = _from_poses(config, poses, rng, student.head_batch_size)
-                state, loss = _step(config, steps, state, samples)
+            for _ in range(student.poses.steps):
+                samples = _from_poses(config, poses, rng, student.head.batch_size)
+                state, metrics = _step(config, steps, state, samples)
                 task.advance()
-            task.advance(0, loss=float(loss), success=rate)
-            progress.scalars(i, pose_loss=float(loss), pose_success=rate)
+            loss = float(metrics["loss"])
+            task.advance(0, loss=loss, success=rate)
+            progress.scalars(i, pose_loss=loss, pose_success=rate)
     lengths = np.array([len(x) for x in columns["held"]])
     saved = {name: np.concatenate(parts) for name, parts in columns.items()} | {"lengths": lengths}
-    artifacts.save_params(directory / POSES, saved)
+    save_params(directory / POSES, saved)
     trained = jax.tree.map(np.asarray, state.ema)
-    return params | trained, {"rollout_success": rate, "head_loss": float(loss)}
+    return params | trained, {"rollout_success": rate, "head_loss": float(metrics["loss"])}
 
 
 def fit_on_perception(
     config: Config, params: dict, frames: Frames, directory: Path, progress: Progress
 ) -> tuple[dict, dict[str, float]]:
     """The head on what `params` see in every frame, and on as many noisy poses if there are any."""
-    student, steps = config.student, config.student.head_steps
+    student, steps = config.student, config.student.head.train_steps
     rng = np.random.default_rng([config.seed, _SEED, 1])
     seen = _encode_all(config, params, frames, rng, progress)
-    chunks = sharpen_gripper(frames.action_chunks(np.arange(len(frames)), student.chunk))
+    chunks = sharpen_gripper(frames.action_chunks(np.arange(len(frames)), student.head.chunk))
     poses = _load_poses(directory / POSES)
     state = train.init_state(student, steps, config.seed, train.head_of(params))
-    count = student.head_batch_size if poses is None else student.head_batch_size // 2
-    loss = np.float32(0.0)
-    with progress.task("head, on perception", steps) as task:
-        for i in range(steps):
-            index = frames.draw(rng, count, student.held_weight)
-            samples = jax.tree.map(lambda x, index=index: x[index], (seen, frames.state, chunks))
-            if poses is not None:
-                samples = _join(samples, _from_poses(config, poses, rng, student.head_batch_size - count))
-            state, loss = _step(config, steps, state, samples)
-            if (i + 1) % LOG_EVERY == 0:
-                progress.scalars(i + 1, head_loss=float(loss))
-                task.advance(0, loss=float(loss))
-            task.advance()
-    return params | jax.tree.map(np.asarray, state.ema), {"head_loss": float(loss)}
+    count = student.head.batch_size if poses is None else student.head.batch_size // 2
+
+    def step_once(state: TrainState, _: int) -> tuple[TrainState, Metrics]:
+        index = frames.draw(rng, count, student.training.held_weight)
+        samples = jax.tree.map(lambda x: x[index], (seen, frames.state, chunks))
+        if poses is not None:
+            samples = _join(samples, _from_poses(config, poses, rng, student.head.batch_size - count))
+        return _step(config, steps, state, samples)
+
+    # No checkpoints: every draw depends on those before, and the steps take less time than the features.
+    state, metrics = run_steps(
+        state, steps, step_once, None,
+        label="head, on perception", progress=progress, curve="head_", log_every=LOG_EVERY,
+    )  # fmt: skip
+    return params | jax.tree.map(np.asarray, state.ema), {"head_loss": metrics["loss"]}
 
 
-def _step(config: Config, steps: int, state: train.TrainState, samples: Samples):
+def _step(config: Config, steps: int, state: TrainState, samples: Samples) -> tuple[TrainState, Metrics]:
     # Samples cost nothing here: more of them serve better than more noises for each.
-    student = replace(config.student, noise_draws=1)
+    student = replace(config.student, training=replace(config.student.training, noise_draws=1))
     return train.head_step(student, config.world.profile, steps, state, *samples)
 
 
 def _from_poses(config: Config, poses: Frames, rng: np.random.Generator, count: int) -> Samples:
-    index = poses.draw(rng, count, config.student.held_weight)
+    index = poses.draw(rng, count, config.student.training.held_weight)
     bias = rng.standard_normal((count, 5))
     seen = noisy_seen(poses.observation[index], poses.held[index], bias, rng, config.student)
-    return seen, poses.state[index], sharpen_gripper(poses.action_chunks(index, config.student.chunk))
+    return seen, poses.state[index], sharpen_gripper(poses.action_chunks(index, config.student.head.chunk))
 
 
 def _join(a: Samples, b: Samples) -> Samples:
@@ -115,7 +119,7 @@ def _encode_all(config: Config, params: dict, frames: Frames, rng, progress: Pro
     batches = range(0, len(frames), _ENCODE_BATCH)
     for start in progress.track(batches, "features", len(batches)):
         index = np.minimum(np.arange(start, start + _ENCODE_BATCH), len(frames) - 1)
-        crops = random_crops(rng, _ENCODE_BATCH, profile, student.crop_shift_px)
+        crops = random_crops(rng, _ENCODE_BATCH, profile, student.training.crop_shift_px)
         key = jax.random.fold_in(jax.random.key(config.seed), start)
         depth, state = frames.depth_stack(index), frames.state[index]
         seen = train.encode(student, profile, params, depth, state, crops, key)
@@ -130,6 +134,6 @@ def _poses(columns: dict[str, list[np.ndarray]]) -> Frames:
 def _load_poses(path: Path) -> Frames | None:
     if not path.exists():
         return None
-    saved = artifacts.load_params(path)
+    saved = load_params(path)
     bounds = np.cumsum(saved["lengths"])[:-1]
     return _poses({name: np.split(saved[name], bounds) for name in _COLUMNS})

@@ -19,9 +19,8 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
-from learning.diffusion import Schedule
+from learning import diffusion
 from mjx_envs import kinematics
-from student_jax import action_diffusion as diffusion
 from student_jax.denoiser import Denoiser, StateStream, normalise_state
 from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M, DepthEncoder
 from student_jax.hand_view import HandView
@@ -34,10 +33,12 @@ BESIDE_SIZE = 4
 """What the hand view adds to the auxiliary output: the object's offset from the hand, and a gate."""
 BESIDE_SCALE = 0.25
 """Network units per unit of that offset: 5 cm."""
+TERMINAL_TIME = 0.98
+"""Of the action diffusion's schedule, see `learning.diffusion.cosine_betas`."""
 HEAD_PARAMS = ("state_stream", "denoiser")
 """The parameters that act; all others see."""
 PARAMS_FILE = "params.msgpack"
-"""Name of the parameter file in the student's artefact (`artifacts.save_params`)."""
+"""Name of the parameter file in the student's artefact (`learning.params`)."""
 Numbers = jax.Array | np.ndarray
 
 
@@ -77,13 +78,14 @@ class StudentPolicy(nn.Module):
     profile: CameraProfile
 
     def setup(self) -> None:
+        """Flax: builds the parts that the configuration names."""
         check_head(self.config)
         self.encoder = DepthEncoder(self.config, self.profile)
-        self.aux_hidden = nn.Dense(self.config.feature_size)
-        self.aux_output = nn.Dense(AUX_SIZE + (BESIDE_SIZE if self.config.hand_view_px else 0))
+        self.aux_hidden = nn.Dense(self.config.encoder.features)
+        self.aux_output = nn.Dense(AUX_SIZE + (BESIDE_SIZE if self.config.hand_view.size_px else 0))
         self.state_stream = StateStream(self.config)
         self.denoiser = Denoiser(self.config)
-        if self.config.hand_view_px:
+        if self.config.hand_view.size_px:
             self.hand_view = HandView(self.config, self.profile)
 
     def encode(self, depth_m: jax.Array, state: jax.Array, crop_rc: jax.Array | None = None) -> Seen:
@@ -95,7 +97,7 @@ class StudentPolicy(nn.Module):
         """As `encode`, from the output of `prepare_depth`."""
         origin = crop_origin(crop_rc, picture.shape[0], self.profile)
         features = self.encoder(picture, origin)
-        if not self.config.hand_view_px:
+        if not self.config.hand_view.size_px:
             raw = self._aux(features, normalise_state(state))
             return Seen(features, Aux(raw[:, :3], raw[:, 3:5], raw[:, 5]))
         grip_m = grip_position(state)
@@ -112,9 +114,9 @@ class StudentPolicy(nn.Module):
     def condition(self, seen: Seen, state: jax.Array) -> jax.Array:
         """(B, D) what the denoiser is told."""
         parts: list[Numbers] = [self.state_stream(state)]
-        if self.config.features_to_head:
+        if self.config.head.features_to_head:
             parts.append(seen.features)
-        if self.config.aux_to_head:
+        if self.config.head.aux_to_head:
             aux = seen.aux
             beside = (aux.position - position_from_world(grip_position(state))) / BESIDE_SCALE
             parts += [aux.position, aux.yaw, nn.sigmoid(aux.held_logit)[:, None], beside]
@@ -139,8 +141,10 @@ class StudentPolicy(nn.Module):
 
 def check_head(config: StudentConfig) -> None:
     """UserError if the head would see nothing."""
-    if not (config.features_to_head or config.aux_to_head):
-        raise UserError("student.features_to_head and student.aux_to_head are both off: turn one on.")
+    if not (config.head.features_to_head or config.head.aux_to_head):
+        raise UserError(
+            "student.head.features_to_head and student.head.aux_to_head are both off: turn one on."
+        )
 
 
 def grip_position(state: jax.Array) -> jax.Array:
@@ -150,18 +154,18 @@ def grip_position(state: jax.Array) -> jax.Array:
 
 def feature_count(config: StudentConfig) -> int:
     """Length of `Seen.features`."""
-    return config.feature_size + (config.hand_view_features if config.hand_view_px else 0)
+    return config.encoder.features + (config.hand_view.features if config.hand_view.size_px else 0)
 
 
-def noise_schedule(config: StudentConfig) -> Schedule:
-    """Noise schedule of the action diffusion."""
-    return diffusion.cosine_schedule(config.diffusion_steps)
+def noise_schedule(config: StudentConfig) -> diffusion.Schedule:
+    """Noise schedule of the action diffusion: cosine, short of pure noise."""
+    return diffusion.schedule_of(diffusion.cosine_betas(config.head.diffusion_steps, TERMINAL_TIME))
 
 
 def init_params(key: jax.Array, config: StudentConfig, profile: CameraProfile) -> dict:
     """Fresh parameters (a dict of float32 arrays)."""
     depth = jnp.zeros((1, contract.DEPTH_FRAMES, profile.height_px, profile.width_px))
-    action = jnp.zeros((1, config.chunk, contract.ACTION_SIZE))
+    action = jnp.zeros((1, config.head.chunk, contract.ACTION_SIZE))
     state, k = jnp.zeros((1, contract.STATE_SIZE)), jnp.zeros((1,), jnp.int32)
     init = jax.jit(StudentPolicy(config, profile).init)  # one program; op by op it takes many times longer
     return dict(init(key, depth, state, action, k)["params"])
@@ -196,7 +200,7 @@ def sample_from_seen(
     def predict(x: jax.Array, k: jax.Array) -> jax.Array:
         return cast(jax.Array, policy.apply({"params": params}, x, k, cond, method="denoise"))
 
-    return diffusion.ddim_sample(predict, noise, noise_schedule(config), steps or config.ddim_steps)
+    return diffusion.ddim_sample(predict, noise, noise_schedule(config), steps or config.head.ddim_steps)
 
 
 def sample_actions(

@@ -67,16 +67,16 @@ def plan_axis(crop: int, out: int) -> Axis:
 def plan_window(profile: CameraProfile, config: StudentConfig) -> Window:
     """The window of `profile` that becomes an input of `config`'s size."""
     return Window(
-        plan_axis(profile.crop_height_px, config.input_height_px),
-        plan_axis(profile.crop_width_px, config.input_width_px),
+        plan_axis(profile.crop_height_px, config.picture.height_px),
+        plan_axis(profile.crop_width_px, config.picture.width_px),
     )
 
 
 def check_channels(config: StudentConfig) -> None:
     """UserError for an unknown or empty channel selection."""
-    if not config.channels:
-        raise UserError(f"student.channels is empty; expected some of {', '.join(CHANNELS)}.")
-    for name in config.channels:
+    if not config.picture.channels:
+        raise UserError(f"student.picture.channels is empty; expected some of {', '.join(CHANNELS)}.")
+    for name in config.picture.channels:
         if name not in CHANNELS:
             raise unknown_name("student channel", name, CHANNELS)
 
@@ -94,7 +94,9 @@ def table_depth(profile: CameraProfile, max_depth_m: float) -> np.ndarray:
 
 def clean_depth(depth_m: jax.Array, config: StudentConfig) -> jax.Array:
     """Non-finite, too near and too far readings become 0 = invalid. Any shape, metres."""
-    usable = (depth_m >= config.min_depth_m) & (depth_m <= config.max_depth_m)  # False for NaN
+    usable = (depth_m >= config.picture.min_depth_m) & (
+        depth_m <= config.picture.max_depth_m
+    )  # False for NaN
     return jnp.where(usable, depth_m, 0.0).astype(jnp.float32)
 
 
@@ -146,13 +148,13 @@ def prepare_depth(
         wanted = ", ".join(map(str, expected))
         raise UserError(f"Depth has shape {tuple(depth_m.shape)}; expected (B, {wanted}).")
     window = plan_window(profile, config)
-    table = jnp.asarray(table_depth(profile, config.max_depth_m))
+    table = jnp.asarray(table_depth(profile, config.picture.max_depth_m))
     depth, table = _cut(clean_depth(depth_m, config), table, crop_rc, profile, window)
     valid = (depth > 0).astype(jnp.float32)
     relief = (table[:, None] - depth) / RELIEF_SCALE_M
-    relief, depth, valid = _resize_masked(relief, depth, valid, window, "depth" in config.channels)
+    relief, depth, valid = _resize_masked(relief, depth, valid, window, "depth" in config.picture.channels)
     planes = {"relief": jnp.clip(relief, RELIEF_MIN, RELIEF_MAX) * valid, "valid": valid, "depth": depth}
-    stacked = jnp.stack([planes[name] for name in config.channels], axis=-1)  # (B, 3, h, w, C)
+    stacked = jnp.stack([planes[name] for name in config.picture.channels], axis=-1)  # (B, 3, h, w, C)
     picture = jnp.moveaxis(stacked, 1, 3)
     return picture.reshape(*picture.shape[:3], -1)
 

@@ -31,38 +31,39 @@ _RESNET18 = {
 def source(config: StudentConfig) -> str | dict[str, str]:
     """For reports: "built-in", or the weights that the encoder starts from.
 
-    Raises UserError if `config.encoder_weights` holds none, or the student's encoder is no ResNet-18.
+    Raises UserError if `config.encoder.weights` holds none, or the student's encoder is no ResNet-18.
     """
-    if not config.encoder_weights:
+    if not config.encoder.weights:
         return store.BUILT_IN
     _check(config)
-    return store.read_manifest(Path(config.encoder_weights)).summary()
+    return store.read_manifest(Path(config.encoder.weights)).summary()
 
 
 def load_into(encoder: Mapping[str, Any], config: StudentConfig) -> dict[str, Any]:
-    """The encoder's parameters with those of `config.encoder_weights` in place; unchanged without weights.
+    """The encoder's parameters with those of `config.encoder.weights` in place; unchanged without weights.
 
     Raises UserError as `source`, and for weights of another network.
     """
-    if not config.encoder_weights:
+    if not config.encoder.weights:
         return dict(encoder)
     _check(config)
-    _, variables = store.load(Path(config.encoder_weights), (catalog.RESNET18,))
+    _, variables = store.load(Path(config.encoder.weights), (catalog.RESNET18,))
     return from_resnet18(encoder, variables["params"], config)
 
 
 def _check(config: StudentConfig) -> None:
     """UserError naming the first option that makes the encoder another network, or another start."""
     if config.init_from:
-        raise UserError("student.init_from and student.encoder_weights both say where to start: give one.")
+        raise UserError("student.init_from and student.encoder.weights both say where to start: give one.")
     for name, wanted in _RESNET18.items():
-        if (value := getattr(config, name)) != wanted:
+        if (value := getattr(config.encoder, name)) != wanted:
             raise UserError(
-                f"student.{name} is {value!r}; ResNet-18 (student.encoder_weights) needs {wanted!r}."
+                f"student.encoder.{name} is {value!r}; ResNet-18 (student.encoder.weights) needs {wanted!r}."
             )
-    if not set(DEPTH_CHANNELS) & set(config.channels):
+    if not set(DEPTH_CHANNELS) & set(config.picture.channels):
         raise UserError(
-            f"student.channels is {config.channels}; student.encoder_weights needs depth or relief."
+            f"student.picture.channels is {config.picture.channels}; student.encoder.weights needs depth or "
+            "relief."
         )
 
 
@@ -88,10 +89,10 @@ def from_resnet18(
 
 def first_kernel(kernel: np.ndarray, config: StudentConfig) -> np.ndarray:
     """(7, 7, 3, 64) over RGB -> (7, 7, 3 * channels, 64) over frames and, faster, their channels."""
-    depth = next(name for name in DEPTH_CHANNELS if name in config.channels)
+    depth = next(name for name in DEPTH_CHANNELS if name in config.picture.channels)
     rows, columns, _, outputs = kernel.shape
-    made = np.zeros((rows, columns, contract.DEPTH_FRAMES, len(config.channels), outputs), np.float32)
-    made[:, :, :, config.channels.index(depth)] = kernel
+    made = np.zeros((rows, columns, contract.DEPTH_FRAMES, len(config.picture.channels), outputs), np.float32)
+    made[:, :, :, config.picture.channels.index(depth)] = kernel
     return made.reshape(rows, columns, -1, outputs)
 
 

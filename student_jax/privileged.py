@@ -19,7 +19,7 @@ ERROR_PER_DISTANCE = 0.08
 FAR_ERROR_M = 0.010
 """Standard deviation of a position per axis: near + slope * distance, at most far."""
 YAW_ERROR = 0.15
-"""Of cosine and sine of the doubled angle: four degrees."""
+"""Standard deviation of cosine and sine of the doubled angle: four degrees."""
 HELD_LOGIT = 6.0
 HELD_WRONG = 0.01
 """Share of steps whose held probability is the wrong way round."""
@@ -75,7 +75,7 @@ class PoseActor:
         rng, action = self._rng, np.array(scene.expert)
         if self._head is not None:
             seen = noisy_seen(scene.observation, scene.held, self._bias, rng, self._config)
-            noise = np.zeros((len(action), self._config.chunk, action.shape[1]), np.float32)
+            noise = np.zeros((len(action), self._config.head.chunk, action.shape[1]), np.float32)
             chosen = train.act_on_seen(self._config, self._profile, self._head, seen, scene.state, noise)
             taught = rng.random((len(action), 1)) < self._share
             action = np.where(taught, action, np.asarray(chosen)[:, 0])

@@ -41,7 +41,7 @@ def run(job: Job) -> Artifact:
 def _trains(config: Config) -> bool:
     student = config.student
     steps = (
-        student.train_steps, student.dagger_rounds * student.dagger_steps, student.head_steps,
-        student.pose_rounds * student.pose_steps,
+        student.training.steps, student.dagger.rounds * student.dagger.steps, student.head.train_steps,
+        student.poses.rounds * student.poses.steps,
     )  # fmt: skip
     return any(steps)

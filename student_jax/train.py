@@ -14,6 +14,8 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from learning.diffusion import q_sample
+from learning.optimizers import adamw
+from learning.train_state import TrainState, first_state, step_key, updated
 from student_jax.augment import disparity_noise
 from student_jax.data import Frames, aux_targets, random_crops, sharpen_gripper
 from student_jax.encoder import POSITION_SCALE_M
@@ -26,23 +28,11 @@ from student_jax.policy import (
     sample_from_seen,
 )
 
-MAX_GRAD_NORM = 1.0
 WARMUP_STEPS = 100
+FINAL_LEARNING_RATE = 0.02
+"""Share of the learning rate left at the end."""
 POSITION_DELTA, POSITION_WEIGHT = 0.05, 40.0
 """Huber's bound in network units (one centimetre); with the weight, centimetres count as much as yaw."""
-
-
-@flax.struct.dataclass
-class TrainState:
-    """Everything training needs to go on."""
-
-    step: Array
-    params: Any
-    ema: Any
-    """Exponential moving average of `params`: the weights that are used."""
-    opt_state: Any
-    key: Array
-    """Raw key data; a step's key is fold_in(key, step)."""
 
 
 @flax.struct.dataclass
@@ -66,27 +56,27 @@ def make_batch(
     """The samples at `index` (B,), cropped at random."""
     return Batch(
         depth_mm=jnp.asarray(frames.depth_stack(index)),
-        crop_rc=jnp.asarray(random_crops(rng, len(index), profile, config.crop_shift_px)),
+        crop_rc=jnp.asarray(random_crops(rng, len(index), profile, config.training.crop_shift_px)),
         state=jnp.asarray(frames.state[index]),
-        action=jnp.asarray(sharpen_gripper(frames.action_chunks(index, config.chunk))),
+        action=jnp.asarray(sharpen_gripper(frames.action_chunks(index, config.head.chunk))),
         aux=aux_targets(frames.observation[index], frames.held[index]),
     )
 
 
 def make_optimizer(config: StudentConfig, steps: int) -> optax.GradientTransformation:
     """AdamW with warm-up and cosine decay over `steps`."""
-    warmup = min(WARMUP_STEPS, max(1, steps // 10))
-    rate = optax.warmup_cosine_decay_schedule(
-        0.0, config.learning_rate, warmup, max(steps, warmup + 1), 0.02 * config.learning_rate
-    )
-    return optax.chain(
-        optax.clip_by_global_norm(MAX_GRAD_NORM), optax.adamw(rate, weight_decay=config.weight_decay)
+    return adamw(
+        config.training.learning_rate,
+        steps,
+        warmup=WARMUP_STEPS,
+        final_share=FINAL_LEARNING_RATE,
+        weight_decay=config.training.weight_decay,
     )
 
 
 def split(config: StudentConfig, params: dict) -> tuple[dict, dict]:
     """(trained, frozen) on pictures: without an action loss the head keeps what it learnt from poses."""
-    names = set(params) if config.action_weight else set(params) - set(HEAD_PARAMS)
+    names = set(params) if config.training.action_weight else set(params) - set(HEAD_PARAMS)
     return {k: v for k, v in params.items() if k in names}, {
         k: v for k, v in params.items() if k not in names
     }
@@ -99,23 +89,25 @@ def head_of(params: dict) -> dict:
 
 def init_state(config: StudentConfig, steps: int, seed: int, params: dict) -> TrainState:
     """State before the first of `steps` steps on `params`."""
-    params = jax.tree.map(jnp.array, params)  # copies: a step gives its state away
-    return TrainState(
-        jnp.zeros((), jnp.int32),
-        params,
-        jax.tree.map(jnp.copy, params),
-        make_optimizer(config, steps).init(params),
-        jax.random.key_data(jax.random.key(seed)),
-    )
+    key = jax.random.key_data(jax.random.key(seed))
+    return first_state(params, make_optimizer(config, steps), key)
 
 
-def diffusion_loss(config, policy, params, seen, state, action, key) -> Array:
+def diffusion_loss(
+    config: StudentConfig,
+    policy: StudentPolicy,
+    params: dict,
+    seen: Seen,
+    state: Array,
+    action: Array,
+    key: Array,
+) -> Array:
     """mean |eps - eps_theta(a_k, k, s)|^2 (paper Eq. 6) over `noise_draws` noises for each sample."""
     cond = policy.apply({"params": params}, seen, state, method="condition")
-    draws = config.noise_draws
+    draws = config.training.noise_draws
     cond, action = (jnp.repeat(x, draws, axis=0) for x in (cond, action))
     k_step, k_noise = jax.random.split(key)
-    k = jax.random.randint(k_step, (len(cond),), 0, config.diffusion_steps)
+    k = jax.random.randint(k_step, (len(cond),), 0, config.head.diffusion_steps)
     eps = jax.random.normal(k_noise, action.shape)
     noisy = q_sample(noise_schedule(config), action, k, eps)
     predicted = policy.apply({"params": params}, noisy, k, cond, method="denoise")
@@ -136,12 +128,11 @@ def aux_losses(seen: Aux, target: Aux) -> dict[str, Array]:
 def train_step(
     config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, frozen: dict, batch: Batch
 ) -> tuple[TrainState, dict[str, Array]]:
-    """One optimiser step on pictures. Pure: noise comes from fold_in(state.key, state.step)."""
+    """One optimiser step on pictures. Pure: noise comes from `step_key`."""
     policy = StudentPolicy(config, profile)
-    key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
-    key, k_noise = jax.random.split(key)
+    key, k_noise = jax.random.split(step_key(state))
     depth_m = batch.depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
-    if config.disparity_noise_px:
+    if config.training.disparity_noise_px:
         depth_m = disparity_noise(k_noise, depth_m, profile, config)
 
     def loss_fn(params):
@@ -150,24 +141,16 @@ def train_step(
             Seen, policy.apply({"params": params}, depth_m, batch.state, batch.crop_rc, method="encode")
         )
         terms = aux_losses(seen.aux, batch.aux)
-        total = config.aux_weight * (terms["position"] + terms["yaw"] + 0.3 * terms["held"])
-        if config.action_weight:
+        total = config.training.aux_weight * (terms["position"] + terms["yaw"] + 0.3 * terms["held"])
+        if config.training.action_weight:
             terms["action"] = diffusion_loss(config, policy, params, seen, batch.state, batch.action, key)
-            total += config.action_weight * terms["action"]
+            total += config.training.action_weight * terms["action"]
         error = jnp.linalg.norm(seen.aux.position - batch.aux.position, axis=-1)
         terms["position_error_mm"] = 1000.0 * POSITION_SCALE_M * jnp.median(error)
         return total, terms
 
     (_, terms), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.params)
-    return _update(config, steps, state, grads), terms
-
-
-def _update(config: StudentConfig, steps: int, state: TrainState, grads) -> TrainState:
-    updates, opt_state = make_optimizer(config, steps).update(grads, state.opt_state, state.params)
-    params = optax.apply_updates(state.params, updates)
-    decay = jnp.minimum(config.ema_decay, (1 + state.step) / (10 + state.step))
-    ema = jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, state.ema, params)
-    return TrainState(state.step + 1, params, ema, opt_state, state.key)
+    return updated(state, make_optimizer(config, steps), grads, config.training.ema_decay), terms
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -191,16 +174,16 @@ def encode(
 def head_step(
     config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, seen: Seen, joints: Array,
     action: Array,
-) -> tuple[TrainState, Array]:  # fmt: skip
+) -> tuple[TrainState, dict[str, Array]]:  # fmt: skip
     """One optimiser step on the head's parameters alone; `state.params` is `head_of` all."""
-    key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
+    key = step_key(state)
     policy = StudentPolicy(config, profile)
 
     def loss_fn(head):
         return diffusion_loss(config, policy, head, seen, joints, action, key)
 
     loss, grads = jax.value_and_grad(loss_fn)(state.params)
-    return _update(config, steps, state, grads), loss
+    return updated(state, make_optimizer(config, steps), grads, config.training.ema_decay), {"loss": loss}
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -9,7 +9,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from ddgrasp import contract
 from ddgrasp import policy_metadata as metadata
-from ddgrasp.config import ExportConfig, StudentConfig
+from ddgrasp.config import ExportConfig, HeadConfig, StudentConfig
 from deploy.interfaces import CameraError, Clock, Frame, RobotState
 from mjx_envs import scene
 
@@ -22,7 +22,9 @@ HOME_RAD = np.array(scene.HOME_RAD)
 def describe(depth_dtype: str = "uint16_mm", chunk: int = 4, execute_steps: int = 1, **changes):
     """Metadata of a policy for PROFILE."""
     described = metadata.describe(
-        StudentConfig(chunk=chunk, execute_steps=execute_steps),
+        StudentConfig(
+            head=HeadConfig(chunk=chunk, execute_steps=execute_steps),
+        ),
         ExportConfig(depth_dtype=depth_dtype),
         PROFILE,
     )

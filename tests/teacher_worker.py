@@ -10,10 +10,10 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
 
 from app import commands
 from ddgrasp.config import Config
+from learning.checkpoints import Checkpoints
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import learner
 from ppo import train as ppo_train
@@ -46,8 +46,8 @@ def leaves(state: learner.LearnerState) -> dict[str, np.ndarray]:
 def saved(run_dir: Path) -> dict[str, np.ndarray]:
     """The newest checkpoint of a run of TINY, whatever devices made it."""
     env = AutoReset(GraspEnv(ppo_train.training_world(config())))
-    with ocp.CheckpointManager((run_dir / "teacher" / ppo_train.CHECKPOINTS).absolute()) as manager:
-        return leaves(ppo_train.restore(config(), env, manager))
+    with Checkpoints(run_dir / "teacher" / ppo_train.CHECKPOINTS) as checkpoints:
+        return leaves(ppo_train.restore(config(), env, checkpoints))
 
 
 def main(directory: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from ddg_jax import network_prior, sample
 from ddg_jax.inverse_depth import invert, normalise
 from ddg_jax.prior import InverseDepthPrior, make_prior
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import DDGConfig, DDGDepthConfig, PriorConfig, PriorInSim
 from ddgrasp.errors import UserError
 from demos.rollout import Scene
 from foundation import convert, store
@@ -35,12 +35,13 @@ def weights(tmp_path_factory):
     return directory
 
 
-def config(weights, **changes) -> DDGConfig:
-    return DDGConfig(prior="depth_anything_v2", prior_weights=str(weights), prior_input_px=28, **changes)
+def config(weights, in_sim: PriorInSim = "depth", depth=DDGDepthConfig()) -> DDGConfig:  # noqa: B008
+    prior = PriorConfig(source="depth_anything_v2", weights=str(weights), input_px=28, in_sim=in_sim)
+    return DDGConfig(prior=prior, depth=depth)
 
 
 def test_recordings_and_simulation_on_rgb_see_the_network(weights):
-    prior = make_prior(config(weights, prior_in_sim="rgb"))
+    prior = make_prior(config(weights, in_sim="rgb"))
     rgb = np.random.default_rng(1).integers(0, 256, (3, 40, 56, 3)).astype(np.uint8)
     depth = np.ones((3, 20, 28), np.float32)
     c = prior.from_recording(depth, rgb, np.random.default_rng(0))
@@ -56,7 +57,7 @@ def test_recordings_and_simulation_on_rgb_see_the_network(weights):
 def test_the_students_camera_shows_the_prior_each_environment_by_itself(weights, monkeypatch):
     # c itself in place of samples: holes where it is low, no deviations
     monkeypatch.setattr(sample, "predict", lambda key, generator, c, **_: np.stack([c, 0 * c], axis=-1))
-    settings = config(weights, prior_in_sim="rgb", height_px=24, width_px=32)
+    settings = config(weights, in_sim="rgb", depth=DDGDepthConfig(height_px=24, width_px=32))
     prior = make_prior(settings)
     assert prior.needs_sim_rgb and not make_prior(config(weights)).needs_sim_rgb
     rng = np.random.default_rng(2)
@@ -71,9 +72,11 @@ def test_the_students_camera_shows_the_prior_each_environment_by_itself(weights,
     for environment in range(3):
         assert scene.rgb is not None
         c = prior.from_sim(np.ones((1, 24, 32), np.float32), scene.rgb[environment : environment + 1])[0]
-        clear = np.abs(c - settings.noise_threshold) > 1e-4
-        assert 0.05 < np.mean(c < settings.noise_threshold) < 0.95
-        np.testing.assert_array_equal((seen[environment] == 0)[clear], (c < settings.noise_threshold)[clear])
+        clear = np.abs(c - settings.graft.noise_threshold) > 1e-4
+        assert 0.05 < np.mean(c < settings.graft.noise_threshold) < 0.95
+        np.testing.assert_array_equal(
+            (seen[environment] == 0)[clear], (c < settings.graft.noise_threshold)[clear]
+        )
     with pytest.raises(UserError, match="no RGB"):
         camera(replace(scene, rgb=None))
 
@@ -90,12 +93,18 @@ def test_what_was_used_is_said(weights):
     assert isinstance(make_prior(DDGConfig()), InverseDepthPrior)
     with pytest.raises(UserError, match="weights convert"):
         make_prior(config(weights.parent / "nothing"))
-    with pytest.raises(UserError, match="holds depth_anything_v2_small; ddg.prior is video_depth_anything"):
-        make_prior(DDGConfig(prior="video_depth_anything", prior_weights=str(weights)))
+    with pytest.raises(
+        UserError, match="holds depth_anything_v2_small; ddg.prior.source is video_depth_anything"
+    ):
+        make_prior(
+            DDGConfig(
+                prior=PriorConfig(source="video_depth_anything", weights=str(weights)),
+            )
+        )
     with pytest.raises(UserError, match="Did you mean 'video_depth_anything'"):
-        make_prior(DDGConfig(prior="video_depth_anythin"))
+        make_prior(DDGConfig(prior=PriorConfig(source="video_depth_anythin")))
     with pytest.raises(UserError, match="Did you mean 'depth'"):
-        make_prior(config(weights, prior_in_sim="deph"))
+        make_prior(config(weights, in_sim="deph"))
 
 
 def test_prior_and_depth_of_other_aspect_ratios_show_the_same_part():

@@ -10,31 +10,40 @@ import pytest
 from ddg_jax import distil, sample, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
-from ddgrasp import artifacts
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import (
+    DDGConfig,
+    DDGDepthConfig,
+    DDGDiffusionConfig,
+    DDGTrainingConfig,
+    PriorConfig,
+    SamplingConfig,
+    UNetConfig,
+)
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress, read_curves
 from learning import diffusion
+from learning.params import load_params
 
 TINY = DDGConfig(
-    height_px=16,
-    width_px=24,
-    widths=(8, 8),
-    blocks=(0, 1),
-    attention_heads=1,
-    diffusion_steps=100,
-    batch_size=8,
-    checkpoint_every=20,
-    sample_batch=8,
-    prior_noise=0.0,
-    learning_rate=1e-2,
+    depth=DDGDepthConfig(height_px=16, width_px=24),
+    unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
+    diffusion=DDGDiffusionConfig(steps=100),
+    training=DDGTrainingConfig(batch_size=8, checkpoint_every=20, learning_rate=1e-2),
+    sampling=SamplingConfig(batch_size=8),
+    prior=PriorConfig(noise=0.0),
 )
-DISTILLED = dataclasses.replace(TINY, sampler="progressive", sample_steps=1, distil_from=4, distil_steps=60)
+DISTILLED = dataclasses.replace(
+    TINY,
+    sampling=dataclasses.replace(TINY.sampling, sampler="progressive", steps=1),
+    training=dataclasses.replace(TINY.training, distil_from=4, distil_steps=60),
+)
 
 
 def test_log_odds_are_not_distilled():
     with pytest.raises(UserError, match="hole_loss is cross_entropy.*take sampler ddim"):
-        dataclasses.replace(DISTILLED, hole_loss="cross_entropy")
+        dataclasses.replace(
+            DISTILLED, training=dataclasses.replace(DISTILLED.training, hole_loss="cross_entropy")
+        )
 
 
 def pictures(count: int = 32) -> Frames:
@@ -56,11 +65,19 @@ def made_up_teacher():
 
 def test_halvings_end_at_the_samplers_evaluations():
     def rounds(start: int, end: int) -> list[int]:
-        return distil.rounds(dataclasses.replace(DISTILLED, distil_from=start, sample_steps=end))
+        return distil.rounds(
+            dataclasses.replace(
+                DISTILLED,
+                training=dataclasses.replace(DISTILLED.training, distil_from=start),
+                sampling=dataclasses.replace(DISTILLED.sampling, steps=end),
+            )
+        )
 
     assert (rounds(8, 4), rounds(8, 1), rounds(64, 4)) == ([4], [4, 2, 1], [32, 16, 8, 4])
     for start, end in ((8, 3), (8, 8), (12, 4), (4, 8)):
-        with pytest.raises(UserError, match=f"ddg.distil_from is {start} and ddg.sample_steps {end}"):
+        with pytest.raises(
+            UserError, match=f"ddg.training.distil_from is {start} and ddg.sampling.steps {end}"
+        ):
             rounds(start, end)
 
 
@@ -80,7 +97,8 @@ def test_one_step_to_the_target_ends_where_the_teacher_does():
     k, end = jnp.array([899, 499, 249]), jnp.array([749, 249, -1])
     x_0 = distil.one_step_target(made, x_k, k, x_end, end)
     eps = diffusion.eps_from_x_0(made, x_k, k, x_0)
-    np.testing.assert_allclose(diffusion.ddim_step(made, x_k, k, end, eps, None), x_end, atol=2e-5)
+    step = diffusion.ddim_coefficients(made, k, end, x_k)
+    np.testing.assert_allclose(diffusion.ddim_step(step, x_k, eps, None), x_end, atol=2e-5)
     np.testing.assert_allclose(x_0[2], x_end[2], atol=1e-6)  # the last step ends at x_0 itself
 
 
@@ -100,14 +118,18 @@ def directory(teacher, tmp_path_factory):
 
 
 def samples(config: DDGConfig, params, steps: int) -> np.ndarray:
-    generator = sample.Generator(dataclasses.replace(config, sample_steps=steps), params, make_prior(config))
+    generator = sample.Generator(
+        dataclasses.replace(config, sampling=dataclasses.replace(config.sampling, steps=steps)),
+        params,
+        make_prior(config),
+    )
     return sample.predict(jax.random.key(7), generator, pictures().prior[:8])
 
 
 def test_students_of_few_evaluations_follow_the_teacher_of_many(teacher, directory):
     wanted = samples(TINY, teacher, 4)
     for count in (2, 1):
-        student = artifacts.load_params(directory / distil.params_file(count))
+        student = load_params(directory / distil.params_file(count))
         mine = np.mean((samples(DISTILLED, student, count) - wanted) ** 2)
         plain = np.mean((samples(TINY, teacher, count) - wanted) ** 2)
         assert mine < 0.5 * plain, (count, mine, plain)
@@ -145,7 +167,7 @@ def test_resume_equals_an_uninterrupted_distillation(teacher, directory, tmp_pat
 
 
 def test_a_student_runs_with_its_own_evaluations_only(directory):
-    student = artifacts.load_params(directory / distil.params_file(1))
+    student = load_params(directory / distil.params_file(1))
     generator = sample.Generator(DISTILLED, student, make_prior(DISTILLED))
     with pytest.raises(UserError, match="distilled to 1 evaluations, not 4"):
         sample.predict(jax.random.key(0), generator, pictures().prior[:2], steps=4)

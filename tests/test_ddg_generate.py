@@ -15,23 +15,28 @@ import pytest
 from ddg_jax import generate, sample, train
 from ddg_jax.prior import make_prior
 from ddgrasp import artifacts, contract
-from ddgrasp.config import Config, DDGConfig
+from ddgrasp.config import (
+    Config,
+    DDGConfig,
+    DDGDepthConfig,
+    DDGDiffusionConfig,
+    GraftConfig,
+    SamplingConfig,
+    UNetConfig,
+)
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
+from learning.params import save_params
 
 ROOT = Path(__file__).parents[1]
 CONFIG = Config(
     preset="test",
     ddg=DDGConfig(
-        height_px=16,
-        width_px=24,
-        widths=(8, 8),
-        blocks=(0, 1),
-        attention_heads=1,
-        diffusion_steps=50,
-        sample_steps=2,
-        sample_batch=4,
-        noise_threshold=-0.02,
+        depth=DDGDepthConfig(height_px=16, width_px=24),
+        unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
+        diffusion=DDGDiffusionConfig(steps=50),
+        sampling=SamplingConfig(steps=2, batch_size=4),
+        graft=GraftConfig(noise_threshold=-0.02),
     ),
 )
 LENGTHS = 4 * (5, 3, 9, 1, 7, 6, 2, 8)
@@ -51,7 +56,7 @@ def made_up_params(config: DDGConfig):
 def run(tmp_path_factory):
     """A run directory with a generator and demos, finished."""
     directory = tmp_path_factory.mktemp("run")
-    artifacts.save_params(directory / "ddg" / sample.PARAMS_FILE, made_up_params(CONFIG.ddg))
+    save_params(directory / "ddg" / sample.PARAMS_FILE, made_up_params(CONFIG.ddg))
     artifacts.finish(directory / "ddg", "ddg", CONFIG, seconds=1, metrics={})
     rng = np.random.default_rng(0)
     store = EpisodeStore(directory / "demos" / "episodes.zarr", create=True)
@@ -158,7 +163,7 @@ def test_resuming_anywhere_computes_the_same_batches(run, straight):
         for got, wanted in zip(made, expected[first:], strict=True):
             np.testing.assert_array_equal(got, wanted)
         # only the episodes that share a batch with the first one are computed again
-        assert min(opened) >= max(0, first - generator.config.sample_batch)
+        assert min(opened) >= max(0, first - generator.config.sampling.batch_size)
 
 
 def test_only_the_episodes_of_one_batch_are_open(run):
@@ -173,7 +178,7 @@ def test_only_the_episodes_of_one_batch_are_open(run):
     stream = generate.noisy_episodes(jax.random.key(3), generator, LENGTHS, read)
     for done in range(len(LENGTHS)):
         next(stream)
-        assert opened - done <= 1 + generator.config.sample_batch
+        assert opened - done <= 1 + generator.config.sampling.batch_size
 
 
 def test_eight_devices_make_what_one_makes(run, straight, tmp_path):
@@ -225,7 +230,9 @@ def test_the_stream_hands_colour_to_a_prior_that_needs_it(run):
 
 
 def test_wrong_input_is_refused(run, tmp_path, straight):
-    config = dataclasses.replace(CONFIG, ddg=dataclasses.replace(CONFIG.ddg, prior_in_sim="rgb"))
+    config = dataclasses.replace(
+        CONFIG, ddg=dataclasses.replace(CONFIG.ddg, prior=dataclasses.replace(CONFIG.ddg.prior, in_sim="rgb"))
+    )
     assert make_prior(config.ddg).needs_sim_rgb is False  # the built-in prior needs none
     with pytest.raises(UserError, match="holds no finished artefact"):
         artifacts.read_artifact(tmp_path)

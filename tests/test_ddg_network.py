@@ -1,4 +1,4 @@
-"""Space-to-depth, the U-Net's shape rules, representations of depth and grafting."""
+"""The U-Net's shape rules, representations of depth and grafting."""
 
 from dataclasses import replace
 
@@ -9,17 +9,9 @@ import pytest
 
 from ddg_jax.graft import graft
 from ddg_jax.representation import LIMIT_PER_M, channels, decode, encode
-from ddg_jax.unet import UNet, depth_to_space, space_to_depth
-from ddgrasp.config import DDGConfig
+from ddg_jax.unet import UNet
+from ddgrasp.config import DDGConfig, DDGDepthConfig, GraftConfig
 from ddgrasp.errors import UserError
-
-
-def test_space_to_depth_orders_and_inverts():
-    x = jnp.arange(2 * 4 * 6).reshape(2, 4, 6, 1)
-    folded = space_to_depth(x, 2)
-    assert folded.shape == (2, 2, 3, 4)
-    assert folded[0, 0, 0].tolist() == [0, 1, 6, 7]
-    np.testing.assert_array_equal(depth_to_space(folded, 2), x)
 
 
 def test_unet_takes_any_size_and_sees_prior_and_step():
@@ -35,7 +27,7 @@ def test_unet_takes_any_size_and_sees_prior_and_step():
     np.testing.assert_allclose(net.apply(params, x[:1], c[:1], jnp.array([3])), out[:1], atol=1e-5)
 
 
-DEPTH = DDGConfig(representation="depth", noise_threshold=-0.5)
+DEPTH = DDGConfig(depth=DDGDepthConfig(representation="depth"), graft=GraftConfig(noise_threshold=-0.5))
 
 
 def test_depth_survives_the_diffusion_space_and_holes_are_far_away():
@@ -52,7 +44,9 @@ def test_depth_survives_the_diffusion_space_and_holes_are_far_away():
 
 
 def test_deviations_are_metric_on_any_surface_and_limited():
-    config = DDGConfig(representation="deviation", deviation_threshold=0.0005)
+    config = DDGConfig(
+        depth=DDGDepthConfig(representation="deviation"), graft=GraftConfig(deviation_threshold=0.0005)
+    )
     surface = jnp.array([1.0, 1.0, 1.0, 1.0, 2.0, 0.0])
     measured = 1 / (1 / jnp.maximum(surface, 0.5) + jnp.array([0.0, 0.0004, 0.01, 0.5, -0.03, 0.0]))
     measured = measured.at[5].set(0.0)
@@ -67,29 +61,33 @@ def test_deviations_are_metric_on_any_surface_and_limited():
     # the same deviation is the same disparity at half the distance
     closer = decode(config, x[2:3], jnp.array([0.5])).depth_m
     np.testing.assert_allclose(closer, 1 / (2 + 0.01), rtol=1e-5)
-    assert not decode(replace(config, deviation_threshold=1.0), x[:5], surface[:5]).mask.any()
+    assert not decode(
+        replace(config, graft=replace(config.graft, deviation_threshold=1.0)), x[:5], surface[:5]
+    ).mask.any()
 
 
 def test_an_unknown_representation_is_named():
-    with pytest.raises(UserError, match="ddg.representation 'disparity'"):
-        channels(DDGConfig(representation="disparity"))
+    with pytest.raises(UserError, match="ddg.depth.representation 'disparity'"):
+        channels(DDGConfig(depth=DDGDepthConfig(representation="disparity")))
 
 
 def test_a_threshold_among_the_surfaces_is_refused():
-    with pytest.raises(UserError, match=r"ddg.noise_threshold is 0.4.*-0.2"):
-        DDGConfig(representation="depth")
+    with pytest.raises(UserError, match=r"ddg.graft.noise_threshold is 0.4.*-0.2"):
+        DDGConfig(depth=DDGDepthConfig(representation="depth"))
 
 
 @pytest.mark.parametrize("threshold", [-0.1, float("inf"), float("nan")])
 def test_a_threshold_that_no_deviation_has_is_refused(threshold):
-    with pytest.raises(UserError, match=f"ddg.deviation_threshold is {threshold}"):
-        DDGConfig(deviation_threshold=threshold)
+    with pytest.raises(UserError, match=f"ddg.graft.deviation_threshold is {threshold}"):
+        DDGConfig(graft=GraftConfig(deviation_threshold=threshold))
 
 
 @pytest.mark.parametrize("representation", ["depth", "deviation"])
 @pytest.mark.parametrize("threshold", [-0.8, -0.4, -0.1])
 def test_grafting_is_the_papers_equation_bit_for_bit(representation, threshold):
-    config = DDGConfig(representation=representation, noise_threshold=threshold)
+    config = DDGConfig(
+        depth=DDGDepthConfig(representation=representation), graft=GraftConfig(noise_threshold=threshold)
+    )
     rng = np.random.default_rng(0)
     d_sim = rng.uniform(0.3, 2.0, (3, 5, 7)).astype(np.float32)
     d_sim[:, 0] = 0  # nothing in range there

@@ -8,7 +8,7 @@ import pytest
 
 from ddg_jax import data, prior
 from ddgrasp import artifacts
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import DDGConfig, DDGDepthConfig, DDGTrainingConfig, PriorConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
@@ -43,7 +43,7 @@ def test_prior_ignores_affine_changes_of_inverse_depth():
 
 
 def test_the_metric_prior_says_how_far_a_surface_is_whatever_else_is_seen():
-    made = prior.make_prior(DDGConfig(prior="metric_inverse_depth"))
+    made = prior.make_prior(DDGConfig(prior=PriorConfig(source="metric_inverse_depth")))
     near, far = np.full((1, 24, 32), 1.0, np.float32), np.full((1, 24, 32), 4.0, np.float32)
     mixed = np.concatenate([near[:, :12], far[:, :12]], axis=1)
     np.testing.assert_allclose(made.from_sim(near), 0, atol=1e-6)
@@ -96,11 +96,14 @@ def recordings(tmp_path):
 
 
 def test_frames_and_batches(recordings):
-    config = DDGConfig(height_px=18, width_px=32, batch_size=4, holdout_fraction=0.34)
+    config = DDGConfig(
+        depth=DDGDepthConfig(height_px=18, width_px=32),
+        training=DDGTrainingConfig(batch_size=4, holdout_fraction=0.34),
+    )
     frames = data.load_frames(recordings, config, prior.make_prior(config), 0, Progress(quiet=True))
     assert len(frames) == 6 and frames.recording.tolist() == [0, 0, 0, 1, 1, 1]
     np.testing.assert_allclose(np.mean(frames.depth_m == 0), 2 / 32)
-    training, held = frames.split(config.holdout_fraction)
+    training, held = frames.split(config.training.holdout_fraction)
     assert (len(training), len(held)) == (4, 2)
     one, again, other = (data.make_batch(training, config, 7, step) for step in (3, 3, 4))
     np.testing.assert_array_equal(one.x_0, again.x_0)
@@ -111,7 +114,7 @@ def test_frames_and_batches(recordings):
     with pytest.raises(UserError, match="record more"):
         frames.part(slice(0, 1)).split(0.1)
     with pytest.raises(UserError, match="inverse_depth"):
-        prior.make_prior(DDGConfig(prior="inverse_dept"))
+        prior.make_prior(DDGConfig(prior=PriorConfig(source="inverse_dept")))
 
 
 def _record(path, frames: int = 2, size=(36, 64), **changes):
@@ -134,7 +137,10 @@ class Notes(Progress):
         self.said.append(text)
 
 
-def load(root, config=DDGConfig(height_px=18, width_px=32)):  # noqa: B008
+WIDE = DDGConfig(depth=DDGDepthConfig(height_px=18, width_px=32))
+
+
+def load(root, config=WIDE):
     notes = Notes()
     return data.load_frames(root, config, prior.make_prior(config), 0, notes), notes.said
 
@@ -146,9 +152,18 @@ def _depth(root, name, frame, image):
 def test_a_crop_is_told(tmp_path):
     _record(tmp_path / "square", size=(64, 64))
     assert any(
-        "sees 56% of each 64x64 frame" in line and "--ddg.height-px 32" in line for line in load(tmp_path)[1]
+        "sees 56% of each 64x64 frame" in line and "--ddg.depth.height-px 32" in line
+        for line in load(tmp_path)[1]
     )
-    assert not any("sees" in line for line in load(tmp_path, DDGConfig(height_px=32, width_px=32))[1])
+    assert not any(
+        "sees" in line
+        for line in load(
+            tmp_path,
+            DDGConfig(
+                depth=DDGDepthConfig(height_px=32, width_px=32),
+            ),
+        )[1]
+    )
 
 
 def test_what_cannot_be_used_is_named_and_counted(recordings):
@@ -169,7 +184,9 @@ def test_what_cannot_be_used_is_named_and_counted(recordings):
         assert sum(words in line for line in said) == 1, (words, said)
     assert any("blind: left out 1 frame(s) without a valid pixel in the window" in line for line in said)
     assert said[-1] == "left out 3 frame(s), and 2 of 5 recording(s)"
-    config = DDGConfig(height_px=18, width_px=32)
+    config = DDGConfig(
+        depth=DDGDepthConfig(height_px=18, width_px=32),
+    )
     few = data.load_frames(recordings, config, prior.make_prior(config), 0, Progress(quiet=True), 3)
     np.testing.assert_array_equal(few.depth_m, frames.depth_m[:3])
 

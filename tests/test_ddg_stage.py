@@ -10,29 +10,32 @@ import pytest
 from ddg_jax import stage
 from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator, generate, predict
-from ddgrasp import artifacts
-from ddgrasp.config import Config, DDGConfig
+from ddgrasp.config import (
+    Config,
+    DDGConfig,
+    DDGDepthConfig,
+    DDGDiffusionConfig,
+    DDGTrainingConfig,
+    GraftConfig,
+    SamplingConfig,
+    UNetConfig,
+)
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress, read_curves
 from job_support import make_job
+from learning.params import load_params
 from sensors.recordings.recording import RecordingWriter
 
 CONFIG = Config(
     preset="test",
     ddg=DDGConfig(
-        height_px=16,
-        width_px=24,
-        widths=(8, 8),
-        blocks=(0, 1),
-        attention_heads=1,
-        diffusion_steps=50,
-        train_steps=10,
-        batch_size=4,
-        sample_steps=2,
-        sample_batch=4,
-        holdout_fraction=0.25,
-        noise_threshold=0.0,
+        depth=DDGDepthConfig(height_px=16, width_px=24),
+        unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
+        diffusion=DDGDiffusionConfig(steps=50),
+        training=DDGTrainingConfig(steps=10, batch_size=4, holdout_fraction=0.25),
+        sampling=SamplingConfig(steps=2, batch_size=4),
+        graft=GraftConfig(noise_threshold=0.0),
     ),
 )
 
@@ -102,40 +105,62 @@ def test_sample_folder_draws_a_picture(fitted, recordings, tmp_path):
 
 
 def test_the_camera_presets_generator_fits_and_samples_with_fresh_noise(recordings, tmp_path):
-    small = {
-        name: getattr(CONFIG.ddg, name) for name in ("height_px", "width_px", "widths", "diffusion_steps")
-    }
-    small |= {"train_steps": 10, "attention_heads": 1, "blocks": (1, 1), "sample_batch": 4}
-    config = dataclasses.replace(CONFIG, ddg=dataclasses.replace(get_preset("camera").ddg, **small))
+    camera, change = get_preset("camera").ddg, dataclasses.replace
+    small = change(
+        camera,
+        depth=change(camera.depth, height_px=CONFIG.ddg.depth.height_px, width_px=CONFIG.ddg.depth.width_px),
+        unet=change(camera.unet, widths=CONFIG.ddg.unet.widths, attention_heads=1, blocks=(1, 1)),
+        diffusion=change(camera.diffusion, steps=CONFIG.ddg.diffusion.steps),
+        training=change(camera.training, steps=10),
+        sampling=change(camera.sampling, batch_size=4),
+    )
+    config = change(CONFIG, ddg=small)
     progress = Progress(tmp_path / "ddg", "ddg", quiet=True)
     fitted = stage.run(make_job("ddg", config, tmp_path / "ddg", progress, data=recordings))
     progress.close()
     assert fitted.manifest.metrics["prior"] == "metric_inverse_depth"
     generator = Generator.load(fitted.directory)
-    assert (generator.config.sampler, generator.config.eta, generator.config.sample_steps) == ("ddim", 1.0, 2)
+    assert (
+        generator.config.sampling.sampler,
+        generator.config.sampling.eta,
+        generator.config.sampling.steps,
+    ) == ("ddim", 1.0, 2)
     c = np.zeros((3, 16, 24), np.float32)
     made = predict(jax.random.key(0), generator, c)
     np.testing.assert_array_equal(predict(jax.random.key(0), generator, c), made)
     # fresh noise is each frame's own, however they are batched
     last = predict(jax.random.key(0), generator, c[2:], frame=np.array([2]))
     np.testing.assert_allclose(last[0], made[2], atol=1e-5)
-    calm = dataclasses.replace(generator, config=dataclasses.replace(generator.config, eta=0.0))
+    calm = dataclasses.replace(
+        generator,
+        config=dataclasses.replace(
+            generator.config, sampling=dataclasses.replace(generator.config.sampling, eta=0.0)
+        ),
+    )
     assert np.abs(predict(jax.random.key(0), calm, c) - made).max() > 1e-2
 
 
 def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
     config = dataclasses.replace(
-        CONFIG, ddg=dataclasses.replace(CONFIG.ddg, init_from=str(fitted.directory), sample_steps=3)
+        CONFIG,
+        ddg=dataclasses.replace(
+            CONFIG.ddg,
+            init_from=str(fitted.directory),
+            sampling=dataclasses.replace(CONFIG.ddg.sampling, steps=3),
+        ),
     )
     loaded = stage.run(
         make_job("ddg", config, tmp_path / "ddg", Progress(tmp_path / "ddg", quiet=True), data=recordings)
     )
     assert loaded.manifest.origin == "loaded"
-    before, after = (artifacts.load_params(a.directory / "params.msgpack") for a in (fitted, loaded))
+    before, after = (load_params(a.directory / "params.msgpack") for a in (fitted, loaded))
     jax.tree.map(np.testing.assert_array_equal, before, after)
     for change, message in (
-        ({"far_m": 5.0}, "ddg.far_m 10.0.*5.0"),
-        ({"hole_loss": "cross_entropy"}, "ddg.hole_loss 'squared'.*'cross_entropy'"),
+        ({"depth": dataclasses.replace(CONFIG.ddg.depth, far_m=5.0)}, "ddg.depth.far_m 10.0.*5.0"),
+        (
+            {"training": dataclasses.replace(CONFIG.ddg.training, hole_loss="cross_entropy")},
+            "ddg.training.hole_loss 'squared'.*'cross_entropy'",
+        ),
     ):
         other = dataclasses.replace(config, ddg=dataclasses.replace(config.ddg, **change))
         with pytest.raises(UserError, match=message):
@@ -148,20 +173,18 @@ def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings
         ddg=dataclasses.replace(
             CONFIG.ddg,
             init_from=str(fitted.directory),
-            sampler="progressive",
-            sample_steps=1,
-            distil_from=4,
-            distil_steps=4,
+            sampling=dataclasses.replace(CONFIG.ddg.sampling, sampler="progressive", steps=1),
+            training=dataclasses.replace(CONFIG.ddg.training, distil_from=4, distil_steps=4),
         ),
     )
     directory = tmp_path / "ddg"
     stage.run(make_job("ddg", config, directory, Progress(directory, quiet=True), data=recordings))
-    before = artifacts.load_params(fitted.directory / "params.msgpack")
+    before = load_params(fitted.directory / "params.msgpack")
     plain = Generator.load(directory, "ddim", 50)
     jax.tree.map(np.testing.assert_array_equal, plain.params, before)
-    assert (plain.config.sampler, plain.config.sample_steps) == ("ddim", 50)
+    assert (plain.config.sampling.sampler, plain.config.sampling.steps) == ("ddim", 50)
     one, two = Generator.load(directory), Generator.load(directory, steps=2)
-    assert (one.config.sample_steps, two.config.sample_steps) == (1, 2)
+    assert (one.config.sampling.steps, two.config.sampling.steps) == (1, 2)
     weights = [jax.tree.leaves(generator.params) for generator in (plain, one, two)]
     assert not any(np.array_equal(weights[a][0], weights[b][0]) for a, b in ((0, 1), (1, 2), (0, 2)))
     depth = np.full((2, 16, 24), 0.9, np.float32)
@@ -175,9 +198,7 @@ def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings
     loaded = stage.run(
         make_job("ddg", again, tmp_path / "x", Progress(tmp_path / "x", quiet=True), data=recordings)
     )
-    jax.tree.map(
-        np.testing.assert_array_equal, artifacts.load_params(loaded.directory / "params.msgpack"), before
-    )
+    jax.tree.map(np.testing.assert_array_equal, load_params(loaded.directory / "params.msgpack"), before)
 
 
 def test_flicker_is_counted_within_recordings_only():

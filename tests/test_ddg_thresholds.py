@@ -14,19 +14,28 @@ from ddg_jax.representation import decode, encode
 from ddg_jax.sample import PARAMS_FILE
 from ddg_jax.train import init_params
 from ddgrasp import artifacts
-from ddgrasp.config import Config, DDGConfig
+from ddgrasp.config import Config, DDGConfig, DDGDepthConfig, SamplingConfig, UNetConfig
 from ddgrasp.progress import Progress
+from learning.params import save_params
 from sensors.recordings.recording import RecordingWriter
 
-CONFIG = DDGConfig(height_px=16, width_px=24, widths=(8, 8), blocks=(0, 1), attention_heads=1, sample_steps=2)
-DEPTH = replace(CONFIG, representation="depth", noise_threshold=-0.2)
+CONFIG = DDGConfig(
+    depth=DDGDepthConfig(height_px=16, width_px=24),
+    unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
+    sampling=SamplingConfig(steps=2),
+)
+DEPTH = replace(
+    CONFIG,
+    depth=replace(CONFIG.depth, representation="depth"),
+    graft=replace(CONFIG.graft, noise_threshold=-0.2),
+)
 
 
 def test_a_hole_is_the_same_at_every_threshold_of_the_empty_band():
     depth = np.array([[0.0, 0.26, 1.0, 5.0, 9.9]], np.float32)
     x = encode(DEPTH, depth, depth)
     for threshold in thresholds.THRESHOLDS:
-        mask = decode(replace(DEPTH, noise_threshold=threshold), x, depth).mask
+        mask = decode(replace(DEPTH, graft=replace(DEPTH.graft, noise_threshold=threshold)), x, depth).mask
         np.testing.assert_array_equal(mask, depth == 0)
 
 
@@ -52,7 +61,7 @@ def test_the_analysis_by_hand():
 
 def test_the_command_leaves_a_table_and_a_plot(tmp_path):
     params = init_params(CONFIG, jax.random.key(0))
-    artifacts.save_params(tmp_path / "ddg" / PARAMS_FILE, params)
+    save_params(tmp_path / "ddg" / PARAMS_FILE, params)
     artifacts.finish(tmp_path / "ddg", "ddg", Config(preset="test", ddg=CONFIG), seconds=1, metrics={})
     with RecordingWriter(tmp_path / "recording", {}) as writer:
         for t in range(4):

@@ -11,32 +11,38 @@ from ddg_jax import sample, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
 from ddg_jax.representation import correlations
-from ddgrasp.config import CROSS_ENTROPY, HOLE_LOSSES, SQUARED, DDGConfig
+from ddgrasp.config import (
+    CROSS_ENTROPY,
+    HOLE_LOSSES,
+    SQUARED,
+    DDGConfig,
+    DDGDepthConfig,
+    DDGDiffusionConfig,
+    DDGTrainingConfig,
+    GraftConfig,
+    PriorConfig,
+    SamplingConfig,
+    UNetConfig,
+)
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import diffusion as schedule
 from learning import loop
 
 TINY = DDGConfig(
-    height_px=16,
-    width_px=24,
-    widths=(16, 16),
-    blocks=(0, 1),
-    attention_heads=2,
-    diffusion_steps=100,
-    train_steps=6,
-    batch_size=8,
-    checkpoint_every=4,
-    sample_batch=4,
-    prior_blur_px=0.0,
-    learning_rate=3e-3,
+    depth=DDGDepthConfig(height_px=16, width_px=24),
+    unet=UNetConfig(widths=(16, 16), blocks=(0, 1), attention_heads=2),
+    diffusion=DDGDiffusionConfig(steps=100),
+    training=DDGTrainingConfig(steps=6, batch_size=8, checkpoint_every=4, learning_rate=3e-3),
+    sampling=SamplingConfig(batch_size=4),
+    prior=PriorConfig(blur_px=0.0),
 )
 
 
 def pictures(count: int = 16) -> Frames:
     """A near square at a random place; the sensor loses the four columns left of it."""
     rng = np.random.default_rng(0)
-    clean = np.full((count, TINY.height_px, TINY.width_px), 2.0, np.float32)
+    clean = np.full((count, TINY.depth.height_px, TINY.depth.width_px), 2.0, np.float32)
     noisy = clean.copy()
     for i in range(count):
         row, column = rng.integers(2, 8), rng.integers(6, 16)
@@ -48,8 +54,8 @@ def pictures(count: int = 16) -> Frames:
 
 
 def test_an_error_in_the_clean_map_weighs_snr_within_its_limits():
-    config = dataclasses.replace(TINY, snr_limits=(0.5, 3.0))
-    step = np.arange(config.diffusion_steps)
+    config = dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, snr_limits=(0.5, 3.0)))
+    step = np.arange(config.diffusion.steps)
     snr = np.asarray(schedule.signal_to_noise(train.config_schedule(config), step))
     assert snr.min() < 0.5 and snr.max() > 3.0
     # An error e in x_0 is sqrt(SNR) e in eps.
@@ -58,7 +64,10 @@ def test_an_error_in_the_clean_map_weighs_snr_within_its_limits():
 
 
 def test_log_odds_are_those_of_bayes_rule():
-    config, k = dataclasses.replace(TINY, hole_loss=CROSS_ENTROPY), np.array([5, 50, 90])
+    config, k = (
+        dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, hole_loss=CROSS_ENTROPY)),
+        np.array([5, 50, 90]),
+    )
     alpha_bar = train.config_schedule(config).alpha_bars[k].astype(np.float64)[:, None, None]
     rng = np.random.default_rng(0)
     x_k, output = rng.normal(0, 0.3, (2, 3, 4, 5, 2))
@@ -74,7 +83,10 @@ def test_log_odds_are_those_of_bayes_rule():
 
 @pytest.mark.parametrize("hole_loss", HOLE_LOSSES)
 def test_the_loss_weighs_errors_of_the_clean_map(hole_loss):
-    config = dataclasses.replace(TINY, hole_loss=hole_loss, snr_limits=(0.5, 3.0))
+    config = dataclasses.replace(
+        TINY,
+        training=dataclasses.replace(TINY.training, hole_loss=hole_loss, snr_limits=(0.5, 3.0)),
+    )
     rng = np.random.default_rng(0)
     x_0 = np.stack([rng.choice([-1.0, 1.0], (4, 16, 24)), rng.normal(0, 0.2, (4, 16, 24))], -1)
     x_0, eps, c = (np.float32(v) for v in (x_0, rng.normal(size=x_0.shape), rng.normal(size=(4, 16, 24))))
@@ -92,24 +104,28 @@ def test_the_loss_weighs_errors_of_the_clean_map(hole_loss):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("section", "change", "message"),
     [
-        ({"sampler": "progresive"}, "ddg.sampler.*Did you mean 'progressive'"),
-        ({"sample_spacing": "quadratc"}, "ddg.sample_spacing.*Did you mean 'quadratic'"),
-        ({"loss_weight": "trunc"}, "ddg.loss_weight.*truncated"),
-        ({"eta": 5.0}, "ddg.eta is 5.0; expected 0"),
+        (SamplingConfig, {"sampler": "progresive"}, "ddg.sampling.sampler.*Did you mean 'progressive'"),
+        (SamplingConfig, {"spacing": "quadratc"}, "ddg.sampling.spacing.*Did you mean 'quadratic'"),
+        (DDGTrainingConfig, {"loss_weight": "trunc"}, "ddg.training.loss_weight.*truncated"),
+        (SamplingConfig, {"eta": 5.0}, "ddg.sampling.eta is 5.0; expected 0"),
     ],
 )
-def test_wrong_options_are_refused_before_anything_is_fitted(change, message):
+def test_wrong_options_are_refused_before_anything_is_fitted(section, change, message):
     with pytest.raises(UserError, match=message):
-        DDGConfig(**change)
+        section(**change)
 
 
 def test_cross_entropy_needs_holes_of_their_own_channel():
     with pytest.raises(UserError, match="hole_loss cross_entropy needs holes in a channel"):
-        DDGConfig(hole_loss=CROSS_ENTROPY, representation="depth", noise_threshold=-0.2)
+        DDGConfig(
+            training=DDGTrainingConfig(hole_loss=CROSS_ENTROPY),
+            depth=DDGDepthConfig(representation="depth"),
+            graft=GraftConfig(noise_threshold=-0.2),
+        )
     with pytest.raises(UserError, match="crossentropy"):
-        DDGConfig(hole_loss="crossentropy")
+        DDGConfig(training=DDGTrainingConfig(hole_loss="crossentropy"))
 
 
 def test_resume_equals_an_uninterrupted_run(tmp_path):
@@ -143,7 +159,10 @@ def fit_by(tmp_path_factory):
     @cache
     def fitted_generator(hole_loss: str) -> sample.Generator:
         config = dataclasses.replace(
-            TINY, train_steps=300, batch_size=16, checkpoint_every=1000, hole_loss=hole_loss
+            TINY,
+            training=dataclasses.replace(
+                TINY.training, steps=300, batch_size=16, checkpoint_every=1000, hole_loss=hole_loss
+            ),
         )
         params = train.fit(config, pictures(64), tmp_path_factory.mktemp("ddg"), 0, Progress(quiet=True))
         return sample.Generator(config, params, make_prior(config))
@@ -159,7 +178,7 @@ def fitted(fit_by):
 @pytest.fixture(scope="module")
 def scene():
     """Clean depth never seen in training."""
-    depth = np.full((6, TINY.height_px, TINY.width_px), 2.0, np.float32)
+    depth = np.full((6, TINY.depth.height_px, TINY.depth.width_px), 2.0, np.float32)
     depth[:, 5:11, 11:17] = 0.8
     return depth
 
@@ -182,7 +201,12 @@ def test_generator_learns_where_the_sensor_loses_pixels(fit_by, scene, hole_loss
 def test_generation_does_not_depend_on_batching(fitted, scene):
     key = jax.random.key(3)
     all_at_once = sample.predict(key, fitted, fitted.prior.from_sim(scene, None), episode=2)
-    other = dataclasses.replace(fitted, config=dataclasses.replace(fitted.config, sample_batch=3))
+    other = dataclasses.replace(
+        fitted,
+        config=dataclasses.replace(
+            fitted.config, sampling=dataclasses.replace(fitted.config.sampling, batch_size=3)
+        ),
+    )
     np.testing.assert_allclose(
         sample.predict(key, other, fitted.prior.from_sim(scene, None), episode=2), all_at_once, atol=2e-4
     )
@@ -200,9 +224,20 @@ def test_frame_noise_is_standard_normal_with_the_stated_correlation():
 
 
 def test_every_channel_has_its_own_correlation(fitted):
-    config = dataclasses.replace(fitted.config, frame_correlation=0.9, deviation_correlation=0.2)
+    config = dataclasses.replace(
+        fitted.config,
+        sampling=dataclasses.replace(
+            fitted.config.sampling, frame_correlation=0.9, deviation_correlation=0.2
+        ),
+    )
     assert correlations(config) == (0.9, 0.2)
-    assert correlations(dataclasses.replace(config, representation="depth", noise_threshold=-0.2)) == (0.9,)
+    assert correlations(
+        dataclasses.replace(
+            config,
+            depth=dataclasses.replace(config.depth, representation="depth"),
+            graft=dataclasses.replace(config.graft, noise_threshold=-0.2),
+        )
+    ) == (0.9,)
     shape = (200, 200, 2)
     noise = sample.frame_noise(jax.random.key(0), 3, np.array([0, 1]), shape, correlations(config))
     for channel, expected in enumerate(correlations(config)):
@@ -214,7 +249,10 @@ def test_surfaces_change_in_time_with_the_noise_of_deviations(fitted, scene):
     """A still scene sensed again: less in common, more change."""
 
     def change(correlation: float) -> float:
-        config = dataclasses.replace(fitted.config, deviation_correlation=correlation)
+        config = dataclasses.replace(
+            fitted.config,
+            sampling=dataclasses.replace(fitted.config.sampling, deviation_correlation=correlation),
+        )
         generator = dataclasses.replace(fitted, config=config)
         x = sample.predict(jax.random.key(1), generator, fitted.prior.from_sim(scene, None), episode=0)
         deviation = np.asarray(x)[..., 1]
@@ -231,7 +269,12 @@ def test_batch_of_environments_equals_their_episodes(fitted, scene):
 
 
 def test_ancestral_sampler_and_bad_input(fitted, scene):
-    ddpm = dataclasses.replace(fitted, config=dataclasses.replace(fitted.config, sampler="ddpm"))
+    ddpm = dataclasses.replace(
+        fitted,
+        config=dataclasses.replace(
+            fitted.config, sampling=dataclasses.replace(fitted.config.sampling, sampler="ddpm")
+        ),
+    )
     holes = sample.generate(jax.random.key(1), ddpm, scene[:2], steps=20).depth_m == 0
     assert holes[:, 5:11, 7:11].mean() > 0.6
     with pytest.raises(UserError, match="uint16"):

@@ -133,7 +133,7 @@ def test_missing_driver_names_the_extra(monkeypatch, module, start, extra):
 def test_drivers_that_never_started_can_be_stopped():
     RealSenseCamera(SimClock(), contract.D455).stop()
     FrankaRobot("127.0.0.1", SimClock()).stop()
-    with pytest.raises(UserError, match="franka_dynamics is 1.5"):
+    with pytest.raises(UserError, match="franka.dynamics is 1.5"):
         FrankaRobot("127.0.0.1", SimClock(), dynamics=1.5)
 
 

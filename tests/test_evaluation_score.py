@@ -13,7 +13,19 @@ from ddg_jax import stage as ddg_stage
 from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator
 from ddgrasp import artifacts
-from ddgrasp.config import Config, DDGConfig, RecordConfig, ScoreConfig
+from ddgrasp.config import (
+    Config,
+    DDGConfig,
+    DDGDepthConfig,
+    DDGDiffusionConfig,
+    DDGTrainingConfig,
+    GraftConfig,
+    PriorConfig,
+    RecordConfig,
+    SamplingConfig,
+    ScoreConfig,
+    UNetConfig,
+)
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from evaluation.depth_score import data as score_data
@@ -43,19 +55,13 @@ CONFIG = Config(
     preset="test",
     record=RecordConfig(trajectories=1, frames=6),
     ddg=DDGConfig(
-        height_px=36,
-        width_px=64,
-        widths=(8, 8),
-        blocks=(0, 1),
-        attention_heads=1,
-        diffusion_steps=50,
-        train_steps=4,
-        batch_size=2,
-        sample_steps=2,
-        sample_batch=4,
-        checkpoint_every=2,
-        prior_input_px=28,
-        noise_threshold=0.0,
+        depth=DDGDepthConfig(height_px=36, width_px=64),
+        unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
+        diffusion=DDGDiffusionConfig(steps=50),
+        training=DDGTrainingConfig(steps=4, batch_size=2, checkpoint_every=2),
+        sampling=SamplingConfig(steps=2, batch_size=4),
+        prior=PriorConfig(input_px=28),
+        graft=GraftConfig(noise_threshold=0.0),
     ),
 )
 SIZES = [
@@ -163,7 +169,7 @@ def test_a_real_cameras_recordings_are_fitted_and_scored(tmp_path, capsys):
     assert "must not overlap" in capsys.readouterr().err
     assert cli.main([*command, "--run-dir", str(tmp_path)]) == 2
     assert "leave one of them out" in capsys.readouterr().err
-    command += ["--fit-frames", "10", "--score-frames", "16", "--ddg.train-steps", "3"]
+    command += ["--fit-frames", "10", "--score-frames", "16", "--ddg.training.steps", "3"]
     assert cli.main([*command, "--resume"]) == 0
     fitted = artifacts.read_manifest(tmp_path / "out" / "score_real" / "ddg").config["ddg"]
     assert (fitted["height_px"], fitted["train_steps"]) == (120, 3)
@@ -187,7 +193,7 @@ def test_disparity_is_the_recorded_cameras_own(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "option", [("--ddg.train-steps", "3"), ("--fit-frames", "9"), ("--score-frames", "17")]
+    "option", [("--ddg.training.steps", "3"), ("--fit-frames", "9"), ("--score-frames", "17")]
 )
 def test_options_of_real_without_it_are_refused(option, run_dir, tmp_path, capsys):
     command = [

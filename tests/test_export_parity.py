@@ -10,7 +10,14 @@ import pytest
 
 from ddgrasp import contract
 from ddgrasp import policy_metadata as metadata
-from ddgrasp.config import ExportConfig, StudentConfig
+from ddgrasp.config import (
+    EncoderConfig,
+    ExportConfig,
+    HandViewConfig,
+    HeadConfig,
+    PictureConfig,
+    StudentConfig,
+)
 from ddgrasp.errors import UserError
 from export import graph, parity
 from learning.diffusion import q_sample
@@ -18,32 +25,41 @@ from student_jax import policy
 
 PROFILE = contract.D455.scaled(0.125)
 SMALL = StudentConfig(
-    input_height_px=56, input_width_px=72, width=8, stage_blocks=(1, 1), keypoints=8, feature_size=32,
-    state_features=16, denoiser_width=48, denoiser_blocks=2, time_features=16, chunk=3,
-    hand_view_px=16, hand_view_pitch_m=0.008, hand_view_width=8, hand_view_blocks=1, hand_view_channels=2,
-    hand_view_features=16,
-)  # fmt: skip
+    picture=PictureConfig(height_px=56, width_px=72),
+    encoder=EncoderConfig(width=8, stage_blocks=(1, 1), keypoints=8, features=32),
+    head=HeadConfig(state_features=16, width=48, blocks=2, time_features=16, chunk=3),
+    hand_view=HandViewConfig(size_px=16, pitch_m=0.008, width=8, blocks=1, channels=2, features=16),
+)
 OPTIONS = {
     "keypoints, trimmed crop": (SMALL, ExportConfig(depth_dtype="uint16_mm")),
     "keypoints, resized, floats, padded cells": (
-        replace(SMALL, input_height_px=40, input_width_px=52, output_stride=16, stage_blocks=(1, 1, 1)),
+        replace(
+            SMALL,
+            picture=replace(SMALL.picture, height_px=40, width_px=52),
+            encoder=replace(SMALL.encoder, output_stride=16, stage_blocks=(1, 1, 1)),
+        ),
         ExportConfig(depth_dtype="float32_m", ddim_steps=4),
     ),
     "tokens, conv7, concat, all channels": (
         replace(
-            SMALL, pooling="tokens", stem="conv7", conditioning="concat", keypoints=2,
-            channels=("depth", "relief", "valid"), input_height_px=48, input_width_px=64,
-            features_to_head=True, hand_view_pitch_m=0.002,
+            SMALL,
+            encoder=replace(SMALL.encoder, pooling="tokens", stem="conv7", keypoints=2),
+            head=replace(SMALL.head, conditioning="concat", features_to_head=True),
+            picture=replace(SMALL.picture, channels=("depth", "relief", "valid"), height_px=48, width_px=64),
+            hand_view=replace(SMALL.hand_view, pitch_m=0.002),
         ),
         ExportConfig(depth_dtype="float32_m"),
     ),
     "mean, no norm, no auxiliary": (
         replace(
-            SMALL, pooling="mean", norm="none", hand_view_px=0, features_to_head=True, aux_to_head=False
+            SMALL,
+            encoder=replace(SMALL.encoder, pooling="mean", norm="none"),
+            hand_view=replace(SMALL.hand_view, size_px=0),
+            head=replace(SMALL.head, features_to_head=True, aux_to_head=False),
         ),
         ExportConfig(depth_dtype="uint16_mm"),
     ),
-}  # fmt: skip
+}
 
 
 def jittered(params: dict, seed: int = 0) -> dict:
@@ -67,8 +83,8 @@ def trained_head(params: dict, config: StudentConfig) -> dict:
     def loss(head, key):
         keys = jax.random.split(key, 4)
         cond = jax.random.normal(keys[0], (64, size))
-        action = 0.6 * jnp.tanh(cond[:, :8])[:, None] * jnp.ones((1, config.chunk, 1))
-        k = jax.random.randint(keys[1], (64,), 0, config.diffusion_steps)
+        action = 0.6 * jnp.tanh(cond[:, :8])[:, None] * jnp.ones((1, config.head.chunk, 1))
+        k = jax.random.randint(keys[1], (64,), 0, config.head.diffusion_steps)
         noise = jax.random.normal(keys[2], action.shape)
         noisy = q_sample(schedule, action, k, noise)
         predicted = net.apply({"params": {**params, "denoiser": head}}, noisy, k, cond, method="denoise")
@@ -141,10 +157,10 @@ def test_options_and_parameters_that_do_not_fit_are_refused():
         graph.build_model(params, config, options, PROFILE, metadata.describe(SMALL, ExportConfig(), PROFILE))
 
     with pytest.raises(UserError, match="Did you mean 'tokens'"):
-        build(replace(SMALL, pooling="token"), ExportConfig())
+        build(replace(SMALL, encoder=replace(SMALL.encoder, pooling="token")), ExportConfig())
     with pytest.raises(UserError, match="'uint8'; expected one of uint16_mm, float32_m"):
         build(SMALL, ExportConfig(depth_dtype="uint8"))
     with pytest.raises(UserError, match="ddim_steps is 51; expected 1 to 50"):
         build(SMALL, ExportConfig(ddim_steps=51))
     with pytest.raises(UserError, match=r"aux_hidden/bias has shape \(32,\), expected \(24,\)"):
-        build(replace(SMALL, feature_size=24), ExportConfig())
+        build(replace(SMALL, encoder=replace(SMALL.encoder, features=24)), ExportConfig())

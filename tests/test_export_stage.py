@@ -9,30 +9,39 @@ import pytest
 
 from ddgrasp import artifacts
 from ddgrasp import policy_metadata as metadata
-from ddgrasp.config import Config, ExportConfig, StudentConfig, WorldConfig
+from ddgrasp.config import (
+    Config,
+    EncoderConfig,
+    ExportConfig,
+    HeadConfig,
+    PictureConfig,
+    StudentConfig,
+    WorldConfig,
+)
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from demos.stage import STORE
 from demos.store import EpisodeStore
 from export import stage
 from job_support import make_job
+from learning.params import save_params
 from student_jax import policy
 
 CONFIG = Config(
     preset="test",
     world=WorldConfig(camera_scale=0.125),
     student=StudentConfig(
-        input_height_px=56, input_width_px=72, width=8, stage_blocks=(1,), keypoints=4, feature_size=16,
-        state_features=16, denoiser_width=16, denoiser_blocks=1, time_features=8,
-        output_stride=4, ddim_steps=3,
+        picture=PictureConfig(height_px=56, width_px=72),
+        encoder=EncoderConfig(width=8, stage_blocks=(1,), keypoints=4, features=16, output_stride=4),
+        head=HeadConfig(state_features=16, width=16, blocks=1, time_features=8, ddim_steps=3),
     ),
     export=ExportConfig(parity_batches=2, latency_runs=5),
-)  # fmt: skip
+)
 
 
 def finish_student(run_dir, config):
     params = policy.init_params(jax.random.key(0), config.student, config.world.profile)
-    artifacts.save_params(run_dir / "student" / policy.PARAMS_FILE, params)
+    save_params(run_dir / "student" / policy.PARAMS_FILE, params)
     return artifacts.finish(run_dir / "student", "student", config, seconds=0.0, metrics={})
 
 

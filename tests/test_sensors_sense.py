@@ -10,7 +10,16 @@ from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator
 from ddg_jax.sensor import SENSORS, learned, make_sensor
 from ddg_jax.train import init_params
-from ddgrasp.config import DDGConfig, DextrahConfig, KinectConfig, SensorConfig
+from ddgrasp.config import (
+    DDGConfig,
+    DDGDepthConfig,
+    DextrahConfig,
+    GraftConfig,
+    KinectConfig,
+    SamplingConfig,
+    SensorConfig,
+    UNetConfig,
+)
 from ddgrasp.contract import D455
 from ddgrasp.errors import UserError
 from sensors.models import procedural
@@ -34,9 +43,11 @@ def scene() -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def sensors() -> dict[str, Sense]:
     config = DDGConfig(
-        height_px=72, width_px=128, widths=(8, 16), blocks=(0, 1), attention_heads=0, sample_steps=2,
-        noise_threshold=0.0,
-    )  # fmt: skip
+        depth=DDGDepthConfig(height_px=72, width_px=128),
+        unet=UNetConfig(widths=(8, 16), blocks=(0, 1), attention_heads=0),
+        sampling=SamplingConfig(steps=2),
+        graft=GraftConfig(noise_threshold=0.0),
+    )
     # A network at its start predicts zero everywhere; shaken weights give pictures with and without holes.
     leaves, tree = jax.tree.flatten(init_params(config, jax.random.key(0)))
     keys = jax.random.split(jax.random.key(1), len(leaves))

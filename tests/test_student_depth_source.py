@@ -12,12 +12,26 @@ from ddg_jax import generate, sample, train
 from ddg_jax.prior import make_prior
 from ddg_jax.sensor import BY_COLOUR, SENSORS
 from ddgrasp import artifacts, config, contract
-from ddgrasp.config import Config, DDGConfig, DextrahConfig, StudentConfig, WorldConfig
+from ddgrasp.config import (
+    Config,
+    DDGConfig,
+    DDGDepthConfig,
+    DDGDiffusionConfig,
+    DextrahConfig,
+    GraftConfig,
+    PictureConfig,
+    SamplingConfig,
+    StudentConfig,
+    StudentTrainingConfig,
+    UNetConfig,
+    WorldConfig,
+)
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from demos.rollout import Scene
 from demos.store import EpisodeStore
+from learning.params import save_params
 from student_jax import frames_io
 from student_jax.act import SourceCamera
 from student_jax.depth_source import GeneratorSource, SenseSource, make_source
@@ -27,17 +41,24 @@ CONFIG = Config(
     seed=3,
     world=WorldConfig(camera_scale=0.125),
     ddg=DDGConfig(
-        height_px=18, width_px=32, widths=(8, 8), blocks=(0, 1), attention_heads=1, diffusion_steps=50,
-        sample_steps=2, sample_batch=4, noise_threshold=-0.02,
+        depth=DDGDepthConfig(height_px=18, width_px=32),
+        unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
+        diffusion=DDGDiffusionConfig(steps=50),
+        sampling=SamplingConfig(steps=2, batch_size=4),
+        graft=GraftConfig(noise_threshold=-0.02),
     ),
-    student=StudentConfig(clean_share=0.0, demo_held_steps=99),
-)  # fmt: skip
+    student=StudentConfig(
+        picture=PictureConfig(height_px=32, width_px=40),
+        training=StudentTrainingConfig(clean_share=0.0, demo_held_steps=99, crop_shift_px=2),
+    ),
+)
 PROFILE = CONFIG.world.profile
 LENGTHS = (5, 20, 3)
 
 
-def with_source(name: str, **changes) -> Config:
-    return replace(CONFIG, student=replace(CONFIG.student, depth_source=name, **changes))
+def with_source(name: str, clean_share: float = 0.0) -> Config:
+    training = replace(CONFIG.student.training, clean_share=clean_share)
+    return replace(CONFIG, student=replace(CONFIG.student, depth_source=name, training=training))
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +147,7 @@ def test_a_frame_hangs_on_its_own_numbers_alone(demos):
 
 
 def test_learned_is_the_generator_of_the_run_to_the_bit(demos, generator, tmp_path):
-    artifacts.save_params(tmp_path / "ddg" / sample.PARAMS_FILE, generator.params)
+    save_params(tmp_path / "ddg" / sample.PARAMS_FILE, generator.params)
     artifacts.finish(tmp_path / "ddg", "ddg", CONFIG, seconds=1, metrics={})
     source = make_source(CONFIG, tmp_path / "ddg")
     assert isinstance(source, GeneratorSource) and not source.needs_rgb

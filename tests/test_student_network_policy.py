@@ -13,22 +13,22 @@ from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import nominal_camera
-from student_jax import action_diffusion as diffusion
 from student_jax import denoiser, encoder, hand_view, policy, preprocess
 
 PROFILE = contract.D455.scaled(0.25)
 CONFIG = StudentConfig()
 SMALL = replace(
-    CONFIG, width=8, stage_blocks=(1, 1), keypoints=8, feature_size=32, state_features=16,
-    denoiser_width=32, denoiser_blocks=1, time_features=16,
-)  # fmt: skip
+    CONFIG,
+    encoder=replace(CONFIG.encoder, width=8, stage_blocks=(1, 1), keypoints=8, features=32),
+    head=replace(CONFIG.head, state_features=16, width=32, blocks=1, time_features=16),
+)
 
 
 def test_keypoint_on_a_cell_is_that_cell_s_point_in_the_world():
     """A one-hot attention on one cell with known relief must give the surface point seen there."""
     origin = jnp.array([[20, 60]])
     maps = encoder.cell_maps(origin, PROFILE, CONFIG)
-    stride, columns = encoder.map_stride(CONFIG), CONFIG.input_width_px // encoder.map_stride(CONFIG)
+    stride, columns = encoder.map_stride(CONFIG), CONFIG.picture.width_px // encoder.map_stride(CONFIG)
     row, column, relief = 5, 7, 0.8
     logits = np.full((1, maps.shape[1], 1), -1e9, np.float32)
     logits[0, row * columns + column] = 0.0
@@ -71,31 +71,36 @@ def test_group_norm_matches_flax():
     np.testing.assert_allclose(ours, flax_norm.apply(flax_norm.init(jax.random.key(1), x), x), atol=1e-5)
 
 
-def test_space_to_depth_by_hand():
-    x = jnp.arange(2 * 4 * 1).reshape(1, 2, 4, 1)
-    assert np.asarray(encoder.space_to_depth(x, 2))[0, 0].tolist() == [[0, 1, 4, 5], [2, 3, 6, 7]]
-
-
 def test_stages_stop_striding_at_the_output_stride():
-    resnet = replace(CONFIG, width=64, stage_blocks=(2, 2, 2, 2), output_stride=32)
+    resnet = replace(
+        CONFIG,
+        encoder=replace(CONFIG.encoder, width=64, stage_blocks=(2, 2, 2, 2), output_stride=32),
+    )
     assert encoder.stage_plan(resnet) == [(64, 1), (128, 2), (256, 2), (512, 2)]
-    assert encoder.stage_plan(replace(resnet, output_stride=8, max_channels=128)) == [
-        (64, 1), (128, 2), (128, 1), (128, 1),
-    ]  # fmt: skip
-    assert encoder.map_stride(replace(resnet, output_stride=16)) == 16
+    narrow = replace(resnet, encoder=replace(resnet.encoder, output_stride=8, max_channels=128))
+    assert encoder.stage_plan(narrow) == [
+        (64, 1),
+        (128, 2),
+        (128, 1),
+        (128, 1),
+    ]
+    assert encoder.map_stride(replace(resnet, encoder=replace(resnet.encoder, output_stride=16))) == 16
 
 
 def test_resnet18_has_the_published_number_of_parameters():
     """torchvision's resnet18 has 11,176,512 in its convolutions and norms, for 3 input channels."""
     config = replace(
         CONFIG,
-        stem="conv7",
-        width=64,
-        stage_blocks=(2, 2, 2, 2),
-        output_stride=32,
-        pooling="mean",
-        channels=("relief",),
-        hand_view_px=0,
+        encoder=replace(
+            CONFIG.encoder,
+            stem="conv7",
+            width=64,
+            stage_blocks=(2, 2, 2, 2),
+            output_stride=32,
+            pooling="mean",
+        ),
+        picture=replace(CONFIG.picture, channels=("relief",)),
+        hand_view=replace(CONFIG.hand_view, size_px=0),
     )
     shapes = policy.param_shapes(config, PROFILE)["encoder"]
     del shapes["features"]
@@ -105,39 +110,6 @@ def test_resnet18_has_the_published_number_of_parameters():
 def test_state_limits_map_to_minus_one_and_one():
     state = jnp.stack([denoiser.STATE_LOWER, denoiser.STATE_UPPER])
     np.testing.assert_allclose(denoiser.normalise_state(state), [[-1.0] * 8, [1.0] * 8], atol=1e-6)
-
-
-def test_time_embedding_by_value():
-    embedded = denoiser.embed_time(jnp.array([0, 3]), 4)
-    np.testing.assert_allclose(embedded[0], [0, 0, 1, 1], atol=1e-6)
-    np.testing.assert_allclose(embedded[1], [np.sin(3), np.sin(0.03), np.cos(3), np.cos(0.03)], atol=1e-6)
-
-
-def test_schedule_falls_from_almost_one_to_almost_zero():
-    schedule = diffusion.cosine_schedule(50).alpha_bars
-    assert schedule[0] > 0.99 and np.all(np.diff(schedule) < 0)
-    assert np.sqrt(schedule[-1]) == pytest.approx(0.0310, abs=1e-3)
-
-
-@pytest.mark.parametrize("iterations", [1, 3, 10])
-def test_ddim_with_perfect_noise_prediction_returns_the_clean_sample(iterations):
-    schedule = diffusion.cosine_schedule(50)
-    x0 = jax.random.uniform(jax.random.key(0), (5, 4, 8), minval=-1, maxval=1)
-
-    def predict(x, k):
-        a = jnp.asarray(schedule.alpha_bars)[k][:, None, None]
-        return (x - jnp.sqrt(a) * x0) / jnp.sqrt(1 - a)
-
-    noise = jax.random.normal(jax.random.key(1), x0.shape)
-    sampled = diffusion.ddim_sample(predict, noise, schedule, iterations)
-    np.testing.assert_allclose(sampled, x0, atol=1e-4)
-
-
-def test_ddim_step_clips_and_keeps_explaining_x():
-    row = jnp.array([2.0, np.sqrt(3.0), 0.8, 0.6])  # a = 1/4, a' = 0.64
-    x, eps = jnp.array([1.0]), jnp.array([-1.0])  # x0 = 2 + 1.73, clipped to 1
-    # eps' = (2 * 1 - 1) / sqrt(3); x' = 0.8 * 1 + 0.6 * eps'
-    np.testing.assert_allclose(diffusion.ddim_step(x, eps, row), [0.8 + 0.6 / np.sqrt(3.0)], rtol=1e-6)
 
 
 def test_the_condition_is_joints_then_pose_then_offset_from_the_hand():
@@ -159,10 +131,10 @@ def test_the_condition_is_joints_then_pose_then_offset_from_the_hand():
     held = 1 / (1 + np.exp(-2.0))
     expected = np.concatenate([joints, place, [0.6, 0.8, held], [0.0, 2.0, -1.0]])  # units of 5 cm
     np.testing.assert_allclose(condition(SMALL), expected, atol=1e-5)
-    both = condition(replace(SMALL, features_to_head=True))
+    both = condition(replace(SMALL, head=replace(SMALL.head, features_to_head=True)))
     assert both.shape[0] == len(expected) + policy.feature_count(SMALL)
-    with pytest.raises(UserError, match="features_to_head and student.aux_to_head are both off"):
-        condition(replace(SMALL, aux_to_head=False))
+    with pytest.raises(UserError, match="features_to_head and student.head.aux_to_head are both off"):
+        condition(replace(SMALL, head=replace(SMALL.head, aux_to_head=False)))
 
 
 def test_the_hand_view_decides_how_much_the_hand_counts():
@@ -171,7 +143,7 @@ def test_the_hand_view_decides_how_much_the_hand_counts():
     output = {"kernel": jnp.zeros_like(params["aux_output"]["kernel"])}
     state = jnp.asarray([[*scene.HOME_RAD, 0.05]])
     hand, _ = kinematics.grip_pose(np.array(scene.HOME_RAD))
-    picture = jnp.zeros((1, SMALL.input_height_px, SMALL.input_width_px, 6))
+    picture = jnp.zeros((1, SMALL.picture.height_px, SMALL.picture.width_px, 6))
     net = policy.StudentPolicy(SMALL, PROFILE)
 
     def position(gate):
@@ -190,7 +162,7 @@ def test_the_hand_view_decides_how_much_the_hand_counts():
 
 def test_the_hand_view_shows_what_lies_beside_the_hand():
     """A point 3 cm beside the hand, across the camera's axis, is 3 cm / pitch samples from the middle."""
-    config = replace(CONFIG, hand_view_pitch_m=0.005)
+    config = replace(CONFIG, hand_view=replace(CONFIG.hand_view, pitch_m=0.005))
     origin = np.array(PROFILE.crop_origin_px) + [3, -4]
     camera = nominal_camera(PROFILE)
     right, down = camera.T_world_cam[:3, 0], camera.T_world_cam[:3, 1]
@@ -199,19 +171,19 @@ def test_the_hand_view_shows_what_lies_beside_the_hand():
     seen = np.linalg.inv(camera.T_world_cam)[:3] @ [*point, 1.0]
     u = PROFILE.fx_px * seen[0] / seen[2] + PROFILE.cx_px - origin[1]
     v = PROFILE.fy_px * seen[1] / seen[2] + PROFILE.cy_px - origin[0]
-    picture = np.zeros((1, config.input_height_px, config.input_width_px, 6), np.float32)
+    picture = np.zeros((1, config.picture.height_px, config.picture.width_px, 6), np.float32)
     rows, columns = np.mgrid[: picture.shape[1], : picture.shape[2]] + 0.5
     picture[0, :, :, 1::2] = 1.0  # valid everywhere
     picture[0, :, :, 4] = np.exp(-((rows - v) ** 2 + (columns - u) ** 2) / 8)  # relief of the newest frame
     placed = hand_view.place(jnp.asarray(hand)[None], jnp.asarray(origin)[None], PROFILE, config)
     view = np.asarray(hand_view.cut(jnp.asarray(picture), *placed, config))[0, :, :, 4]
-    middle = (config.hand_view_px - 1) / 2
+    middle = (config.hand_view.size_px - 1) / 2
     sample = (np.indices(view.shape) * view).sum((1, 2)) / view.sum() - middle
     np.testing.assert_allclose(sample, [-0.02 / 0.005, 0.03 / 0.005], atol=0.1)
 
 
 def test_the_hand_view_ignores_invalid_pixels_and_what_is_outside():
-    picture = np.full((1, CONFIG.input_height_px, CONFIG.input_width_px, 6), 0.7, np.float32)
+    picture = np.full((1, CONFIG.picture.height_px, CONFIG.picture.width_px, 6), 0.7, np.float32)
     picture[..., 1::2] = 1.0
     picture[:, :, ::2] = 0.0  # every second column has no reading
     centre, per_metre = jnp.array([[56.0, 144.0]]), jnp.array([[300.0, 300.0]])  # at the right edge
@@ -233,16 +205,16 @@ def test_the_chain_of_the_exported_graph_ends_between_the_finger_pads():
 
 def test_unknown_options_name_the_nearest():
     with pytest.raises(UserError, match="Did you mean 'spatial_softmax'"):
-        encoder.check_encoder(replace(CONFIG, pooling="spatial_sofmax"))
+        encoder.check_encoder(replace(CONFIG, encoder=replace(CONFIG.encoder, pooling="spatial_sofmax")))
     with pytest.raises(UserError, match="needs 'relief'"):
-        encoder.check_encoder(replace(CONFIG, channels=("depth", "valid")))
+        encoder.check_encoder(replace(CONFIG, picture=replace(CONFIG.picture, channels=("depth", "valid"))))
     with pytest.raises(UserError, match="ddim_steps is 60; expected 1 to 50"):
-        denoiser.check_denoiser(replace(CONFIG, ddim_steps=60))
+        denoiser.check_denoiser(replace(CONFIG, head=replace(CONFIG.head, ddim_steps=60)))
 
 
 def disc_scene(rng: np.random.Generator, batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Discs of 5 cm above the table at random places, 10 % dropped pixels, random crops."""
-    camera, table = nominal_camera(PROFILE), preprocess.table_depth(PROFILE, CONFIG.max_depth_m)
+    camera, table = nominal_camera(PROFILE), preprocess.table_depth(PROFILE, CONFIG.picture.max_depth_m)
     rows, columns = np.mgrid[: PROFILE.height_px, : PROFILE.width_px] + 0.5
     rays = np.stack([(columns - PROFILE.cx_px) / PROFILE.fx_px, (rows - PROFILE.cy_px) / PROFILE.fy_px], -1)
     rays = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ camera.T_world_cam[:3, :3].T
@@ -259,7 +231,11 @@ def disc_scene(rng: np.random.Generator, batch: int) -> tuple[np.ndarray, np.nda
 def test_the_encoder_learns_where_an_object_is_within_seconds():
     """Chance is 10 cm; 80 steps of 32 pictures must bring unseen ones under 4 cm."""
     rng = np.random.default_rng(0)
-    config = replace(SMALL, width=16, keypoints=16, feature_size=64, hand_view_px=0)
+    config = replace(
+        SMALL,
+        encoder=replace(SMALL.encoder, width=16, keypoints=16, features=64),
+        hand_view=replace(SMALL.hand_view, size_px=0),
+    )
     net = policy.StudentPolicy(config, PROFILE)
     params = policy.init_params(jax.random.key(0), config, PROFILE)
     optimiser = optax.adam(3e-3)

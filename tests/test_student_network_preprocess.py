@@ -15,8 +15,11 @@ from student_jax import preprocess
 
 PROFILE = contract.D455.scaled(0.25)
 CONFIG = StudentConfig()
-RESIZED = replace(CONFIG, input_height_px=56, input_width_px=72)
-TABLE = preprocess.table_depth(PROFILE, CONFIG.max_depth_m)
+RESIZED = replace(
+    CONFIG,
+    picture=replace(CONFIG.picture, height_px=56, width_px=72),
+)
+TABLE = preprocess.table_depth(PROFILE, CONFIG.picture.max_depth_m)
 
 
 def frames_of(depth: np.ndarray) -> np.ndarray:
@@ -105,4 +108,4 @@ def test_wrong_frames_and_channels_are_refused_by_name():
     with pytest.raises(UserError, match=r"\(1, 3, 90, 160\); expected \(B, 3, 180, 320\)"):
         preprocess.prepare_depth(jnp.zeros((1, 3, 90, 160)), None, PROFILE, CONFIG)
     with pytest.raises(UserError, match="Did you mean 'relief'"):
-        preprocess.check_channels(replace(CONFIG, channels=("releif",)))
+        preprocess.check_channels(replace(CONFIG, picture=replace(CONFIG.picture, channels=("releif",))))

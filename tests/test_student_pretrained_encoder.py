@@ -8,13 +8,15 @@ import pytest
 
 import checkpoint_support as files
 import parity_support as parity
-from ddgrasp.config import StudentConfig, WorldConfig
+from ddgrasp.config import EncoderConfig, StudentConfig, WorldConfig
 from ddgrasp.errors import UserError
 from foundation import convert, store
 from student_jax import policy, pretrained_encoder
 
 PROFILE = WorldConfig().profile
-RESNET18 = StudentConfig(stem="conv7", width=64, stage_blocks=(2, 2, 2, 2), output_stride=32)
+RESNET18 = StudentConfig(
+    encoder=EncoderConfig(stem="conv7", width=64, stage_blocks=(2, 2, 2, 2), output_stride=32),
+)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,10 @@ def fresh_encoder(config: StudentConfig) -> dict:
 @pytest.mark.parametrize("norm", ["group", "none"])
 def test_every_convolution_is_taken_over(weights, norm, stride):
     directory, theirs = weights
-    config = replace(RESNET18, encoder_weights=str(directory), norm=norm, output_stride=stride)
+    config = replace(
+        RESNET18,
+        encoder=replace(RESNET18.encoder, weights=str(directory), norm=norm, output_stride=stride),
+    )
     fresh = fresh_encoder(config)
     made, source = pretrained_encoder.load_into(fresh, config), pretrained_encoder.source(config)
     shapes = jax.tree.map(np.shape, fresh)
@@ -62,7 +67,11 @@ def test_every_convolution_is_taken_over(weights, norm, stride):
 
 def test_colours_stand_for_frames(weights):
     directory, theirs = weights
-    config = replace(RESNET18, encoder_weights=str(directory), channels=("valid", "relief"))
+    config = replace(
+        RESNET18,
+        encoder=replace(RESNET18.encoder, weights=str(directory)),
+        picture=replace(RESNET18.picture, channels=("valid", "relief")),
+    )
     kernel = pretrained_encoder.load_into(fresh_encoder(config), config)["stem"]["conv7"]["conv"]["kernel"]
     assert kernel.shape == (7, 7, 6, 64)
     for frame in range(3):
@@ -72,15 +81,24 @@ def test_colours_stand_for_frames(weights):
 
 def test_another_encoder_is_refused_and_none_is_said(weights):
     directory, _ = weights
-    small = StudentConfig(encoder_weights=str(directory))
-    with pytest.raises(UserError, match="student.stem is 'space_to_depth'.*'conv7'"):
+    small = StudentConfig(encoder=EncoderConfig(weights=str(directory)))
+    with pytest.raises(UserError, match="student.encoder.stem is 'space_to_depth'.*'conv7'"):
         pretrained_encoder.load_into({}, small)
     with pytest.raises(UserError, match="depth or relief"):
-        pretrained_encoder.load_into({}, replace(RESNET18, encoder_weights="x", channels=("valid",)))
+        pretrained_encoder.load_into(
+            {},
+            replace(
+                RESNET18,
+                encoder=replace(RESNET18.encoder, weights="x"),
+                picture=replace(RESNET18.picture, channels=("valid",)),
+            ),
+        )
     encoder = {"stem": {}}
     assert pretrained_encoder.load_into(encoder, StudentConfig()) == encoder
     assert pretrained_encoder.source(StudentConfig()) == "built-in"
     with pytest.raises(UserError, match="both say where to start"):
-        pretrained_encoder.source(replace(RESNET18, encoder_weights="x", init_from="y"))
+        pretrained_encoder.source(
+            replace(RESNET18, encoder=replace(RESNET18.encoder, weights="x"), init_from="y")
+        )
     with pytest.raises(UserError, match="weights convert"):
-        pretrained_encoder.source(replace(RESNET18, encoder_weights="nowhere"))
+        pretrained_encoder.source(replace(RESNET18, encoder=replace(RESNET18.encoder, weights="nowhere")))

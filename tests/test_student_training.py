@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ddgrasp import contract
-from ddgrasp.config import StudentConfig
+from ddgrasp.config import EncoderConfig, HandViewConfig, HeadConfig, StudentConfig, StudentTrainingConfig
 from ddgrasp.errors import UserError
 from student_jax import train
 from student_jax.augment import disparity_noise
@@ -19,10 +19,11 @@ from student_jax.privileged import noisy_seen
 
 PROFILE = contract.D455.scaled(0.25)
 CONFIG = StudentConfig(
-    width=8, keypoints=4, stage_blocks=(1, 1), feature_size=16, denoiser_width=16, denoiser_blocks=1,
-    state_features=8, chunk=2, execute_steps=1, batch_size=2, noise_draws=2,
-    hand_view_px=8, hand_view_width=8, hand_view_blocks=1, hand_view_channels=2, hand_view_features=8,
-)  # fmt: skip
+    encoder=EncoderConfig(width=8, keypoints=4, stage_blocks=(1, 1), features=16),
+    head=HeadConfig(width=16, blocks=1, state_features=8, chunk=2, execute_steps=1),
+    training=StudentTrainingConfig(batch_size=2, noise_draws=2),
+    hand_view=HandViewConfig(size_px=8, width=8, blocks=1, channels=2, features=8),
+)
 
 
 def frames_of(lengths=(3, 2)):
@@ -103,7 +104,10 @@ def test_auxiliary_losses_by_hand():
 
 @pytest.mark.parametrize("action_weight", [0.0, 1.0])
 def test_a_training_step_is_pure_and_learns(action_weight):
-    config = dataclasses.replace(CONFIG, action_weight=action_weight, learning_rate=5e-3)
+    config = dataclasses.replace(
+        CONFIG,
+        training=dataclasses.replace(CONFIG.training, action_weight=action_weight, learning_rate=5e-3),
+    )
     frames = frames_of((6, 6))
     rng = np.random.default_rng(0)
     batch = train.make_batch(frames, np.arange(8), rng, config, PROFILE)
@@ -136,7 +140,7 @@ def test_the_head_learns_actions_from_poses():
         observation[:, 18:21] = observation[:, 25:28]  # hand at the object: errors are small
         observation[:, 36] = 1.0
         seen = noisy_seen(observation, np.zeros(count, bool), np.zeros((count, 5)), rng, CONFIG)
-        label = np.zeros((count, CONFIG.chunk, 8), np.float32)
+        label = np.zeros((count, CONFIG.head.chunk, 8), np.float32)
         label[:, :, 0] = observation[:, 26:27] * 5
         return seen, np.zeros((count, 8), np.float32), label
 
@@ -157,12 +161,14 @@ def test_pose_errors_shrink_near_the_object():
 
 
 def test_executing_more_than_a_chunk_is_refused():
-    with pytest.raises(UserError, match=r"execute_steps is 3: expected 1 to student.chunk = 2"):
-        check_chunk(dataclasses.replace(CONFIG, execute_steps=3))
+    with pytest.raises(UserError, match=r"execute_steps is 3: expected 1 to student.head.chunk = 2"):
+        check_chunk(dataclasses.replace(CONFIG, head=dataclasses.replace(CONFIG.head, execute_steps=3)))
 
 
 def test_disparity_noise_grows_with_the_square_of_depth_and_keeps_holes():
-    config = dataclasses.replace(CONFIG, disparity_noise_px=0.2)
+    config = dataclasses.replace(
+        CONFIG, training=dataclasses.replace(CONFIG.training, disparity_noise_px=0.2)
+    )
     depth = np.zeros((40, 3, 40, 60), np.float32)
     depth[:, :, :20, :30], depth[:, :, 20:, :30] = 0.5, 1.0  # the right half is invalid
     noisy = np.asarray(disparity_noise(jax.random.key(0), jnp.asarray(depth), PROFILE, config))

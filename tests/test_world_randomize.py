@@ -1,6 +1,8 @@
 """Each range of RandomConfig moves what it names, over its whole width, and nothing else."""
 
 from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jp
@@ -35,7 +37,7 @@ MOVES = {
     "camera_angle_rad": {"camera_angle": (-0.015, 0.015)},
 }
 """Field -> what it moves at its default, with the bounds (relative to nominal, or absolute where nominal is
-0). Nothing reads crop_px: the student's training shifts the window (student.crop_shift_px)."""
+0)."""
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,8 @@ def sampler(table):
 
     @jax.jit
     def draw_all(ranges, keys):
-        config = RandomConfig(**dict(zip(names, ranges, strict=True)))  # traced: one program for all ranges
+        # traced numbers, one program for all ranges: no RandomConfig, which checks its values
+        config: Any = SimpleNamespace(**dict(zip(names, ranges, strict=True)))
 
         def one(key):
             k_params, k_qpos, k_start, k_camera = jax.random.split(key, 4)
@@ -89,7 +92,6 @@ def sampler(table):
 def test_every_range_is_listed():
     assert {field.name for field in fields(RandomConfig)} == {
         *MOVES,
-        "crop_px",
         "latency_share",
         "other_pose_share",
     }

@@ -5,6 +5,7 @@ Stages are imported inside `run`, so that `--help` starts without JAX.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from app.commands.checks import check_config_values, check_devices
 from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
+from app.commands.parsing import parsed
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
@@ -27,6 +29,7 @@ class Run(FromPreset):
     """The whole flow: teacher, demos, record, ddg, student, export, deploy, report."""
 
     def run(self) -> None:
+        """Makes every stage that is not finished and prints the table."""
         from evaluation.report.summary import print_summary
 
         check_config_values(self.config)
@@ -68,7 +71,8 @@ COMMANDS: dict[str, type] = {
 
 
 def parse(name: str, args: Sequence[str]) -> Command:
-    """The command `name` with its options; prints help or usage and raises SystemExit as tyro does."""
+    """The command `name` with its options; --help prints and raises SystemExit(0), options that are
+    wrong raise UserError."""
     cls = COMMANDS[name]
     options: dict[str, Any] = {}
     if issubclass(cls, FromPreset):
@@ -83,13 +87,11 @@ def parse(name: str, args: Sequence[str]) -> Command:
         options["default"] = Deploy(config=config_of(policy, _option(args, "--preset")), policy=policy)
     elif cls is TeacherEval:
         options["default"] = with_world_of(Path(args[0]) if args and args[0][0] != "-" else None)
-    return tyro.cli(
-        cls,
-        prog=f"ddgrasp {name}",
-        args=list(args),
-        config=(tyro.conf.FlagCreatePairsOff,),
-        **options,
+    program = f"ddgrasp {name}"
+    read = partial(
+        tyro.cli, cls, prog=program, args=list(args), config=(tyro.conf.FlagCreatePairsOff,), **options
     )
+    return parsed(read, program)
 
 
 def describe_commands(group: str = "") -> str:

@@ -25,6 +25,8 @@ class Command(Protocol):
 
 @dataclass(frozen=True)
 class FromPreset:
+    """A command whose options are those of a preset, each of which can be given on its own."""
+
     config: Annotated[Config, tyro.conf.arg(name="")]
     """Values of the preset; any of them can be given on its own, for example --seed 1."""
     out: Path
@@ -34,9 +36,12 @@ class FromPreset:
 
 
 class OneStage(FromPreset):
+    """A command that makes one stage of a run."""
+
     stage: str
 
     def run(self) -> None:
+        """Makes the stage from its finished parents in the run."""
         pipeline.make(get_stage(self.stage), check_config_values(self.config), self.out, resume=self.resume)
 
 

@@ -21,11 +21,11 @@ def check_config_values(config: Config) -> Config:
     check_objects(config.world)
     for stage, file in CHECKPOINTS.items():
         _check_start(stage, getattr(config, stage).init_from, file)
-    if config.ddg.prior_in_sim not in IN_SIMULATION:
-        raise unknown_name("ddg.prior_in_sim", config.ddg.prior_in_sim, IN_SIMULATION)
+    if config.ddg.prior.in_sim not in IN_SIMULATION:
+        raise unknown_name("ddg.prior.in_sim", config.ddg.prior.in_sim, IN_SIMULATION)
     check_source(config, make_prior(config.ddg))
     check_depth_dtype(config.export.depth_dtype)
-    if config.student.encoder_weights:
+    if config.student.encoder.weights:
         from student_jax import pretrained_encoder
 
         pretrained_encoder.source(config.student)
@@ -64,5 +64,6 @@ def _check_start(stage: str, init_from: str, file: str) -> None:
 
 
 def check_count(option: str, value: int) -> None:
+    """UserError unless `value` is at least 1."""
     if value < 1:
         raise UserError(f"{option} is {value}; expected at least 1.")

@@ -20,6 +20,7 @@ class DDGFit(OneStage):
     stage = "ddg"
 
     def run(self) -> None:
+        """Fits on the run's recordings, or on those in `data`."""
         if self.data is None:
             super().run()
             return
@@ -40,9 +41,10 @@ class DDGSample:
     count: int = 4
     """Frames to draw."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of the noise."""
 
     def run(self) -> None:
+        """Writes samples.png and prints where it is."""
         from ddg_jax.stage import sample_folder
         from ddgrasp.progress import Progress
 
@@ -68,19 +70,20 @@ class DDGDistil:
     evaluations: int = 4
     """Network evaluations per map; those passed on the way (4 and 2 before 1) are kept too."""
     steps: int | None = None
-    """Optimiser steps per halving; none takes the model's ddg.distil_steps."""
+    """Optimiser steps per halving; none takes the model's ddg.training.distil_steps."""
     resume: bool = False
     """Continue what is there."""
 
     def run(self) -> None:
+        """Distils, with checkpoints, and leaves a stage `ddg` that samples in few evaluations."""
         fitted = artifacts.read_artifact(self.model)
         config = artifacts.config_from_json(fitted.manifest.config)
+        training = config.ddg.training
         ddg = replace(
             config.ddg,
             init_from=str(self.model.resolve()),
-            sampler="progressive",
-            sample_steps=self.evaluations,
-            distil_steps=config.ddg.distil_steps if self.steps is None else self.steps,
+            sampling=replace(config.ddg.sampling, sampler="progressive", steps=self.evaluations),
+            training=training if self.steps is None else replace(training, distil_steps=self.steps),
         )
         config = replace(config, ddg=ddg)
         inputs = {"data": self.data, "model": fitted.hash}
@@ -98,11 +101,12 @@ class DDGGenerate:
     out: Path
     """Directory of a run; the depth goes to its folder noisy."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of the noise."""
     resume: bool = False
     """Continue what is there."""
 
     def run(self) -> None:
+        """Writes depth.zarr episode by episode and prints how much of it is invalid."""
         parents = {"ddg": artifacts.read_artifact(self.model), "demos": artifacts.read_artifact(self.demos)}
         config = artifacts.config_from_json(parents["ddg"].manifest.config)
         config = replace(config, seed=self.seed)
@@ -128,9 +132,10 @@ class DDGThresholds:
     count: int = 180
     """Frames."""
     seed: int = 1
-    """Of the noise."""
+    """Seed of the noise."""
 
     def run(self) -> None:
+        """Prints the table and writes thresholds.json and thresholds.png."""
         from ddg_jax import thresholds
         from ddgrasp.progress import Progress
 

@@ -46,6 +46,7 @@ class RecordImport:
     """The pictures follow each other in time (a RealSense file's do)."""
 
     def run(self) -> None:
+        """Imports every source that can be used and says what was left out."""
         from sensors.recordings import importers
 
         if not 0 <= self.depth_unit_m <= 1:
@@ -65,7 +66,7 @@ class RecordRealsense:
     out: Path = Path("recordings")
     """The recording becomes a folder in it."""
     name: str = "take"
-    """Of that folder; one that exists is never overwritten."""
+    """Name of that folder; one that exists is never overwritten."""
     seconds: float = 10.0
     """Length, after the half second in which the exposure settles. Ctrl-C ends it earlier and keeps it."""
     frames: int = 0
@@ -73,13 +74,14 @@ class RecordRealsense:
     hz: int = 10
     """Frames kept per second: 1, 2, 3, 5, 6, 10, 15 or 30; the camera itself always runs at 30."""
     width: int = 1280
-    """Of depth and colour in pixels."""
+    """Columns of depth and colour, in pixels."""
     height: int = 720
-    """Of depth and colour in pixels."""
+    """Rows of depth and colour, in pixels."""
     serial: str = ""
     """Serial number of the camera; empty takes the first."""
 
     def run(self) -> None:
+        """Records, and says what was kept; UserError if the camera stopped by itself."""
         from ddgrasp.progress import Progress
         from sensors.recordings import realsense_live as live
 
@@ -111,9 +113,10 @@ class SensorsCompare:
     frames: int = 6
     """Frames per scene."""
     seed: int = 0
-    """Of the scenes."""
+    """Seed of the scenes."""
 
     def run(self) -> None:
+        """Prints both cameras' figures side by side and writes sensors.json and sensors.png."""
         from ddgrasp.progress import Progress
         from evaluation import camera_comparison as compare
 

@@ -20,6 +20,7 @@ class WeightsConvert:
     """Range of a metric depth model in metres (20 indoor, 80 outdoor); 0 for the relative ones."""
 
     def run(self) -> None:
+        """Converts one file and prints what it is."""
         from foundation import store
 
         directory = store.convert_file(self.file, self.out, self.max_depth_m)
@@ -37,6 +38,7 @@ class WeightsList:
     """Folder of converted weights."""
 
     def run(self) -> None:
+        """Prints an entry per network."""
         from foundation import catalog, store
 
         there = store.installed(self.out)
@@ -60,6 +62,7 @@ class Report:
     """Directory of the run."""
 
     def run(self) -> None:
+        """Writes both reports and prints the table."""
         from evaluation.report.stage import write_report
         from evaluation.report.summary import print_summary
 
@@ -73,6 +76,7 @@ class ObjectsList:
     """Name the objects: category, size, mass, friction, where the numbers come from."""
 
     def run(self) -> None:
+        """Prints a line per object."""
         from mjx_envs.objects import OBJECTS
 
         for spec in OBJECTS.values():
@@ -91,6 +95,7 @@ class ObjectsSheet:
     """The picture's file."""
 
     def run(self) -> None:
+        """Writes the picture and prints where it is."""
         from evaluation.object_sheet import draw
         from mjx_envs.objects import OBJECTS
 

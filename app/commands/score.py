@@ -19,6 +19,8 @@ from ddgrasp.stages import get_stage
 
 @dataclass(frozen=True)
 class Scoring:
+    """A command that scores generated depth: options of the preset's `score` section, without prefix."""
+
     score: Annotated[ScoreConfig, tyro.conf.arg(name="")]
     """How to score; the rest of the configuration is the run's own."""
     preset: str
@@ -28,7 +30,7 @@ class Scoring:
     run_dir: Path | None = None
     """Run whose teacher and generator to use; none takes --out."""
     seed: int = 0
-    """Of trajectories, noise and resampling."""
+    """Seed of trajectories, noise and resampling."""
     resume: bool = False
     """Continue what is there."""
 
@@ -58,6 +60,7 @@ class DDGScore(Scoring):
     """Frames that --real is scored on, the last ones."""
 
     def run(self) -> None:
+        """Scores the run's generator on the rig, or one fitted on a real camera."""
         if self.real is None:
             self._refuse_options_of_real()
             self._make("score")
@@ -93,6 +96,7 @@ class DDGCurve(Scoring):
     """Fit and score the generator on 5, 10, 20, ... recorded trajectories: the data-efficiency curve."""
 
     def run(self) -> None:
+        """Fits and scores each point that is not there yet."""
         self._make("curve")
 
 
@@ -101,6 +105,7 @@ class DDGSamplers(Scoring):
     """Score every sampler of the generator: what fewer network evaluations cost, and frames per second."""
 
     def run(self) -> None:
+        """Scores each sampler on the same trajectories."""
         self._make("samplers")
 
 
@@ -113,6 +118,7 @@ class DDGFeatures:
     """Folder of the extractor; the same command continues what was begun there."""
 
     def run(self) -> None:
+        """Trains, or goes on, and prints what the test said."""
         from foundation.depth_feature_training import train
 
         manifest = train(self.config, self.out)

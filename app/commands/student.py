@@ -29,11 +29,13 @@ class StudentEval:
     trials: int = 200
     """Episodes per kind of depth."""
     seed: int = 1
-    """Of the episodes."""
+    """Seed of the episodes."""
 
     def run(self) -> None:
+        """Prints success on clean and on generated depth, with Wilson intervals."""
         from ddgrasp.progress import Progress
         from evaluation import wilson
+        from learning.params import load_params
         from ppo.policy import load_policy
         from student_jax.depth_source import make_source
         from student_jax.evaluate import closed_loop
@@ -43,7 +45,7 @@ class StudentEval:
         config = load_config(self.run_dir, "student")
         evaluation = replace(config.evaluation, student_trials=self.trials)
         config = replace(config, seed=self.seed, evaluation=evaluation)
-        params = artifacts.load_params(self.run_dir / "student" / PARAMS_FILE)
+        params = load_params(self.run_dir / "student" / PARAMS_FILE)
         source = make_source(config, self.run_dir / "ddg")
         teacher = load_policy(self.run_dir / "teacher")
         result = closed_loop(config, teacher, source, params, Progress(name="student eval"))
@@ -79,6 +81,7 @@ class Deploy:
     """How long to run; inf runs until Ctrl-C."""
 
     def run(self) -> None:
+        """Runs the loop until the time is over or Ctrl-C, and prints how it kept time."""
         from deploy.session import SessionOptions, deploy, describe
 
         options = SessionOptions(self.robot, self.camera, self.recording, self.object_name, self.seconds)

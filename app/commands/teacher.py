@@ -24,6 +24,7 @@ class TeacherTrain(OneStage):
     stage = "teacher"
 
     def run(self) -> None:
+        """Trains with every process that --hosts names."""
         from ppo import hosts
 
         hosts.connect(self.hosts)
@@ -46,11 +47,12 @@ class TeacherEval:
     watched: int = 8
     """How many of them are drawn, to count the object's visible pixels."""
     seed: int = 0
-    """Of the episodes."""
+    """Seed of the episodes."""
     out: Path | None = None
     """Where trials.json and pictures/episodes.png go; by default beside the teacher, for the report."""
 
     def run(self) -> None:
+        """Runs the trials, prints a row per object, keeps figures and pictures."""
         from ddgrasp.progress import Progress
         from evaluation import teacher_trials
         from mjx_envs.grasp_env import GraspEnv
@@ -83,9 +85,10 @@ class TeacherCompare:
     trials: int | None = None
     """Episodes per backend; by default 1000, on jax 200 (without a GPU it compiles for minutes)."""
     seed: int = 0
-    """Of the episodes."""
+    """Seed of the episodes."""
 
     def run(self) -> None:
+        """Prints success per backend and keeps it beside the teacher."""
         if self.trials is not None:
             check_count("--trials", self.trials)
         from evaluation import backends as measured

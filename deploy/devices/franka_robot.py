@@ -25,12 +25,12 @@ WIDTH_PERIOD_S = 0.03
 
 def make(setup: Setup) -> "FrankaRobot":
     """The configured arm, not connected yet."""
-    config = setup.config.deploy
+    config = setup.config.deploy.franka
     return FrankaRobot(
-        config.franka_host,
+        config.host,
         setup.clock,
-        dynamics=config.franka_dynamics,
-        grip_force_n=config.franka_grip_force_n,
+        dynamics=config.dynamics,
+        grip_force_n=config.grip_force_n,
     )
 
 
@@ -51,7 +51,7 @@ class FrankaRobot:
         `realtime` insists on a real-time kernel, as a real arm needs; a simulated one does not.
         """
         if not 0.0 < dynamics <= 1.0:
-            raise UserError(f"deploy.franka_dynamics is {dynamics}; expected above 0 and at most 1.")
+            raise UserError(f"deploy.franka.dynamics is {dynamics}; expected above 0 and at most 1.")
         self._host, self._clock = host, clock
         self._dynamics, self._grip_force_n, self._realtime = dynamics, grip_force_n, realtime
         self._arm: Any = None
@@ -69,7 +69,7 @@ class FrankaRobot:
         except franky.Exception as error:
             raise UserError(
                 f"no Franka at {self._host!r} ({error}): unlock the joints, activate FCI in Desk and check "
-                "deploy.franka_host."
+                "deploy.franka.host."
             ) from error
         self._arm = arm
 

@@ -29,7 +29,7 @@ def make(setup: Setup, robot: Robot) -> "RealSenseCamera":
             "with export.depth_dtype uint16_mm."
         )
     profile = contract.D455.scaled(info.depth_width / contract.D455.width_px)
-    return RealSenseCamera(setup.clock, profile, serial=setup.config.deploy.realsense_serial)
+    return RealSenseCamera(setup.clock, profile, serial=setup.config.deploy.realsense.serial)
 
 
 class RealSenseCamera:

@@ -34,7 +34,7 @@ JSON = "curve.json"
 POINT = "point.json"
 COLUMNS = ("sim_gt", "ddg_no_graft", "ddg")
 EVALUATIONS = 8
-"""Of the second-order sampler: what is compared is the fit, so no point is distilled."""
+"""Evaluations of the second-order sampler: what is compared is the fit, so no point is distilled."""
 
 
 def run(job: Job) -> Artifact:
@@ -100,7 +100,7 @@ def _point(
     table = score_table.make_table(samples, config.score, config.seed)
     for figures in table.values():
         figures.pop("resampled_fid", None)
-    point = {"trajectories": size, "frames": len(chosen), "steps": generator.config.train_steps, **table}
+    point = {"trajectories": size, "frames": len(chosen), "steps": generator.config.training.steps, **table}
     artifacts.atomic_write_json(folder / POINT, point)
     return artifacts.to_json(point)
 
@@ -111,9 +111,12 @@ def _fitted(config: Config, frames: "Frames", folder: Path, progress: Progress) 
     from ddg_jax.sample import DPM_SOLVER
     from ddg_jax.stage import fitted_generator
 
-    steps = config.score.curve_steps or config.ddg.train_steps
+    steps = config.score.curve_steps or config.ddg.training.steps
     settings = replace(
-        config.ddg, train_steps=steps, init_from="", sampler=DPM_SOLVER, sample_steps=EVALUATIONS
+        config.ddg,
+        training=replace(config.ddg.training, steps=steps),
+        init_from="",
+        sampling=replace(config.ddg.sampling, sampler=DPM_SOLVER, steps=EVALUATIONS),
     )
     return fitted_generator(settings, make_prior(settings), frames, folder, config.seed, progress)
 

@@ -46,9 +46,12 @@ class Methods:
 
         settings = replace(
             self.generator.config,
-            prior=self.config.monocular,
-            prior_weights=self.config.monocular_weights,
-            prior_in_sim="rgb",
+            prior=replace(
+                self.generator.config.prior,
+                source=self.config.monocular,
+                weights=self.config.monocular_weights,
+                in_sim="rgb",
+            ),
         )
         if not self.config.monocular_weights and not weights_folder(settings).exists():
             return None
@@ -132,7 +135,7 @@ def _monocular(name: str) -> Callable[[Methods, Episode], dict[str, np.ndarray]]
         assert methods.monocular is not None and episode.rgb is not None
         reference = metres(episode.sensed_mm if episode.side == REAL else episode.clean_mm)
         relative = methods.monocular.from_recording(reference, episode.rgb, np.random.default_rng(0))
-        far_m = methods.generator.config.far_m
+        far_m = methods.generator.config.depth.far_m
         fitted = [metric_depth(r, d, far_m) for r, d in zip(relative, reference, strict=True)]
         return {name: millimetres(np.stack(fitted))}
 

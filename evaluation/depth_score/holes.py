@@ -68,9 +68,9 @@ def incidence_deg(clean_m: np.ndarray, focal_px: float) -> np.ndarray:
 
 
 def episode_sums(depth_m: np.ndarray, clean_m: np.ndarray, places: Sequence[Mapping[str, Any]]) -> Sums:
-    """Of maps (T, H, W) in time order over the clean geometry they show; places: `geometry` of each frame.
+    """Hole sums of maps (T, H, W) in time order over the clean geometry they show.
 
-    Counts are taken where the clean geometry has a surface.
+    `places` is the `geometry` of each frame. Counts are taken where the clean geometry has a surface.
     """
     holes, surface = depth_m <= 0, clean_m > 0
     both = ~holes & surface
@@ -93,7 +93,7 @@ def episode_sums(depth_m: np.ndarray, clean_m: np.ndarray, places: Sequence[Mapp
 
 
 def repeat_sums(depth_m: np.ndarray) -> Sums:
-    """Of one motionless scene sensed again and again, (K, H, W)."""
+    """Hole sums of one motionless scene sensed again and again, (K, H, W) metres."""
     holes = depth_m <= 0
     overlaps = [
         (a & b).sum() / union

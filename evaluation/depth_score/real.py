@@ -27,8 +27,8 @@ SETTING = (
 
 def real_config(config: Config, root: Path) -> Config:
     """`config` with the generator's rows those of the recordings below `root`: nothing is cropped."""
-    rows, _ = score_data.real_size(root, config.ddg.width_px)
-    return replace(config, ddg=replace(config.ddg, height_px=rows))
+    rows, _ = score_data.real_size(root, config.ddg.depth.width_px)
+    return replace(config, ddg=replace(config.ddg, depth=replace(config.ddg.depth, height_px=rows)))
 
 
 def run(job: Job) -> Artifact:
@@ -42,7 +42,7 @@ def run(job: Job) -> Artifact:
     least = 4 * score_data.BLOCK_FRAMES
     if score_frames < least:
         raise UserError(f"--score-frames is {score_frames}; expected {least} or more: two blocks per side.")
-    frames = score_data.load_real(root, config.ddg.width_px, score_frames)
+    frames = score_data.load_real(root, config.ddg.depth.width_px, score_frames)
     if fit_frames < 2 or fit_frames + score_frames > frames.total:
         raise UserError(
             f"--fit-frames {fit_frames} and --score-frames {score_frames} of {frames.total} frame(s): "

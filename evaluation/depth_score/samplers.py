@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 JSON = "samplers.json"
 REFERENCE = ("ddim", 50)
 PLAIN = (REFERENCE, ("ddim", 10), ("ddim", 4), ("dpm_solver", 8), ("dpm_solver", 4))
-"""DDIM with the generator's own `ddg.eta`."""
+"""DDIM with the generator's own `ddg.sampling.eta`."""
 TARGET = 1.1
 """FID of a sampler of at most 4 evaluations over that of REFERENCE."""
 TIMED_FRAMES = 64
@@ -90,7 +90,7 @@ def _row(figures: dict[str, Any], scored: Scored, domain: str) -> dict[str, Any]
 
 
 def _frames_per_s(generator: "Generator", loads: Sequence[Load]) -> float:
-    """Of `ddg_jax.sample.generate` on TIMED_FRAMES frames, compiled before."""
+    """Speed of `ddg_jax.sample.generate` on TIMED_FRAMES frames, compiled before."""
     import jax
 
     from ddg_jax.sample import generate

@@ -17,7 +17,7 @@ DEPTH_COLORS = "viridis_r"
 INVALID_RGB = (1.0, 0.0, 1.0)
 """Magenta: no depth is drawn in it."""
 MAX_FRAMES = 8
-"""Of a film strip."""
+"""Most frames in one film strip."""
 
 
 def depth_to_metres(depth: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ RENDERERS = ("jax", "warp")
 
 
 class Pictures(NamedTuple):
-    """Of B scenes; NumPy or JAX arrays."""
+    """What a camera sees of B scenes; NumPy or JAX arrays."""
 
     depth_m: Any
     """(B, H, W) float32 planar depth, metres; 0 where nothing is hit within the far limit."""

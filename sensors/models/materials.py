@@ -44,7 +44,7 @@ class ObjectMaterial:
     surface: Material
     source: str
     parts: Mapping[str, Material] = field(default_factory=dict)
-    """Of single slots, by geom name (`SlotLayout.names`), where they differ."""
+    """Materials of single slots, by geom name (`SlotLayout.names`), where they differ."""
 
 
 _ESTIMATE = "our estimate"

@@ -34,9 +34,9 @@ class LiveOptions:
     """Frames kept per second, a divisor of STREAM_HZ."""
     width_px: int = 1280
     height_px: int = 720
-    """Of depth and of colour."""
+    """Size of the depth and of the colour stream."""
     serial: str = ""
-    """Of the camera; empty takes the first."""
+    """Serial number of the camera; empty takes the first."""
 
     def __post_init__(self):
         if self.frames < 1:

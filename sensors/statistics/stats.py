@@ -35,6 +35,7 @@ class DepthStatistics:
     temporal_range_mm: float = 750.0
 
     def as_dict(self) -> dict[str, float]:
+        """Name -> value, for manifests."""
         return asdict(self)
 
 

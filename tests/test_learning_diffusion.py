@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ddgrasp.config import HeadConfig, StudentConfig
 from ddgrasp.errors import UserError
 from learning import diffusion as s
+from student_jax.policy import noise_schedule
 
 PARITY = Path(
     os.environ.get("PARITY_DIR") or Path(__file__).resolve().parents[1].parent / "shared/parity/public"
@@ -54,7 +56,8 @@ def test_samplers_match_the_reference(reference):
         with jax.enable_x64(True):
             x = jnp.asarray(values[f"case{i}/xT"])
             for k, previous in zip(visited, s.previous_steps(visited), strict=True):
-                x = s.ddim_step(made, x, k, previous, stub_model(x, k), clip, case["eta"])
+                step = s.ddim_coefficients(made, k, previous, x, case["eta"])
+                x = s.ddim_step(step, x, stub_model(x, k), clip)
             np.testing.assert_allclose(x, values[f"case{i}/ddim_out"], rtol=0, atol=2e-5)
             compared += 1
             if f"case{i}/ddpm_out" in values:
@@ -77,7 +80,9 @@ def test_two_step_schedule_by_hand():
     want = np.sqrt(0.5) * 0.5 * (1 + x_1[0, 0]) / 0.75
     np.testing.assert_allclose(s.posterior_mean(made, x_1, x_0, 1, 0)[0, 0], want, rtol=1e-6)
     np.testing.assert_allclose(s.posterior_variance(made, 1, 0, x_1)[0], 0.5 / 0.75 * 0.5, rtol=1e-6)
-    np.testing.assert_allclose(s.ddim_step(made, x_1, 1, -1, eps, None), x_0, rtol=1e-6)
+    np.testing.assert_allclose(
+        s.ddim_step(s.ddim_coefficients(made, 1, -1, x_1), x_1, eps, None), x_0, rtol=1e-6
+    )
 
 
 def test_ddim_with_eta_one_equals_ddpm():
@@ -85,7 +90,7 @@ def test_ddim_with_eta_one_equals_ddpm():
     x = jax.random.normal(jax.random.key(0), (3, 4))
     eps, noise = jax.random.normal(jax.random.key(1), (2, 3, 4))
     for k, previous in ((40, 30), (10, 9), (9, -1)):
-        ddim = s.ddim_step(made, x, k, previous, eps, None, eta=1.0, noise=noise)
+        ddim = s.ddim_step(s.ddim_coefficients(made, k, previous, x, eta=1.0), x, eps, None, noise=noise)
         np.testing.assert_allclose(ddim, s.ddpm_step(made, x, k, previous, eps, noise, None), atol=2e-5)
 
 
@@ -95,7 +100,8 @@ def test_stochastic_ddim_from_pure_noise_stays_finite():
     for count in (2, 3, 7):
         visited = s.timesteps(made.steps, count, "trailing")
         for k, previous in zip(visited, s.previous_steps(visited), strict=True):
-            assert np.isfinite(s.ddim_step(made, x, k, previous, x, 1.0, eta=1.0, noise=x)).all(), (count, k)
+            step = s.ddim_coefficients(made, k, previous, x, eta=1.0)
+            assert np.isfinite(s.ddim_step(step, x, x, 1.0, noise=x)).all(), (count, k)
 
 
 def test_shift_moves_log_snr_by_the_amount():
@@ -135,10 +141,82 @@ def test_dpm_solver_is_of_second_order_on_a_gaussian():
             if second_order:
                 x = s.dpm_solver_step(made, x, k, previous, x_0, before, x_0_before)
             else:
-                x = s.ddim_step(made, x, k, previous, s.eps_from_x_0(made, x, k, x_0), None)
+                step = s.ddim_coefficients(made, k, previous, x)
+                x = s.ddim_step(step, x, s.eps_from_x_0(made, x, k, x_0), None)
             before, x_0_before = k, x_0
         return abs(float(x[0, 0]) - 1.3 * spread)
 
     assert error(1, True) == pytest.approx(error(1, False), abs=1e-5)
     for count in (8, 16, 32):
         assert error(count, True) < 0.4 * error(count, False), count
+
+
+# --- the action head's schedule and sampler --------------------------------------------------------
+
+
+def test_schedule_falls_from_almost_one_to_almost_zero():
+    schedule = noise_schedule(StudentConfig(head=HeadConfig(diffusion_steps=50))).alpha_bars
+    assert schedule[0] > 0.99 and np.all(np.diff(schedule) < 0)
+    assert np.sqrt(schedule[-1]) == pytest.approx(0.0310, abs=1e-3)
+
+
+@pytest.mark.parametrize("iterations", [1, 3, 10])
+def test_ddim_with_perfect_noise_prediction_returns_the_clean_sample(iterations):
+    schedule = noise_schedule(StudentConfig(head=HeadConfig(diffusion_steps=50)))
+    x0 = jax.random.uniform(jax.random.key(0), (5, 4, 8), minval=-1, maxval=1)
+
+    def predict(x, k):
+        a = jnp.asarray(schedule.alpha_bars)[k][:, None, None]
+        return (x - jnp.sqrt(a) * x0) / jnp.sqrt(1 - a)
+
+    noise = jax.random.normal(jax.random.key(1), x0.shape)
+    sampled = s.ddim_sample(predict, noise, schedule, iterations)
+    np.testing.assert_allclose(sampled, x0, atol=1e-4)
+
+
+def test_ddim_step_clips_and_keeps_explaining_x():
+    step = s.DDIMCoefficients(2.0, np.sqrt(3.0), 0.8, 0.6)  # a = 1/4, a' = 0.64
+    x, eps = jnp.array([1.0]), jnp.array([-1.0])  # x0 = 2 + 1.73, clipped to 1
+    # eps' = (2 * 1 - 1) / sqrt(3); x' = 0.8 * 1 + 0.6 * eps'
+    made = s.ddim_step(step, x, eps, 1.0, after_clip=s.CONSISTENT)
+    np.testing.assert_allclose(made, [0.8 + 0.6 / np.sqrt(3.0)], rtol=1e-6)
+
+
+def test_ddim_step_may_keep_the_predicted_eps_after_clipping():
+    """The same step as above: x0 is clipped to 1, the direction stays the predicted -1."""
+    x, eps = jnp.array([1.0]), jnp.array([-1.0])
+    step = s.DDIMCoefficients(2.0, np.sqrt(3.0), 0.8, 0.6)
+    np.testing.assert_allclose(s.ddim_step(step, x, eps, 1.0), [0.8 - 0.6], rtol=1e-6)
+    # Unclipped the two agree: x0 = 2 + 1.73.
+    for after_clip in (s.PREDICTED, s.CONSISTENT):
+        made = s.ddim_step(step, x, eps, None, after_clip=after_clip)
+        np.testing.assert_allclose(made, [0.8 * (2 + np.sqrt(3)) - 0.6], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("after_clip", "expected"), [(s.PREDICTED, [-0.6, 0.68]), (s.CONSISTENT, [0.8 + 0.6 / np.sqrt(3), 0.68])]
+)
+def test_both_sets_of_coefficients_take_the_same_step(after_clip, expected):
+    """alpha_bar 1/4 -> 0.64. The first entry's x0 is 2 + 7 / sqrt 3 and clipped, the second's is 0.1."""
+    made = s.Schedule(np.array([0.36, 0.609375], np.float32), np.array([0.64, 0.25], np.float32))
+    eps = jnp.array([-7 / 3, 1.0])
+    x = jnp.array([1.0, 0.05 + np.sqrt(0.75)])
+    computed = s.ddim_step(s.ddim_coefficients(made, 1, 0, x), x, eps, 1.0, after_clip=after_clip)
+    row = s.ddim_table(made, np.array([1, 0]))[0]
+    np.testing.assert_allclose(row, [2, np.sqrt(3), 0.8, 0.6], rtol=1e-6)
+    tabled = s.ddim_step(s.DDIMCoefficients(*row), x, eps, 1.0, after_clip=after_clip)
+    np.testing.assert_allclose(computed, expected, rtol=1e-5)
+    np.testing.assert_allclose(tabled, expected, rtol=1e-5)
+
+
+def test_the_last_row_of_the_table_leads_to_the_clean_sample():
+    made = s.make_schedule("cosine", 20)
+    assert s.ddim_table(made, s.timesteps(20, 4))[-1, 2:].tolist() == [1, 0]
+
+
+def test_a_terminal_time_below_one_is_the_start_of_the_whole_schedule():
+    """Half the time in 10 steps is the first half of 20 steps."""
+    np.testing.assert_allclose(s.cosine_betas(10, 0.5), s.cosine_betas(20)[:10], rtol=1e-12)
+    action = noise_schedule(StudentConfig(head=HeadConfig(diffusion_steps=50)))
+    f = np.cos((np.arange(51) / 50 * 0.98 + 0.008) / 1.008 * np.pi / 2) ** 2
+    np.testing.assert_array_equal(action.alpha_bars, (f[1:] / f[0]).astype(np.float32))

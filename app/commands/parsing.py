@@ -1,0 +1,65 @@
+"""Turns what tyro prints about a command line that it cannot read, a box of several lines, into one line."""
+
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Callable
+from typing import TypeVar
+
+from ddgrasp.errors import UserError, unknown_name
+
+T = TypeVar("T")
+
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+_RULE = re.compile(r"^─+$")
+_CHOICE = re.compile(r"invalid choice '(?P<value>.*)' for argument '-*(?P<option>\S+)'\. Expected one of \(")
+_NUMBER = re.compile(
+    r"Error parsing (?P<option>\S+): ((?P<int>invalid literal for int\(\) with base 10)|"
+    r"could not convert string to float): (?P<value>.*)"
+)
+
+
+def parsed(parse: Callable[[], T], command: str) -> T:
+    """What `parse`, a call of tyro, returns; UserError in one line for options that it refuses.
+
+    Help is printed as ever, and ends with SystemExit(0).
+    """
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            return parse()
+    except SystemExit as stop:
+        if stop.code != 2:
+            sys.stderr.write(told.getvalue())
+            raise
+    raise refused(told.getvalue(), command)
+
+
+def refused(box: str, command: str) -> UserError:
+    """The error that tyro's `box` tells, for the options of `command`."""
+    trouble, *more = _blocks(box)
+    if (choice := _CHOICE.search(trouble)) is not None:
+        known = re.findall(r"'([^']*)'", trouble[choice.end() :])
+        field = choice["option"].replace("-", "_")
+        if all(name.isdigit() for name in known):
+            return UserError(f"{field} is {choice['value']}; expected one of {', '.join(known)}.")
+        return unknown_name(field, choice["value"], known)
+    if (number := _NUMBER.search(trouble)) is not None:
+        kind = "a whole number" if number["int"] else "a number"
+        return UserError(f"{number['option']} is {number['value']}; expected {kind}.")
+    nearest = [re.search(r"--\S+", block) for block in more if block.startswith("Perhaps you meant")]
+    hint = f" Did you mean {nearest[0].group()}?" if nearest and nearest[0] else ""
+    return UserError(f"{trouble.rstrip('.')}.{hint} Options: {command} --help.")
+
+
+def _blocks(box: str) -> list[str]:
+    """What stands between the rules of the box, each part on one line, without the title."""
+    lines = [line.strip().strip("│").strip() for line in _COLOUR.sub("", box).splitlines()]
+    blocks: list[list[str]] = [[]]
+    for line in lines:
+        if _RULE.match(line):
+            blocks.append([])
+        elif line and line[0] not in "╭╰":
+            blocks[-1].append(line)
+    return [" ".join(block) for block in blocks]

@@ -1,0 +1,191 @@
+"""Configuration of every stage: frozen dataclasses that check themselves, one file per stage.
+
+A field's docstring is the command line's help; its type says what it may hold (checks.py).
+"""
+
+from dataclasses import dataclass, field
+
+from ddgrasp.config.checks import Section, Seed, Text
+from ddgrasp.config.ddg import (
+    CROSS_ENTROPY,
+    DDIM,
+    DDPM,
+    DEPTH,
+    DEVIATION,
+    DPM_SOLVER,
+    FILTERED,
+    HOLE_LOSSES,
+    LOSS_WEIGHTS,
+    PIECEWISE,
+    PROGRESSIVE,
+    REPRESENTATIONS,
+    SAMPLERS,
+    SPACINGS,
+    SQUARED,
+    SURFACES,
+    TRUNCATED,
+    UNIFORM,
+    DDGConfig,
+    DDGDepthConfig,
+    DDGDiffusionConfig,
+    DDGTrainingConfig,
+    DType,
+    GraftConfig,
+    NoiseSchedule,
+    PriorConfig,
+    PriorInSim,
+    PriorSource,
+    Sampler,
+    SamplingConfig,
+    Spacing,
+    Surface,
+    UNetConfig,
+)
+from ddgrasp.config.demos import DemosConfig
+from ddgrasp.config.deploy import START_NOISES, DeployConfig, FrankaConfig, RealSenseConfig, StartNoise
+from ddgrasp.config.evaluation import EvalConfig
+from ddgrasp.config.export import DEPTH_DTYPES, DepthDtype, ExportConfig
+from ddgrasp.config.features import DepthFeatureConfig
+from ddgrasp.config.record import RecordConfig
+from ddgrasp.config.score import SCORE_COLUMNS, SCORE_FEATURES, ScoreConfig
+from ddgrasp.config.sensors import SENSORS, DextrahConfig, KinectConfig, Sensor, SensorConfig, StereoConfig
+from ddgrasp.config.student import (
+    CHANNELS,
+    GROUP_CHANNELS,
+    STEM_STRIDE,
+    DaggerConfig,
+    EncoderConfig,
+    HandViewConfig,
+    HeadConfig,
+    PictureConfig,
+    PosesConfig,
+    StudentConfig,
+    StudentTrainingConfig,
+)
+from ddgrasp.config.teacher import HostsConfig, TeacherConfig
+from ddgrasp.config.world import BACKENDS, Backend, CameraScale, RandomConfig, RewardConfig, WorldConfig
+from ddgrasp.errors import UserError
+
+
+@dataclass(frozen=True)
+class Config(Section):
+    """Everything a run needs; a preset is one value of this."""
+
+    preset: Text
+    seed: Seed = 0
+    """Of all random numbers."""
+    world: WorldConfig = field(default_factory=WorldConfig)
+    teacher: TeacherConfig = field(default_factory=TeacherConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    record: RecordConfig = field(default_factory=RecordConfig)
+    ddg: DDGConfig = field(default_factory=DDGConfig)
+    student: StudentConfig = field(default_factory=StudentConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)
+    deploy: DeployConfig = field(default_factory=DeployConfig)
+    evaluation: EvalConfig = field(default_factory=EvalConfig)
+    score: ScoreConfig = field(default_factory=ScoreConfig)
+
+    def check(self) -> None:
+        """See `Section.check`."""
+        self._check_picture()
+        head = self.student.head
+        if self.export.ddim_steps > head.diffusion_steps:
+            raise self.export.error(
+                "ddim_steps", f"1 to {head.diffusion_steps} (student.head.diffusion_steps), or 0"
+            )
+        if self.deploy.execute_steps > head.chunk:
+            raise self.deploy.error("execute_steps", f"1 to {head.chunk} (student.head.chunk), or 0")
+
+    def _check_picture(self) -> None:
+        """The student's picture is cut out of the camera's crop window, never enlarged."""
+        profile, picture = self.world.profile, self.student.picture
+        crop = (profile.crop_height_px, profile.crop_width_px)
+        if picture.height_px > crop[0] or picture.width_px > crop[1]:
+            raise UserError(
+                f"student.picture is {picture.height_px} x {picture.width_px} pixels; at world.camera_scale "
+                f"{self.world.camera_scale:g} the camera's crop window has {crop[0]} x {crop[1]}: take a "
+                "smaller student.picture.height_px and width_px, or a larger camera_scale."
+            )
+        if (shift := self.student.training.crop_shift_px) > min(profile.crop_origin_px):
+            raise UserError(
+                f"student.training.crop_shift_px is {shift}; expected 0 to {min(profile.crop_origin_px)}, "
+                f"the margin around the crop window at world.camera_scale {self.world.camera_scale:g}."
+            )
+
+
+__all__ = [
+    "BACKENDS",
+    "Backend",
+    "CHANNELS",
+    "CROSS_ENTROPY",
+    "CameraScale",
+    "Config",
+    "DDGConfig",
+    "DDGDepthConfig",
+    "DDGDiffusionConfig",
+    "DDGTrainingConfig",
+    "DDIM",
+    "DDPM",
+    "DEPTH",
+    "DEPTH_DTYPES",
+    "DEVIATION",
+    "DPM_SOLVER",
+    "DType",
+    "DaggerConfig",
+    "DemosConfig",
+    "DeployConfig",
+    "DepthDtype",
+    "DepthFeatureConfig",
+    "DextrahConfig",
+    "EncoderConfig",
+    "EvalConfig",
+    "ExportConfig",
+    "FILTERED",
+    "FrankaConfig",
+    "GROUP_CHANNELS",
+    "GraftConfig",
+    "HOLE_LOSSES",
+    "HandViewConfig",
+    "HeadConfig",
+    "HostsConfig",
+    "KinectConfig",
+    "LOSS_WEIGHTS",
+    "NoiseSchedule",
+    "PIECEWISE",
+    "PROGRESSIVE",
+    "PictureConfig",
+    "PosesConfig",
+    "PriorConfig",
+    "PriorInSim",
+    "PriorSource",
+    "REPRESENTATIONS",
+    "RandomConfig",
+    "RealSenseConfig",
+    "RecordConfig",
+    "RewardConfig",
+    "SAMPLERS",
+    "SCORE_COLUMNS",
+    "SCORE_FEATURES",
+    "SENSORS",
+    "SPACINGS",
+    "SQUARED",
+    "START_NOISES",
+    "STEM_STRIDE",
+    "SURFACES",
+    "Sampler",
+    "SamplingConfig",
+    "ScoreConfig",
+    "Sensor",
+    "SensorConfig",
+    "Spacing",
+    "StartNoise",
+    "StereoConfig",
+    "StudentConfig",
+    "StudentTrainingConfig",
+    "Surface",
+    "TRUNCATED",
+    "TeacherConfig",
+    "UNIFORM",
+    "UNetConfig",
+    "WorldConfig",
+]

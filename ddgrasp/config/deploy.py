@@ -1,0 +1,67 @@
+"""The control loop on the robot side, and the devices it drives."""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal, get_args
+
+from ddgrasp.config.checks import Count, Range, Section, Text
+from ddgrasp.errors import UserError
+
+StartNoise = Literal["zero", "normal"]
+START_NOISES: tuple[StartNoise, ...] = get_args(StartNoise)
+_Coordinate = Annotated[float, Range(-2, 2)]
+_Corner = tuple[_Coordinate, _Coordinate, _Coordinate]
+
+
+@dataclass(frozen=True)
+class FrankaConfig(Section, name="deploy.franka"):
+    """A real Franka robot."""
+
+    host: Text = "172.16.0.2"
+    """Address of the robot's control unit."""
+    dynamics: Annotated[float, Range(0, 1, above=True)] = 0.2
+    """Share of the arm's velocity, acceleration and jerk limits that it may use."""
+    grip_force_n: Annotated[float, Range(0, 140, above=True)] = 20.0
+    """Force of the gripper in newtons."""
+
+
+@dataclass(frozen=True)
+class RealSenseConfig(Section, name="deploy.realsense"):
+    """A real RealSense camera."""
+
+    serial: Text = ""
+    """Serial number of the camera; empty takes the first one found."""
+
+
+@dataclass(frozen=True)
+class DeployConfig(Section, name="deploy"):
+    """Control loop on the robot side."""
+
+    noise: StartNoise = "zero"
+    """Start of the reverse diffusion: zero (deterministic) or normal (seeded)."""
+    execute_steps: Annotated[int, Range(0, 1000)] = 0
+    """Actions played from a chunk before the network runs again; 0 takes the exported file's own."""
+    stale_periods: Annotated[float, Range(0, 1000, above=True)] = 2.0
+    """A frame older than this many control periods makes the robot hold position."""
+    acceleration_scale: Annotated[float, Range(0, 100, above=True)] = 2.0
+    """Largest change between two steps, relative to Franka's acceleration limit. Targets lead the arm, so
+    they may change faster than the arm itself; from 2.8 on, a full reversal of any joint passes."""
+    workspace_lower_m: _Corner = (0.15, -0.45, 0.012)
+    """Where the point between the finger pads may go, robot base frame; 12 mm = fingertips on the table."""
+    workspace_upper_m: _Corner = (0.80, 0.45, 0.80)
+    """The box's other corner."""
+    realtime_trials: Count = 3
+    """Trials on the machine's own clock, for time keeping (success comes from evaluation.rig_trials)."""
+    workers: Annotated[int, Range(1, 1024)] = 2
+    """Processes that run simulated-clock trials."""
+    film_every: Annotated[int, Range(1, 10000)] = 6
+    """Steps between two columns of a trial's film strip."""
+    franka: FrankaConfig = field(default_factory=FrankaConfig)
+    realsense: RealSenseConfig = field(default_factory=RealSenseConfig)
+
+    def check(self) -> None:
+        """See `Section.check`."""
+        if any(low >= high for low, high in zip(self.workspace_lower_m, self.workspace_upper_m, strict=True)):
+            raise UserError(
+                f"deploy.workspace is {self.workspace_lower_m} to {self.workspace_upper_m}; expected the "
+                "lower corner below the upper one in x, y and z."
+            )

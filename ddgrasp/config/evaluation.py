@@ -1,0 +1,17 @@
+"""How many trials are behind every success rate."""
+
+from dataclasses import dataclass
+
+from ddgrasp.config.checks import Count, Section
+
+
+@dataclass(frozen=True)
+class EvalConfig(Section, name="evaluation"):
+    """Trials behind every success rate."""
+
+    teacher_trials: Count = 300
+    """Episodes of the teacher in its own simulation."""
+    student_trials: Count = 100
+    """Episodes of the student on clean depth and on generated depth."""
+    rig_trials: Count = 60
+    """Episodes of the exported student in the pseudo-real rig."""

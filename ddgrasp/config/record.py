@@ -1,0 +1,25 @@
+"""Recordings from the pseudo-real rig."""
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from ddgrasp.config.checks import Count, Range, Section
+from ddgrasp.config.sensors import StereoConfig
+
+
+@dataclass(frozen=True)
+class RecordConfig(Section, name="record"):
+    """RGB-D recordings from the pseudo-real rig, and the rig's stereo camera."""
+
+    trajectories: Count = 24
+    """Recorded episodes of the teacher, objects in turn."""
+    frames: Annotated[int, Range(1, 10000)] = 60
+    """Frames per trajectory, at the control rate."""
+    camera_position_jitter_m: Annotated[float, Range(0, 0.3)] = 0.05
+    """Half width of the camera's uniform displacement per trajectory."""
+    camera_aim_jitter_m: Annotated[float, Range(0, 0.3)] = 0.04
+    """Half width of the uniform displacement of the point it looks at."""
+    camera_roll_jitter_rad: Annotated[float, Range(0, 3.15)] = 0.05
+    """Half width of its uniform roll."""
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    """The camera itself."""

@@ -1,0 +1,109 @@
+"""The teacher: PPO on the privileged state, on one host or several."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from ddgrasp.config.checks import (
+    Count,
+    CountOrNone,
+    LearningRate,
+    Range,
+    Section,
+    Share,
+    StepsOrNone,
+    Text,
+    Width,
+)
+from ddgrasp.errors import UserError
+
+
+@dataclass(frozen=True)
+class TeacherConfig(Section, name="teacher"):
+    """PPO on the privileged state."""
+
+    total_steps: Annotated[int, Range(0, 10**12)] = 2_000_000
+    """Control steps of experience, over all environments together."""
+    num_envs: Annotated[int, Range(1, 2**31 - 1)] = 512
+    """Environments stepped together."""
+    unroll_steps: Annotated[int, Range(1, 10_000)] = 20
+    """Control steps between updates."""
+    minibatches: Count = 8
+    """Gradient steps per epoch; must divide num_envs."""
+    epochs: Annotated[int, Range(1, 1000)] = 4
+    """Passes over each batch of experience."""
+    learning_rate: LearningRate = 2e-5
+    """Adam's step size for the policy at the start; decays linearly to a tenth. Keep it small when the policy
+    starts from a cloned one (clone_rounds): a large step undoes it."""
+    critic_learning_rate: LearningRate = 5e-4
+    """The same for the value network."""
+    discount: Share = 0.97
+    """How much a reward one control step later counts (gamma)."""
+    gae_lambda: Share = 0.95
+    """Generalised advantage estimation: 0 trusts the value network, 1 the rewards that were seen."""
+    action_std: Annotated[float, Range(0, 10, above=True)] = 0.15
+    """Standard deviation of the exploration noise at the start, before the tanh."""
+    entropy_cost: Annotated[float, Range(0, 10)] = 1e-3
+    """Weight of the reward for acting at random: more keeps exploring for longer."""
+    clip: Share = 0.2
+    """PPO's clipping range: how far an update may move an action's probability, as a share of it."""
+    reward_scaling: Annotated[float, Range(0, 1000, above=True)] = 0.5
+    """Factor on every reward before it is learnt from."""
+    max_grad_norm: Annotated[float, Range(0, 1_000_000, above=True)] = 1.0
+    """Longer gradients are shortened to this length."""
+    hidden: tuple[Width, ...] = (256, 128)
+    """Layers of policy and value networks."""
+    pregrasp_share: Share = 0.2
+    """Share of training episodes that start with the hand above the object (exploring starts)."""
+    clone_rounds: CountOrNone = 8
+    """DAgger rounds in which the policy network learns the guide (ppo/guide.py) before PPO; 0 starts
+    PPO from nothing."""
+    clone_envs: Count = 192
+    """Episodes per such round."""
+    clone_steps: StepsOrNone = 500
+    """Optimiser steps per such round."""
+    critic_warmup: CountOrNone = 10
+    """Iterations in which the critic alone learns, so that it does not mislead a cloned policy."""
+    eval_every: Count = 20
+    """Updates between deterministic evaluations."""
+    checkpoint_every: Count = 20
+    """Updates between whole-state checkpoints."""
+    stop_at: Share = 1.0
+    """End early once two evaluations in a row reach this success rate."""
+    init_from: Text = ""
+    """Run directory or pretrained folder whose policy to start from; total_steps 0 uses it as it is."""
+
+    def check(self) -> None:
+        """See `Section.check`."""
+        if self.num_envs % self.minibatches:
+            raise UserError(
+                f"teacher.num_envs {self.num_envs} is no multiple of teacher.minibatches {self.minibatches}: "
+                "change one of them."
+            )
+
+
+@dataclass(frozen=True)
+class HostsConfig(Section, name="hosts"):
+    """Several processes, usually one per host, that train as one. Not part of a run's configuration: the same
+    run may go on with another number of them."""
+
+    coordinator: Text = ""
+    """Address (host:port) of process 0, the same on every host; auto asks Slurm, Open MPI, Kubernetes or a
+    TPU pod, which name the processes too; empty for one process."""
+    processes: Annotated[int, Range(1, 100_000)] = 1
+    """Number of processes."""
+    process: Annotated[int, Range(0, 100_000)] = 0
+    """This process, from 0; 0 alone writes logs, policies and manifests."""
+
+    def check(self) -> None:
+        """See `Section.check`."""
+        named = self.coordinator not in ("", "auto")
+        host, _, port = self.coordinator.rpartition(":")
+        if named and not (host and port.isdigit()):
+            raise self.error("coordinator", "host:port, or auto")
+        if not named and (self.processes, self.process) != (1, 0):
+            raise UserError(
+                f"hosts.processes is {self.processes}, hosts.process {self.process}, hosts.coordinator "
+                f"{self.coordinator!r}: give the address (host:port) of process 0."
+            )
+        if not 0 <= self.process < self.processes:
+            raise self.error("process", f"0 to {self.processes - 1} (hosts.processes is {self.processes})")

@@ -1,0 +1,77 @@
+"""Whole-state checkpoints: what an interrupted training goes on from, exactly, on any number of devices."""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import jax
+import orbax.checkpoint as ocp
+
+from ddgrasp.errors import UserError
+
+KEPT = 2
+"""Checkpoints in a folder: should the newest be lost with the disk's last write, there is one before."""
+
+State = TypeVar("State")
+
+
+class Checkpoints:
+    """The newest states of one training, in a folder of its own; a context manager.
+
+    Every process of a training opens the same folder and makes the same calls.
+    """
+
+    def __init__(self, directory: Path, keep: int = KEPT):
+        self.directory = directory
+        options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
+        self._manager = ocp.CheckpointManager(directory.absolute(), options=options)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._manager.close()
+
+    @property
+    def latest(self) -> int | None:
+        """Step of the newest checkpoint, None if there is none."""
+        return self._manager.latest_step()
+
+    def restore(self, target: State) -> State:
+        """The newest checkpoint.
+
+        Args:
+          target: a state of the same structure, of arrays or of jax.ShapeDtypeStruct with the shardings that
+            the result shall have; they need not be those it was saved from.
+
+        Raises UserError if there is none, or it does not fit `target`.
+        """
+        if self.latest is None:
+            raise UserError(f"{self.directory} holds no checkpoint: start without resuming.")
+        path = self.directory / str(self.latest)
+        try:
+            restored: Any = self._manager.restore(self.latest, args=ocp.args.StandardRestore(target))
+        except (ValueError, KeyError, TypeError) as error:
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            raise UserError(
+                f"The checkpoint {path} does not fit this training ({reason}): it is of another "
+                "configuration or version; delete the folder to start afresh."
+            ) from None
+        return restored
+
+    def restore_or(self, first: State) -> State:
+        """The newest checkpoint, shaped like `first`; `first` itself if there is none."""
+        return first if self.latest is None else self.restore(first)
+
+    def save(self, step: int, state: Any) -> None:
+        """Keeps `state`, the one after `step` steps, unless it is there already. Returns once written."""
+        if self.latest != step:
+            self._manager.save(step, args=ocp.args.StandardSave(state), force=True)
+            self._manager.wait_until_finished()
+
+
+def intact(state: Any) -> bool:
+    """Whether `state` can still be saved: an interrupted step has taken the buffers that it was donated."""
+    return not any(leaf.is_deleted() for leaf in jax.tree.leaves(state) if isinstance(leaf, jax.Array))

@@ -1,0 +1,55 @@
+"""Layers without parameters that several networks share: sinusoids of a step, folding pixels into channels.
+
+Trained weights depend on every order stated here.
+"""
+
+import math
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+MAX_PERIOD = 10_000.0
+
+
+def time_frequencies(size: int, xp: ModuleType = np) -> Any:
+    """(size / 2,) float32 angular frequencies MAX_PERIOD^(-2i / size) (Vaswani et al. 2017, section 3.5).
+
+    Args:
+      size: length of the embedding.
+      xp: numpy rounds once, at the end; jax.numpy computes in float32. Their last digits differ, so a network
+        keeps the one it was trained with.
+    """
+    half = size // 2
+    return xp.exp(-math.log(MAX_PERIOD) * xp.arange(half) / half).astype(xp.float32)
+
+
+def sinusoids(position: Any, frequencies: Any, *, cosine_first: bool, xp: ModuleType = jnp) -> Any:
+    """(...,) positions and (n,) frequencies to (..., 2n): all sines then all cosines, or the other way round.
+
+    Args:
+      xp: jax.numpy, or numpy for constants.
+    """
+    angles = xp.asarray(position).astype(xp.float32)[..., None] * frequencies
+    pair = (xp.sin(angles), xp.cos(angles))
+    return xp.concatenate(pair[::-1] if cosine_first else pair, axis=-1)
+
+
+def space_to_depth(x: Array, factor: int) -> Array:
+    """(B, H, W, C) -> (B, H/f, W/f, f*f*C); H and W divisible by `factor`.
+
+    Within a patch pixels go row by row, and a pixel's channels stay together: channel (i f + j) C + c is
+    channel c of the patch's pixel in row i and column j.
+    """
+    b, h, w, c = x.shape
+    x = x.reshape(b, h // factor, factor, w // factor, factor, c)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, h // factor, w // factor, factor * factor * c)
+
+
+def depth_to_space(x: Array, factor: int) -> Array:
+    """(B, H, W, f*f*C) -> (B, H*f, W*f, C): inverse of `space_to_depth`."""
+    b, h, w, c = x.shape
+    x = x.reshape(b, h, w, factor, factor, c // factor**2)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, h * factor, w * factor, c // factor**2)

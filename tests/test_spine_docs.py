@@ -1,0 +1,143 @@
+"""What a reader relies on: docstrings, annotations, short files, links that lead somewhere, a true tree."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ddgrasp.stages import ON_REQUEST, STAGES
+
+ROOT = Path(__file__).parents[1]
+MAX_LINES = 400
+PAGES = (
+    "README.md",
+    "CONTRIBUTING.md",
+    *(f"docs/{page.name}" for page in sorted((ROOT / "docs").glob("*.md"))),
+)
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def _packages() -> list[str]:
+    """Packages in the order of the README's tree."""
+    return [name for name in _tree() if (ROOT / name / "__init__.py").exists() and name != "benchmarks"]
+
+
+def _tree() -> list[str]:
+    block = (ROOT / "README.md").read_text().split("## The tree is the data flow")[1].split("```")[1]
+    return re.findall(r"^(\w+)/", block, re.MULTILINE)
+
+
+def _files() -> Iterator[Path]:
+    for package in _packages():
+        yield from sorted((ROOT / package).rglob("*.py"))
+
+
+def _name(file: Path, node: ast.AST, name: str) -> str:
+    return f"{file.relative_to(ROOT)}:{getattr(node, 'lineno', 1)} {name}"
+
+
+def _public(file: Path) -> Iterator[tuple[Function, bool]]:
+    """(function, whether it is a method) of every public function, and of public classes' `__init__`."""
+
+    def visit(node: ast.AST, in_class: bool) -> Iterator[tuple[Function, bool]]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, Function):
+                if not child.name.startswith("_") or child.name == "__init__":
+                    yield child, in_class
+            elif isinstance(child, ast.ClassDef):
+                if not child.name.startswith("_"):
+                    yield from visit(child, True)
+            else:
+                yield from visit(child, in_class)
+
+    yield from visit(ast.parse(file.read_text()), False)
+
+
+def _unannotated(function: Function, is_method: bool) -> bool:
+    args = function.args
+    given = [*args.posonlyargs, *args.args]
+    if is_method and not any(ast.unparse(d) == "staticmethod" for d in function.decorator_list):
+        given = given[1:]
+    given += [*args.kwonlyargs, *(arg for arg in (args.vararg, args.kwarg) if arg)]
+    returns = function.returns is not None or function.name == "__init__"
+    return not returns or any(arg.annotation is None for arg in given)
+
+
+def test_every_public_function_and_class_says_what_it_does():
+    missing = []
+    for file in _files():
+        tree = ast.parse(file.read_text())
+        if tree.body and not ast.get_docstring(tree):
+            missing.append(_name(file, tree, "module"))
+        missing += [
+            _name(file, f, f.name)
+            for f, _ in _public(file)
+            if f.name != "__init__" and not ast.get_docstring(f)
+        ]
+        classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name[0] != "_"]
+        missing += [_name(file, node, node.name) for node in classes if not ast.get_docstring(node)]
+    assert missing == []
+
+
+def test_every_public_function_is_annotated():
+    assert [
+        _name(file, f, f.name) for file in _files() for f, method in _public(file) if _unannotated(f, method)
+    ] == []
+
+
+def test_no_docstring_begins_with_of():
+    assert [
+        _name(file, node, node.value[:40])
+        for file in _files()
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("Of ")
+    ] == []
+
+
+def test_no_file_is_long():
+    lengths = {file.relative_to(ROOT): len(file.read_text().splitlines()) for file in _files()}
+    assert {file: length for file, length in lengths.items() if length > MAX_LINES} == {}
+
+
+def test_the_readme_s_tree_is_the_tree():
+    folders = {file.parent.relative_to(ROOT).parts[0] for file in ROOT.glob("*/__init__.py")}
+    assert folders <= set(_tree())
+    assert {name for name in _tree() if not (ROOT / name).is_dir()} == set()
+
+
+def test_the_flow_picture_names_the_folder_of_every_stage():
+    picture = (ROOT / "docs" / "flow.svg").read_text()
+    for stage in STAGES:
+        assert f">{stage.module.split('.')[0]}/<" in picture, stage.name
+
+
+def test_every_stage_of_the_table_has_its_run():
+    for stage in (*STAGES, *ON_REQUEST):
+        tree = ast.parse((ROOT / f"{stage.module.replace('.', '/')}.py").read_text())
+        runs = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "run"]
+        assert [ast.unparse(run.args) for run in runs] == ["job: Job"], stage.name
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_to_files_and_code_names_files_that_exist(page):
+    text = (ROOT / page).read_text()
+    links = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
+    assert [link for link in links if not ((ROOT / page).parent / link).exists()] == []
+    top = {path.name for path in ROOT.iterdir()}
+    named = {name for name in re.findall(r"`([\w/]+\.(?:py|md|sh))`", text) if name.split("/")[0] in top}
+    named.discard("tests/__init__.py")  # said not to exist
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
+def test_docstrings_and_comments_name_files_that_exist():
+    packages = "|".join(_packages())
+    named = re.compile(rf"(?<![\w./])((?:{packages}|tests|benchmarks|docs)/[\w/]+\.(?:py|md))")
+    missing = [
+        f"{file.relative_to(ROOT)}: {name}"
+        for file in _files()
+        for name in named.findall(file.read_text())
+        if not (ROOT / name).exists()
+    ]
+    assert missing == []
