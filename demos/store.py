@@ -115,8 +115,8 @@ def _put(group: zarr.Group, name: str, start: int, rows: np.ndarray) -> None:
         chunks = (_IMAGE_CHUNK if image else _ROW_CHUNK, *rows.shape[1:])
         group.create_array(
             name, shape=(0, *rows.shape[1:]), chunks=chunks, dtype=rows.dtype, compressors=[_CODEC],
-            config={"write_empty_chunks": True},
         )  # fmt: skip
-    array = _array(group, name)
+    # The setting is not kept in the store: without it Zarr drops a chunk that an append leaves all zeros.
+    array = _array(group, name).with_config({"write_empty_chunks": True})
     array.resize((start + len(rows), *rows.shape[1:]))
     array[start:] = rows

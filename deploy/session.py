@@ -5,36 +5,16 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from ddgrasp import contract
-from ddgrasp.config import CAMERAS, ROBOTS, Config
-from ddgrasp.errors import UserError, unknown_name
-from ddgrasp.policy_metadata import PolicyMetadata
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
 from deploy.clock import RealClock
-from deploy.interfaces import Camera, Clock, Robot
+from deploy.devices.options import SessionOptions, Setup
+from deploy.devices.registry import check_devices, make_devices
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
-
-
-@dataclass(frozen=True)
-class SessionOptions:
-    """What to drive, what to look through, for how long."""
-
-    robot: str = "sim"
-    """sim (the pseudo-real rig) or franka."""
-    camera: str = "stereo"
-    """stereo (the rig's own camera), realsense, or replay (a recording; the robot acts on old pictures)."""
-    recording: Path | None = None
-    """Recording for camera replay."""
-    object_name: str = ""
-    """Object on the rig's table; empty takes the first configured one."""
-    seconds: float = 6.0
-    """How long to run; inf runs until Ctrl-C."""
 
 
 def deploy(
@@ -61,7 +41,7 @@ def _run(
         execute_steps=config.deploy.execute_steps or None,
     )
     clock = RealClock()
-    robot, camera = _devices(config, options, policy.info, clock)
+    robot, camera = make_devices(Setup(config, options, policy.info, clock))
     settings = loop_settings(config.deploy, policy.info)
     loop = ControlLoop(camera, robot, policy, safety_filter(config.deploy, policy.info), clock, settings, say)
     steps = round(options.seconds * policy.info.control_hz) if math.isfinite(options.seconds) else None
@@ -110,75 +90,6 @@ def _row(name: str, percentiles: dict[str, float | None]) -> str:
 
 
 def _check(options: SessionOptions) -> None:
-    if options.robot not in ROBOTS:
-        raise unknown_name("robot", options.robot, ROBOTS)
-    if options.camera not in CAMERAS:
-        raise unknown_name("camera", options.camera, CAMERAS)
-    if options.robot == "franka" and options.camera == "stereo":
-        raise UserError(
-            "camera 'stereo' sees the simulated rig alone, not robot 'franka': use --camera realsense."
-        )
-    if options.robot == "franka" and options.camera == "replay":
-        raise UserError(
-            "camera 'replay' shows the past: robot 'franka' would move blindly; use --camera realsense."
-        )
-    if options.camera == "replay" and options.recording is None:
-        raise UserError("camera 'replay' needs --recording DIR (one recording, as `ddgrasp record` writes).")
+    check_devices(options)
     if not options.seconds > 0:
         raise UserError(f"--seconds is {options.seconds:g}: choose more than 0, or inf to run until Ctrl-C.")
-
-
-def _devices(
-    config: Config, options: SessionOptions, info: PolicyMetadata, clock: Clock
-) -> tuple[Robot, Camera]:
-    if options.robot == "franka":
-        return _franka(config, clock), _realsense(config, info, clock)
-    return _rig(config, options, info, clock)
-
-
-def _rig(config: Config, options: SessionOptions, info: PolicyMetadata, clock: Clock) -> tuple[Robot, Camera]:
-    from deploy.devices.rig_camera import StereoCamera
-    from deploy.devices.rig_robot import SimRobot
-    from deploy.trials import camera_pose
-    from mjx_envs.objects import get_object
-    from rig.camera import RigCamera
-    from rig.world import RigWorld
-
-    name = get_object(options.object_name or config.world.objects[0]).name
-    rng = np.random.default_rng(config.seed)
-    world = RigWorld((name,), randomise=True, random=config.world.random)
-    world.reset(config.seed, name)
-    robot = SimRobot(world, clock, 1.0 / info.control_hz)
-    if options.camera == "realsense":
-        return robot, _realsense(config, info, clock)
-    if options.camera == "replay":
-        from deploy.devices.replay_camera import ReplayCamera
-
-        assert options.recording is not None
-        return robot, ReplayCamera.open(options.recording, clock)
-    rig_camera = RigCamera(world.model, config.record.stereo, config.world.profile)
-    return robot, StereoCamera(world, rig_camera, camera_pose(config, rng), rng, robot.catch_up, name)
-
-
-def _franka(config: Config, clock: Clock) -> Robot:
-    from deploy.devices.franka_robot import FrankaRobot
-
-    deploy_config = config.deploy
-    return FrankaRobot(
-        deploy_config.franka.host,
-        clock,
-        dynamics=deploy_config.franka.dynamics,
-        grip_force_n=deploy_config.franka.grip_force_n,
-    )
-
-
-def _realsense(config: Config, info: PolicyMetadata, clock: Clock) -> Camera:
-    from deploy.devices.realsense_camera import RealSenseCamera
-
-    if info.depth_dtype != "uint16_mm":
-        raise UserError(
-            f"camera 'realsense' gives uint16 millimetres, the policy takes {info.depth_dtype}: export it "
-            "with export.depth_dtype uint16_mm."
-        )
-    profile = contract.D455.scaled(info.depth_width / contract.D455.width_px)
-    return RealSenseCamera(clock, profile, serial=config.deploy.realsense.serial)

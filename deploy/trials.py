@@ -74,19 +74,21 @@ class Rig:
     def __init__(self, config: Config, policy_path: Path):
         import cv2
 
-        from rig.camera import RigCamera
-        from rig.world import RigWorld
+        from rig.camera import make_camera
+        from rig.world import make_world
 
         cv2.setNumThreads(1)
         self._config = config
         self._policy = OnnxPolicy(
             policy_path, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None
         )
-        self._world = RigWorld(config.world.objects, randomise=True, random=config.world.random)
-        self._camera = RigCamera(self._world.model, config.record.stereo, config.world.profile)
+        self._world = make_world(config.world)
+        self._camera = make_camera(config, self._world)
 
     def run(self, trial: Trial) -> tuple[TrialResult, Film]:
         """Run one trial. The same trial gives the same result on the simulated clock."""
+        from rig.camera import camera_pose
+
         config = self._config
         rng = np.random.default_rng([config.seed, _STREAM, trial.index])
         self._world.reset(int(rng.integers(2**31)), trial.object_name)
@@ -132,17 +134,6 @@ def run_trials(
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-def camera_pose(config: Config, rng: np.random.Generator) -> np.ndarray:
-    """(4, 4) T_world_cam of one trial: the nominal place within the calibration error trained for."""
-    from mjx_envs.camera import nominal_camera
-
-    spread = config.world.random
-    T_world_cam = nominal_camera(config.world.profile).T_world_cam.copy()
-    T_world_cam[:3, 3] += rng.uniform(-1, 1, 3) * spread.camera_position_m
-    T_world_cam[:3, :3] = T_world_cam[:3, :3] @ _rotation(rng.uniform(-1, 1, 3) * spread.camera_angle_rad)
-    return T_world_cam
-
-
 class _Filming:
     """Collects a picture every few steps."""
 
@@ -177,16 +168,6 @@ def _result(trial: Trial, success: bool, report: LoopReport) -> TrialResult:
         events=[str(event) for event in report.events],
         **seconds,
     )
-
-
-def _rotation(vector_rad: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation by |vector| about vector (Rodrigues)."""
-    angle = float(np.linalg.norm(vector_rad))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = vector_rad / angle
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
 
 
 # --- worker processes --------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from ddgrasp.progress import Progress
 from mjx_envs.objects import OBJECTS
 from rig.scenes import StandingScene, standing_scenes
 from sensors.recordings.recording import find_recordings
-from sensors.statistics import figures
+from sensors.statistics import figures, stats
 from sensors.statistics.curves import Curve
 from sensors.statistics.figures import CURVES, SCALARS, Figures
 
@@ -92,11 +92,13 @@ def object_losses(scenes: list[StandingScene]) -> dict[str, dict[str, float]]:
 
 
 def _losses(scenes: list[StandingScene]) -> dict[str, float]:
-    pixels = [scene.depth_mm[:, scene.object_px] > 0 for scene in scenes]
+    pixels = [scene.depth_mm[:, scene.object_px] for scene in scenes]
+    changes = [stats.validity_changes(depth).mean(axis=0) for depth in pixels]
     return {
-        "pixels": float(np.mean([valid.shape[1] for valid in pixels])),
-        "invalid_fraction": 1.0 - float(np.mean(np.concatenate([v.mean(axis=0) for v in pixels]))),
-        "flicker_fraction": float(np.mean(np.concatenate([(v[1:] != v[:-1]).mean(axis=0) for v in pixels]))),
+        "pixels": float(np.mean([depth.shape[1] for depth in pixels])),
+        "invalid_fraction": 1.0
+        - float(np.mean(np.concatenate([(depth > 0).mean(axis=0) for depth in pixels]))),
+        "flicker_fraction": float(np.mean(np.concatenate(changes))),
     }
 
 

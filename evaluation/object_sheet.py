@@ -12,7 +12,8 @@ from ddgrasp import contract
 from evaluation.report import figures
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import Buffers, Camera, look_at
-from mjx_envs.objects import ObjectSpec, get_object, slot_layout
+from mjx_envs.object_spec import ObjectSpec, slot_layout
+from mjx_envs.objects import get_object
 from mjx_envs.render import raycast_numpy
 
 HEIGHT_PX, WIDTH_PX = 120, 160

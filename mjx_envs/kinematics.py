@@ -50,6 +50,12 @@ def quat_about_z(angle_rad, xp: ModuleType = np):
     return xp.stack([xp.cos(angle_rad / 2), zero, zero, xp.sin(angle_rad / 2)], axis=-1)
 
 
+def quat_from_rotation_vector(vector_rad, xp: ModuleType = np):
+    """(..., 4) rotation by |vector| about the vector (..., 3)."""
+    half = xp.linalg.norm(vector_rad, axis=-1, keepdims=True) / 2
+    return xp.concatenate([xp.cos(half), vector_rad / 2 * xp.sinc(half / np.pi)], axis=-1)
+
+
 def yaw_of(q, xp: ModuleType = np):
     """(...,) angle about world z of the horizontal projection of the turned x axis."""
     w, x, y, z = (q[..., i] for i in range(4))

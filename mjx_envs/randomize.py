@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jp
 import numpy as np
 
-from ddgrasp import contract
 from ddgrasp.config import RandomConfig
-from mjx_envs import inverse_kinematics, kinematics, scene
-from mjx_envs.objects import get_object, slot_layout
+from mjx_envs import draws, inverse_kinematics, scene
+from mjx_envs.object_spec import ObjectModel, slot_layout
+from mjx_envs.objects import get_object
 from mjx_envs.physics.interface import ModelParams
 
 PREGRASP_HEIGHT_M = 0.15
@@ -25,14 +25,9 @@ class ObjectTable:
         self.other_variant = np.arange(len(specs))
         self.other_variant[turning] = len(specs) + np.arange(len(turning))
         specs += [specs[i].in_other_pose() for i in turning]
-        slots = [spec.slot_arrays(self.layout) for spec in specs]
         self.names = tuple(names)
-        self.slot_size = np.stack([s[0] for s in slots])
-        self.slot_pos = np.stack([s[1] for s in slots])
-        self.slot_quat = np.stack([s[2] for s in slots])
-        self.mass = np.array([s.mass_kg for s in specs])
-        self.inertia = np.stack([s.inertia_kg_m2() for s in specs])
-        self.friction = np.array([s.friction for s in specs])
+        models = [spec.model(self.layout) for spec in specs]
+        self.model = ObjectModel(*(np.stack(values) for values in zip(*models, strict=True)))
         self.rest_height = np.array([s.rest_height_m for s in specs])
         self.symmetry = np.array([s.grasp_symmetry for s in specs])
         self.log_category = np.log([s.category_id for s in specs])
@@ -45,53 +40,53 @@ def sample_variant(key: jax.Array, config: RandomConfig, table: ObjectTable, ind
     return jp.where(other, jp.asarray(table.other_variant)[index], index)
 
 
-def _around(key, half_range, shape=()):
-    """Uniform factors in [1 - half_range, 1 + half_range]."""
-    return 1.0 + half_range * jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
-
-
 def sample_params(
     key: jax.Array, config: RandomConfig, table: ObjectTable, variant
 ) -> tuple[ModelParams, jax.Array]:
     """Model parameters of one episode with `variant` of the table; also the object's size factor ()."""
     keys = jax.random.split(key, 7)
-    size = _around(keys[0], config.size)
-    mass = _around(keys[1], config.object_mass)
-    take = lambda a: jp.asarray(a, jp.float32)[variant]  # noqa: E731
-    params = ModelParams(
-        slot_size=take(table.slot_size) * size,
-        slot_pos=take(table.slot_pos) * size,
-        slot_quat=take(table.slot_quat),
-        object_mass=take(table.mass) * mass,
-        object_inertia=take(table.inertia) * mass * size**2,
-        object_friction=take(table.friction) * _around(keys[2], config.object_friction),
-        link_mass_scale=_around(keys[3], config.link_mass, (scene.N_ARM,)),
-        joint_damping=_around(keys[4], config.damping, (scene.N_ARM,)) * scene.JOINT_DAMPING_NMS_RAD,
-        joint_friction=config.friction_nm * jax.random.uniform(keys[5], (scene.N_ARM,)),
-        gain_scale=_around(keys[6], config.stiffness, (scene.N_ARM,)),
+    arm = (scene.N_ARM,)
+    drawn = draws.dynamics(
+        config,
+        draws.Units(
+            size=_unit(keys[0]),
+            object_mass=_unit(keys[1]),
+            object_friction=_unit(keys[2]),
+            link_mass=_unit(keys[3], arm),
+            damping=_unit(keys[4], arm),
+            joint_friction=jax.random.uniform(keys[5], arm),
+            stiffness=_unit(keys[6], arm),
+        ),
     )
-    return params, size
+    nominal = jax.tree.map(lambda a: jp.asarray(a, jp.float32)[variant], table.model)
+    made = nominal.scaled(drawn.size, drawn.object_mass, drawn.object_friction)
+    params = ModelParams(
+        slot_size=made.slot_size,
+        slot_pos=made.slot_pos,
+        slot_quat=made.slot_quat,
+        object_mass=made.mass_kg,
+        object_inertia=made.inertia_kg_m2,
+        object_friction=made.friction,
+        link_mass_scale=drawn.link_mass,
+        joint_damping=drawn.damping * scene.JOINT_DAMPING_NMS_RAD,
+        joint_friction=drawn.joint_friction_nm,
+        gain_scale=drawn.gain,
+    )
+    return params, drawn.size
 
 
 def sample_qpos(key: jax.Array, config: RandomConfig, rest_height_m) -> jax.Array:
     """(16,) initial joints around home, gripper open, object on the table with any yaw."""
     k_joint, k_xy, k_yaw = jax.random.split(key, 3)
-    joints = jp.asarray(scene.HOME_RAD) + config.joint_rad * jax.random.uniform(
-        k_joint, (scene.N_ARM,), minval=-1.0, maxval=1.0
-    )
-    half = jp.asarray(contract.WORKSPACE_SIZE_M) / 2
-    xy = jp.asarray(contract.WORKSPACE_CENTER_M) + half * jax.random.uniform(
-        k_xy, (2,), minval=-1.0, maxval=1.0
-    )
+    joints, xy = _unit(k_joint, (scene.N_ARM,)), _unit(k_xy, (2,))
     yaw = jax.random.uniform(k_yaw, (), minval=-jp.pi, maxval=jp.pi)
-    fingers = jp.full(2, contract.GRIPPER_MAX_WIDTH_M / 2)
-    return jp.concatenate([joints, fingers, xy, rest_height_m[None], kinematics.quat_about_z(yaw, jp)])
+    return draws.start_qpos(config, joints, xy, yaw, rest_height_m, jp)
 
 
 def maybe_pregrasp(key: jax.Array, config: RandomConfig, qpos: jax.Array, grasp_pos, grasp_quat) -> jax.Array:
     """qpos (16,) with the hand, in a share of the episodes, up to PREGRASP_HEIGHT_M above the grasp pose."""
     k_choice, k_offset = jax.random.split(key)
-    offset = jax.random.uniform(k_offset, (3,), minval=-1.0, maxval=1.0)
+    offset = _unit(k_offset, (3,))
     height = PREGRASP_HEIGHT_M * (0.5 + 0.5 * offset[2])
     target = grasp_pos + jp.stack([0.005 * offset[0], 0.005 * offset[1], height])
     joints = inverse_kinematics.solve(qpos[:7], target, grasp_quat)
@@ -102,10 +97,14 @@ def maybe_pregrasp(key: jax.Array, config: RandomConfig, qpos: jax.Array, grasp_
 def sample_camera(key: jax.Array, config: RandomConfig, T_world_cam) -> jax.Array:
     """(4, 4) the nominal camera pose, moved and turned within the configured range."""
     k_pos, k_rot = jax.random.split(key)
-    shift = config.camera_position_m * jax.random.uniform(k_pos, (3,), minval=-1.0, maxval=1.0)
-    rx, ry, rz = config.camera_angle_rad * jax.random.uniform(k_rot, (3,), minval=-1.0, maxval=1.0)
+    rx, ry, rz = config.camera_angle_rad * _unit(k_rot, (3,))
     # First-order rotation, made orthonormal: the angles are a few hundredths of a radian.
-    quat = jp.array([1.0, rx / 2, ry / 2, rz / 2])
-    turn = kinematics.quat_to_mat(quat / jp.linalg.norm(quat), jp)
+    turn = jp.array([1.0, rx / 2, ry / 2, rz / 2])
+    turn = turn / jp.linalg.norm(turn)
     T = jp.asarray(T_world_cam, jp.float32)
-    return T.at[:3, :3].set(T[:3, :3] @ turn).at[:3, 3].add(shift)
+    return draws.displaced(T, config.camera_position_m * _unit(k_pos, (3,)), turn, jp)
+
+
+def _unit(key: jax.Array, shape: tuple[int, ...] = ()) -> jax.Array:
+    """Uniform numbers in [-1, 1]."""
+    return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)

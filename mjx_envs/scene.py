@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from ddgrasp import contract
-from mjx_envs.objects import DEFAULT_SLOTS, OBJECTS, ObjectSpec, SlotLayout
+from mjx_envs.object_spec import DEFAULT_SLOTS, ObjectSpec, SlotLayout
+from mjx_envs.objects import OBJECTS
 
 _S = 0.7071067811865476  # cos 45 degrees
 
@@ -234,15 +235,13 @@ def fill_slots(
     `mujoco.mj_setConst` must follow: MuJoCo precomputes inertia for free bodies.
     """
     slots, body = slot_ids(model), model.body("object").id
-    slot_size, slot_pos, slot_quat = spec.slot_arrays(layout)
-    model.geom_size[slots], model.geom_pos[slots], model.geom_quat[slots] = (
-        slot_size * size, slot_pos * size, slot_quat,
-    )  # fmt: skip
-    model.geom_rbound[slots] = slot_bounding_radii(slot_size * size, np.array(layout.kinds) == "capsule")
-    model.geom_friction[slots, 0] = spec.friction * friction
+    made = spec.model(layout).scaled(size, mass, friction)
+    model.geom_size[slots], model.geom_pos[slots], model.geom_quat[slots] = made[:3]
+    model.geom_rbound[slots] = slot_bounding_radii(made.slot_size, np.array(layout.kinds) == "capsule")
+    model.geom_friction[slots, 0] = made.friction
     model.geom_rgba[slots, :3] = spec.slot_rgb(layout)
-    model.body_mass[body] = spec.mass_kg * mass
-    model.body_inertia[body] = spec.inertia_kg_m2() * mass * size**2
+    model.body_mass[body] = made.mass_kg
+    model.body_inertia[body] = made.inertia_kg_m2
 
 
 def slot_bounding_radii(size, is_capsule, xp=np):

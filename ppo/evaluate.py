@@ -1,42 +1,17 @@
 """Deterministic evaluation of a teacher: whole episodes on all devices, counted per object."""
 
-from functools import partial
-
 import jax
-import jax.numpy as jp
-import numpy as np
-from jax.sharding import Mesh
+from mujoco_playground import State
 
-from mjx_envs import devices
 from mjx_envs.grasp_env import GraspEnv
 from ppo.motion import motion_metrics
 from ppo.policy import TeacherPolicy
+from ppo.rollout import roll_out
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _episodes(env: GraspEnv, mesh: Mesh, count: int, layers, mean, std, key):
-    """Success (N,), object index (N,) and motion (T, N, ...) of N episodes, whole on every device.
-
-    N is `count` up to the next multiple of the devices, which repeat the last episode.
-    """
-    policy = TeacherPolicy(mean, std, layers)
-    keys = jax.random.split(key, count)
-    surplus = -count % mesh.size
-    keys = jp.concatenate([keys, jp.tile(keys[-1:], (surplus, 1))]) if surplus else keys
-    state = devices.each(mesh, env.reset)(keys)
-
-    def step(carry, _):
-        state, alive, success = carry
-        action = policy(state.obs, jp)
-        state = devices.each(mesh, env.step)(state, action)
-        success = jp.where(alive, state.metrics["success"], success)
-        motion = (state.data.qvel[:, :7], action, alive)
-        return (state, alive & (state.done == 0), success), motion
-
-    start = (state, jp.ones(len(keys), bool), jp.zeros(len(keys)))
-    (state, _, success), motion = jax.lax.scan(step, start, None, env.config.episode_steps)
-    outcome = (success, state.info["episode"].object_index, motion)
-    return jax.lax.with_sharding_constraint(outcome, devices.replicated(mesh))
+def motion_of(before: State, action: jax.Array, after: State) -> dict[str, jax.Array]:
+    """What `motion_metrics` needs of a step (`ppo.rollout.Keep`): velocities (N, 7), actions (N, 8)."""
+    return {"velocity_rad_s": after.data.qvel[:, :7], "action": action}
 
 
 def evaluate(env: GraspEnv, policy: TeacherPolicy, trials: int, seed: int) -> dict:
@@ -46,11 +21,10 @@ def evaluate(env: GraspEnv, policy: TeacherPolicy, trials: int, seed: int) -> di
       success {"successes", "n"}; objects {name: {"successes", "n"}}; saturated_actions; motion, a row
       {"object", ...} of `motion_metrics` for each object that came up, and one for all.
     """
-    key = np.asarray(jax.random.PRNGKey(seed))
-    mesh = devices.make_mesh()
-    success, index, motion = _episodes(env, mesh, trials, policy.layers, policy.mean, policy.std, key)
-    success, index = np.asarray(success)[:trials] > 0, np.asarray(index)[:trials]
-    motion = [np.asarray(part)[:, :trials] for part in motion]
+    keys = jax.random.split(jax.random.PRNGKey(seed), trials)
+    seen = roll_out(env, policy, keys, motion_of)
+    success, index = seen.success, seen.object_index
+    motion = (seen.kept["velocity_rad_s"], seen.kept["action"], seen.running)
     chosen = {name: index == i for i, name in enumerate(env.table.names)} | {"all": index >= 0}
     rows = [
         {"object": name} | motion_metrics(*(part[:, which] for part in motion))

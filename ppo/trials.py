@@ -3,18 +3,20 @@ much of the object the camera sees.
 """
 
 from collections.abc import Sequence
-from functools import partial
 
 import jax
 import jax.numpy as jp
 import numpy as np
 from flax import struct
+from mujoco_playground import State
 
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import TOUCH_N, GraspEnv
 from mjx_envs.physics.interface import ModelParams
+from ppo.evaluate import motion_of
 from ppo.motion import motion_metrics
 from ppo.policy import TeacherPolicy
+from ppo.rollout import roll_out
 from ppo.visible import Watcher, moments
 
 
@@ -52,29 +54,22 @@ def episode_keys(env: GraspEnv, per_object: int, seed: int) -> np.ndarray:
 
 def record(env: GraspEnv, policy: TeacherPolicy, keys: np.ndarray) -> Trials:
     """The deterministic `policy` in the episodes of `keys` (N, 2)."""
-    recorded = _record(env, policy.layers, policy.mean, policy.std, jp.asarray(keys))
-    return Trials(*jax.tree.map(np.asarray, recorded))
+    seen = roll_out(env, policy, keys, _scene_and_motion)
+    kept = seen.kept
+    return Trials(
+        params=seen.params,
+        qpos=kept["qpos"],
+        touched=np.logical_or.accumulate(kept["touching"], axis=0),
+        running=seen.running,
+        action=kept["action"],
+        velocity_rad_s=kept["velocity_rad_s"],
+        success=seen.success,
+    )
 
 
-@partial(jax.jit, static_argnums=0)
-def _record(env: GraspEnv, layers, mean, std, keys):
-    policy = TeacherPolicy(mean, std, layers)
-    state = jax.vmap(env.reset)(keys)
-    params = state.info["episode"].params
-
-    def step(carry, _):
-        state, alive, touched, success = carry
-        touched = touched | jp.any(state.data.touch > TOUCH_N, axis=-1)
-        action = policy(state.obs, jp)
-        new = jax.vmap(env.step)(state, action)
-        success = jp.where(alive, new.metrics["success"] > 0, success)
-        kept = (state.data.qpos, touched, alive, action, new.data.qvel[:, :7])
-        return (new, alive & (new.done == 0), touched, success), kept
-
-    never = jp.zeros(len(keys), bool)
-    start = (state, ~never, never, never)
-    (*_, success), kept = jax.lax.scan(step, start, None, env.config.episode_steps)
-    return (params, *kept, success)
+def _scene_and_motion(before: State, action: jax.Array, after: State) -> dict[str, jax.Array]:
+    touching = jp.any(before.data.touch > TOUCH_N, axis=-1)
+    return {"qpos": before.data.qpos, "touching": touching} | motion_of(before, action, after)
 
 
 def measure(

@@ -4,9 +4,11 @@ import mujoco
 import numpy as np
 
 from ddgrasp import contract
-from ddgrasp.config import RecordConfig, StereoConfig
-from mjx_envs.camera import Buffers, Camera, look_at
+from ddgrasp.config import Config, RecordConfig, StereoConfig
+from mjx_envs import draws, kinematics
+from mjx_envs.camera import Buffers, Camera, look_at, nominal_camera
 from mjx_envs.render.raycast_numpy import render, render_depth
+from rig.world import RigWorld
 from sensors.models.active_stereo import ActiveStereo
 from sensors.models.materials import rig_materials
 
@@ -44,6 +46,11 @@ class RigCamera:
         return np.rint(np.clip(buffers.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
+def make_camera(config: Config, world: RigWorld) -> RigCamera:
+    """The configured camera, before `world`."""
+    return RigCamera(world.model, config.record.stereo, config.world.profile)
+
+
 def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> np.ndarray:
     """(4, 4) T_world_cam near the nominal extrinsics: position, aim and roll drawn uniformly."""
     position = np.array(contract.CAMERA_POSITION_M)
@@ -55,3 +62,11 @@ def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> np.ndarray:
     c, s = np.cos(roll), np.sin(roll)
     T_world_cam[:3, :3] = T_world_cam[:3, :3] @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return T_world_cam
+
+
+def camera_pose(config: Config, rng: np.random.Generator) -> np.ndarray:
+    """(4, 4) T_world_cam of one trial: the nominal place within the calibration error trained for."""
+    spread = config.world.random
+    shift_m = rng.uniform(-1, 1, 3) * spread.camera_position_m
+    turn = kinematics.quat_from_rotation_vector(rng.uniform(-1, 1, 3) * spread.camera_angle_rad)
+    return draws.displaced(nominal_camera(config.world.profile).T_world_cam, shift_m, turn)

@@ -36,7 +36,7 @@ def standing_scenes(
 
     Scene i is the same whatever the camera's configuration: cameras are compared on the same scenes.
     """
-    world = RigWorld(objects=objects, randomise=True)
+    world = RigWorld(objects)
     camera = RigCamera(world.model, config.stereo, profile)
     body = mujoco.mj_name2id(world.model, mujoco.mjtObj.mjOBJ_BODY, "object")
     for index in range(per_object * len(objects)):

@@ -6,7 +6,7 @@ every trajectory. Only pictures are kept: no pose, no CAD model, no clean depth.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +16,10 @@ from ddgrasp.config import Config
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
 from mjx_envs.camera import nominal_camera
-from rig.camera import RigCamera, jittered_pose
+from rig.camera import RigCamera, jittered_pose, make_camera
+from rig.world import RigWorld, make_world
 from sensors.recordings.recording import Recording, RecordingWriter, is_recording
 from sensors.statistics import stats
-
-if TYPE_CHECKING:
-    from rig.world import RigWorld
 
 STATIC_FRAMES = 10
 """Frames of a standing scene behind the temporal statistics."""
@@ -33,12 +31,11 @@ Policy = Callable[[np.ndarray], np.ndarray]
 def run(job: Job) -> Artifact:
     """Record `config.record.trajectories` episodes; finished recordings are kept on resume."""
     from ppo import policy as teacher_policy
-    from rig.world import RigWorld
 
     config, directory, progress = job.config, job.directory, job.progress
     policy = teacher_policy.load(job.parents["teacher"].directory)
-    world = RigWorld(objects=config.world.objects, randomise=True)
-    camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+    world = make_world(config.world)
+    camera = make_camera(config, world)
     with progress.task("trajectories", config.record.trajectories) as task:
         for index in range(config.record.trajectories):
             path = directory / f"rig_{index:04d}"
@@ -53,7 +50,7 @@ def run(job: Job) -> Artifact:
 
 
 def record_trajectory(
-    config: Config, index: int, path: Path, world: "RigWorld", camera: RigCamera, policy: Policy
+    config: Config, index: int, path: Path, world: RigWorld, camera: RigCamera, policy: Policy
 ) -> None:
     """One episode of the teacher, one frame per control step, written to `path` when complete."""
     rng = np.random.default_rng([config.seed, index])
@@ -68,7 +65,7 @@ def record_trajectory(
             act(world, policy(world.observation()))
 
 
-def act(world: "RigWorld", action: np.ndarray) -> None:
+def act(world: RigWorld, action: np.ndarray) -> None:
     """Execute one (8,) action for one control period."""
     q, _ = world.state()
     target = q + contract.ACTION_SCALE_RAD * np.clip(action[:7], -1.0, 1.0)
@@ -105,7 +102,7 @@ def _summary(recordings: list[Recording]) -> dict[str, Any]:
     }
 
 
-def _static_statistics(config: Config, world: "RigWorld", camera: RigCamera) -> dict[str, float]:
+def _static_statistics(config: Config, world: RigWorld, camera: RigCamera) -> dict[str, float]:
     """Noise over time needs a scene that stands still: the robot at rest, the nominal camera."""
     rng = np.random.default_rng([config.seed, config.record.trajectories])
     name = config.world.objects[0]

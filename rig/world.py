@@ -9,10 +9,11 @@ import mujoco
 import numpy as np
 
 from ddgrasp import contract
-from ddgrasp.config import RandomConfig
+from ddgrasp.config import RandomConfig, WorldConfig
 from ddgrasp.errors import unknown_name
-from mjx_envs import grasp_math, kinematics, scene
-from mjx_envs.objects import ObjectSpec, get_object, slot_layout
+from mjx_envs import draws, grasp_math, scene
+from mjx_envs.object_spec import ObjectSpec, slot_layout
+from mjx_envs.objects import get_object
 
 SIM_DT_S = 0.0025
 
@@ -22,14 +23,12 @@ class RigWorld:
 
     Args:
       objects: names that `reset` may be asked for.
-      randomise: draw sizes, masses, frictions and dynamics within `random`; poses are always drawn.
-      random: half-ranges of what is drawn.
+      random: half-ranges of what `reset` draws; the defaults without.
     """
 
-    def __init__(self, objects: Sequence[str], randomise: bool = True, random: RandomConfig | None = None):
+    def __init__(self, objects: Sequence[str], random: RandomConfig | None = None):
         self.objects = {name: get_object(name) for name in objects}
         self._random = random or RandomConfig()
-        self._randomise = randomise
         self._layout = slot_layout(self.objects.values())
         self._base = scene.build_model(SIM_DT_S, self._layout)
         self.model = scene.build_model(SIM_DT_S, self._layout)
@@ -44,8 +43,10 @@ class RigWorld:
             raise unknown_name("object", object_name, self.objects)
         rng = np.random.default_rng(seed)
         self._spec = self._choose_pose(rng, self.objects[object_name])
-        size = self._set_object(rng)
-        self._set_dynamics(rng)
+        drawn = draws.dynamics(self._random, _units(rng))
+        size, mass, friction = (float(f) for f in drawn[:3])
+        scene.fill_slots(self.model, self._spec, self._layout, size, mass, friction)
+        self._set_dynamics(drawn)
         mujoco.mj_setConst(self.model, self.data)  # inertia that MuJoCo precomputes for free bodies
         mujoco.mj_resetData(self.model, self.data)
         self._set_pose(rng, self._spec.rest_height_m * size)
@@ -84,42 +85,37 @@ class RigWorld:
         away_m = np.linalg.norm(self.data.qpos[9:12] - np.array(contract.LIFT_TARGET_M))
         return bool(away_m < contract.LIFT_TOLERANCE_M)
 
-    def _around(self, rng: np.random.Generator, half_range: float, shape=()) -> np.ndarray:
-        scale = half_range if self._randomise else 0.0
-        return 1.0 + scale * rng.uniform(-1.0, 1.0, shape)
-
     def _choose_pose(self, rng: np.random.Generator, spec: ObjectSpec) -> ObjectSpec:
         other = rng.random() < self._random.other_pose_share
         return spec.in_other_pose() if other and spec.other_pose is not None else spec
 
-    def _set_object(self, rng: np.random.Generator) -> float:
-        random = self._random
-        ranges = (random.size, random.object_mass, random.object_friction)
-        size, mass, friction = (float(self._around(rng, half_range)) for half_range in ranges)
-        scene.fill_slots(self.model, self._spec, self._layout, size, mass, friction)
-        return size
-
-    def _set_dynamics(self, rng: np.random.Generator) -> None:
-        base, model, random = self._base, self.model, self._random
+    def _set_dynamics(self, drawn: draws.Dynamics) -> None:
+        base, model = self._base, self.model
         links = [model.body(link.name).id for link in scene.ARM_LINKS]
-        factor = self._around(rng, random.link_mass, len(links))
-        model.body_mass[links] = base.body_mass[links] * factor
-        model.body_inertia[links] = base.body_inertia[links] * factor[:, None]
+        model.body_mass[links] = base.body_mass[links] * drawn.link_mass
+        model.body_inertia[links] = base.body_inertia[links] * drawn.link_mass[:, None]
         arm = np.arange(scene.N_ARM)
-        model.dof_damping[arm] = base.dof_damping[arm] * self._around(rng, random.damping, scene.N_ARM)
-        if self._randomise:
-            model.dof_frictionloss[arm] = random.friction_nm * rng.uniform(size=scene.N_ARM)
-        gain = self._around(rng, random.stiffness, scene.N_ARM)
-        model.actuator_gainprm[arm, 0] = base.actuator_gainprm[arm, 0] * gain
-        model.actuator_biasprm[arm, 1:3] = base.actuator_biasprm[arm, 1:3] * gain[:, None]
+        model.dof_damping[arm] = base.dof_damping[arm] * drawn.damping
+        model.dof_frictionloss[arm] = drawn.joint_friction_nm
+        model.actuator_gainprm[arm, 0] = base.actuator_gainprm[arm, 0] * drawn.gain
+        model.actuator_biasprm[arm, 1:3] = base.actuator_biasprm[arm, 1:3] * drawn.gain[:, None]
 
     def _set_pose(self, rng: np.random.Generator, rest_height_m: float) -> None:
-        q = np.array(scene.HOME_RAD) + self._random.joint_rad * rng.uniform(-1, 1, scene.N_ARM)
-        half = np.array(contract.WORKSPACE_SIZE_M) / 2
-        xy = np.array(contract.WORKSPACE_CENTER_M) + half * rng.uniform(-1, 1, 2)
-        yaw = rng.uniform(-np.pi, np.pi)
-        self.data.qpos[:7] = q
-        self.data.qpos[7:9] = contract.GRIPPER_MAX_WIDTH_M / 2
-        self.data.qpos[9:12] = (*xy, rest_height_m)
-        self.data.qpos[12:16] = kinematics.quat_about_z(np.asarray(yaw))
-        self.command(q, close=False)
+        joints, xy = rng.uniform(-1, 1, scene.N_ARM), rng.uniform(-1, 1, 2)
+        yaw = np.asarray(rng.uniform(-np.pi, np.pi))
+        self.data.qpos[:] = draws.start_qpos(self._random, joints, xy, yaw, rest_height_m)
+        self.command(self.data.qpos[:7], close=False)
+
+
+def make_world(config: WorldConfig, objects: Sequence[str] = ()) -> RigWorld:
+    """The configured world, with the configured objects or `objects`."""
+    return RigWorld(objects or config.objects, config.random)
+
+
+def _units(rng: np.random.Generator) -> draws.Units:
+    """The order of the draws is that of `draws.Units`; every seed's trial hangs on it."""
+    arm = scene.N_ARM
+    size, mass, friction = (rng.uniform(-1.0, 1.0, ()) for _ in range(3))
+    link_mass, damping = rng.uniform(-1.0, 1.0, arm), rng.uniform(-1.0, 1.0, arm)
+    joint_friction, stiffness = rng.uniform(size=arm), rng.uniform(-1.0, 1.0, arm)
+    return draws.Units(size, mass, friction, link_mass, damping, joint_friction, stiffness)

@@ -1,4 +1,4 @@
-"""The student at the wheel of many simulated environments, on clean or generated depth."""
+"""The student at the wheel of many simulated environments, on clean depth or a depth source's."""
 
 from collections.abc import Callable
 from functools import partial
@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ddg_jax.sample import Generator, generate
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from demos.rollout import Scene
+from student_jax.depth_source import DepthSource
 from student_jax.policy import sample_actions
 
 Corrupt = Callable[[Scene], np.ndarray]
@@ -22,23 +22,17 @@ def keep_clean(scene: Scene) -> np.ndarray:
     return scene.depth_mm
 
 
-class DDGCamera:
-    """Generated artefacts for environments in lock-step: number i is episode `first + i` of the generator.
+class SourceCamera:
+    """A depth source before environments in lock-step: number i is its episode `first + i`."""
 
-    Frames of one environment share noise over time, as the generator's episodes do.
-    """
-
-    def __init__(self, generator: Generator, key: jax.Array, first: int = 0):
-        self._generator, self._key, self._first = generator, key, first
+    def __init__(self, source: DepthSource, first: int = 0):
+        self._source, self._first = source, first
 
     def __call__(self, scene: Scene) -> np.ndarray:
         """(B, H, W) uint16 with artefacts."""
-        episode = self._first + np.arange(len(scene.depth_mm))
-        frame = np.full(len(scene.depth_mm), scene.step)
-        depth_m = scene.depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
-        rgb = scene.rgb if self._generator.prior.needs_sim_rgb else None
-        noisy = generate(self._key, self._generator, depth_m, rgb, episode=episode, frame=frame)
-        return np.round(noisy.depth_m / contract.DEPTH_UNIT_M).astype(np.uint16)
+        count = len(scene.depth_mm)
+        episode, frame = self._first + np.arange(count), np.full(count, scene.step)
+        return self._source.frames(scene.depth_mm, scene.rgb, episode, frame)
 
 
 class StudentActor:

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from ddg_jax.sample import Generator
 from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_json
 from ddgrasp.progress import Progress
@@ -25,7 +24,8 @@ from learning.params import load_params, save_params
 from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
 from student_jax import frames_io, head, pretrained_encoder, train
-from student_jax.act import DDGCamera, StudentActor
+from student_jax.act import SourceCamera, StudentActor
+from student_jax.depth_source import DepthSource
 from student_jax.policy import PARAMS_FILE, init_params
 
 PLAN = "plan.json"
@@ -44,12 +44,12 @@ class Trainer:
         self,
         config: Config,
         teacher: TeacherPolicy,
-        generator: Generator,
+        source: DepthSource,
         directory: Path,
         progress: Progress,
     ):
         self._config, self._student, self._profile = config, config.student, config.world.profile
-        self._teacher, self._generator = teacher, generator
+        self._teacher, self._source = teacher, source
         self._directory, self._progress = directory, progress
         self._store = EpisodeStore(directory / frames_io.CACHE, create=True)
         self._done: list[str] = []
@@ -60,7 +60,7 @@ class Trainer:
         """Every phase that is not finished; `params` is then the student."""
         self._restore()
         self._phase("poses", self._fit_on_poses)
-        frames_io.add_noisy_demos(demos, self._store, self._generator, self._config, self._progress)
+        frames_io.add_noisy_demos(demos, self._store, self._source, self._config, self._progress)
         self._phase("demos", lambda: self._fit("demos", self._student.training.steps))
         for i in range(1, self._student.dagger.rounds + 1):
             self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))
@@ -124,14 +124,12 @@ class Trainer:
         if len(self._store) < wanted:
             first = len(self._store)
             share = student.dagger.teacher_share * (1 - (number - 1) / max(1, student.dagger.rounds - 1))
-            key = jax.random.key(self._config.seed)
             rng = np.random.default_rng([self._config.seed, _DAGGER_SEED, number])
-            camera = DDGCamera(self._generator, key, first=first)
+            camera = SourceCamera(self._source, first)
             actor = StudentActor(
                 self.params, student, self._profile, camera, rng, self._config.deploy.noise, share
             )
-            with_rgb = self._generator.prior.needs_sim_rgb
-            roller = Roller(self._config, self._teacher, wanted - first, with_rgb)
+            roller = Roller(self._config, self._teacher, wanted - first, self._source.needs_rgb)
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
                 key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
                 episodes = roller.run(key, actor, lambda _: task.advance())

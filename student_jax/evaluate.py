@@ -1,31 +1,30 @@
-"""Closed-loop success of a student in its own simulation, on clean and on generated depth."""
+"""Closed-loop success of a student in its own simulation, on clean depth and on its depth source's."""
 
 from typing import Any
 
 import jax
 import numpy as np
 
-from ddg_jax.sample import Generator
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
 from demos.rollout import Episodes, Roller
 from ppo.policy import TeacherPolicy
-from student_jax.act import DDGCamera, StudentActor, keep_clean
+from student_jax.act import SourceCamera, StudentActor, keep_clean
+from student_jax.depth_source import DepthSource
 
 _SEED = 50_000
 _FIRST_EPISODE = 1_000_000
-"""Numbers of the generator's episodes here, far from those of training."""
+"""Numbers of the source's episodes here, far from those of training."""
 
 
 def closed_loop(
-    config: Config, teacher: TeacherPolicy, generator: Generator, params: Any, progress: Progress
+    config: Config, teacher: TeacherPolicy, source: DepthSource, params: Any, progress: Progress
 ) -> dict[str, Any]:
-    """`student_clean` and `student_ddg`: counts in total and per object, on the same seeds."""
-    with_rgb = generator.prior.needs_sim_rgb
-    roller = Roller(config, teacher, config.evaluation.student_trials, with_rgb)
+    """`student_clean` and `student_ddg` (the source's depth): counts per object and in all, same seeds."""
+    roller = Roller(config, teacher, config.evaluation.student_trials, source.needs_rgb)
     cameras = {
         "student_clean": keep_clean,
-        "student_ddg": DDGCamera(generator, jax.random.key(config.seed), first=_FIRST_EPISODE),
+        "student_ddg": SourceCamera(source, first=_FIRST_EPISODE),
     }
     metrics = {}
     for name, camera in cameras.items():

@@ -2,28 +2,29 @@
 
 from pathlib import Path
 
-import jax
 import numpy as np
 
-from ddg_jax.generate import Clip, noisy_episodes
-from ddg_jax.sample import Generator
+from ddg_jax.generate import Clip
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
 from demos.rollout import Episodes
 from demos.store import EpisodeStore
 from student_jax.data import Frames, make_frames
+from student_jax.depth_source import DepthSource, check_colour
 
 CACHE = "frames.zarr"
 _FIELDS = ("depth_mm", "state", "action", "observation", "held")
 
 
 def add_noisy_demos(
-    demos: EpisodeStore, frames: EpisodeStore, generator: Generator, config: Config, progress: Progress
+    demos: EpisodeStore, frames: EpisodeStore, source: DepthSource, config: Config, progress: Progress
 ) -> None:
-    """Copies the demos into `frames` with generated artefacts on their depth, going on from what is there.
+    """Copies the demos into `frames` with the source's artefacts on their depth, going on from what is there.
 
-    A share of `config.student.clean_share` keeps clean depth. Steps long after the grasp are left out.
+    A share of `config.student.training.clean_share` keeps clean depth. Steps long after the grasp are left
+    out. UserError if the source needs colour that the demos lack.
     """
+    check_colour(source, demos)
     ends = np.concatenate([[0], demos.ends])
     held = np.split(demos.steps("held"), ends[1:-1])
     lengths = [useful_steps(episode, config.student.training.demo_held_steps) for episode in held]
@@ -32,16 +33,11 @@ def add_noisy_demos(
 
     def read(i: int) -> Clip:
         rows = int(ends[chosen[i]]), int(ends[chosen[i]]) + lengths[chosen[i]]
-        rgb = demos.steps("rgb", *rows) if generator.prior.needs_sim_rgb else None
+        rgb = demos.steps("rgb", *rows) if source.needs_rgb else None
         return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb)
 
-    noisy = noisy_episodes(
-        jax.random.key(config.seed),
-        generator,
-        [lengths[i] for i in chosen],
-        read,
-        int(np.sum(~keep_clean[: len(frames)])),
-    )
+    done = int(np.sum(~keep_clean[: len(frames)]))
+    noisy = source.episodes([lengths[i] for i in chosen], read, done)
     with progress.task("artefacts on the demos", len(demos)) as task:
         task.start_at(len(frames))
         for i in range(len(frames), len(demos)):

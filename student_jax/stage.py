@@ -1,6 +1,6 @@
-"""Stage `student`: demos, generator and teacher -> depth-only diffusion policy.
+"""Stage `student`: demos, depth source (the generator) and teacher -> depth-only diffusion policy.
 
-The action head learns from true poses with noise; perception from the demos with generated artefacts
+The action head learns from true poses with noise; perception from the demos with a camera's artefacts
 and from DAgger, where the student acts, the teacher labels, and all frames so far are fitted again; last
 the head on what perception reports. Each part leaves a checkpoint, so that an interrupted stage goes on
 from the last finished part.
@@ -8,7 +8,6 @@ from the last finished part.
 
 import shutil
 
-from ddg_jax.sample import Generator
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.job import Job
@@ -17,18 +16,19 @@ from demos.store import EpisodeStore
 from ppo import policy as teacher_policy
 from student_jax import evaluate, frames_io, pretrained_encoder
 from student_jax.dagger import Trainer
+from student_jax.depth_source import make_source
 from student_jax.head import POSES
 
 
 def run(job: Job) -> Artifact:
-    """Trains the student and evaluates it closed-loop on clean and on generated depth."""
+    """Trains the student and evaluates it closed-loop on clean depth and on the source's."""
     config, directory, progress, parents = job.config, job.directory, job.progress, job.parents
     encoder_weights = pretrained_encoder.source(config.student)
-    generator = Generator.load(parents["ddg"].directory)
+    source = make_source(config, parents["ddg"].directory)
     teacher = teacher_policy.load(parents["teacher"].directory)
-    trainer = Trainer(config, teacher, generator, directory, progress)
+    trainer = Trainer(config, teacher, source, directory, progress)
     trainer.run(EpisodeStore(parents["demos"].directory / STORE))
-    metrics = evaluate.closed_loop(config, teacher, generator, trainer.params, progress)
+    metrics = evaluate.closed_loop(config, teacher, source, trainer.params, progress)
     metrics |= {"tried": trainer.history, "frames": trainer.frame_count, "encoder_weights": encoder_weights}
     shutil.rmtree(directory / frames_io.CACHE, ignore_errors=True)
     (directory / POSES).unlink(missing_ok=True)

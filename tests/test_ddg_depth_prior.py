@@ -14,7 +14,8 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json
 from demos.rollout import Scene
 from foundation import convert, store
-from student_jax.act import DDGCamera
+from student_jax.act import SourceCamera
+from student_jax.depth_source import GeneratorSource
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def test_the_students_camera_shows_the_prior_each_environment_by_itself(weights,
         rgb=rng.integers(0, 256, (3, 24, 32, 3)).astype(np.uint8),
         **{name: np.zeros(3) for name in ("state", "expert", "observation", "held")},
     )
-    camera = DDGCamera(sample.Generator(settings, {}, prior), jax.random.key(1))
+    camera = SourceCamera(GeneratorSource(sample.Generator(settings, {}, prior), jax.random.key(1)))
     seen = camera(scene)
     for environment in range(3):
         assert scene.rgb is not None

@@ -78,3 +78,10 @@ def test_a_lost_chunk_is_refused_not_read_as_zeros(tmp_path, field):
 def test_no_store_there(tmp_path):
     with pytest.raises(UserError, match="no episode store"):
         EpisodeStore(tmp_path / "nothing.zarr")
+
+
+def test_zeros_are_kept_over_several_appends(tmp_path):
+    for length in (3, 4):
+        store = EpisodeStore(tmp_path / "e", create=True)
+        store.append({"held": np.zeros(length, bool)}, {"object_index": np.int32(0)})
+    assert store.steps("held").tolist() == [False] * 7 and store.episodes("object_index").tolist() == [0, 0]

@@ -14,7 +14,9 @@ from ddgrasp import contract
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy.clock import SimClock
+from deploy.devices import registry
 from deploy.devices.franka_robot import FrankaRobot
+from deploy.devices.options import Setup
 from deploy.devices.realsense_camera import RealSenseCamera
 from deploy.devices.replay_camera import ReplayCamera
 from deploy.loop import ControlLoop, LoopSettings
@@ -153,18 +155,47 @@ def test_wrong_combination_gets_one_line(options, message):
         deploy(get_preset("debug"), Path("absent.onnx"), options)
 
 
+def test_every_pair_is_refused_or_can_be_made(recording):
+    preset = get_preset("debug")
+    info = describe(depth_height=180, depth_width=320)
+    made, refused = {}, set()
+    for robot in registry.ROBOTS:
+        for camera in registry.CAMERAS:
+            options = SessionOptions(robot, camera, recording, object_name=preset.world.objects[0])
+            try:
+                registry.check_devices(options)
+            except UserError:
+                refused.add((robot, camera))
+                continue
+            made[robot, camera] = registry.make_devices(Setup(preset, options, info, SimClock()))
+    assert refused == set(registry.REFUSED) == {("franka", "stereo"), ("franka", "replay")}
+    names = {pair: tuple(type(device).__name__ for device in devices) for pair, devices in made.items()}
+    assert names == {
+        ("sim", "stereo"): ("SimRobot", "StereoCamera"),
+        ("sim", "realsense"): ("SimRobot", "RealSenseCamera"),
+        ("sim", "replay"): ("SimRobot", "ReplayCamera"),
+        ("franka", "realsense"): ("FrankaRobot", "RealSenseCamera"),
+    }
+    robot, camera = made["sim", "stereo"]
+    camera.start()
+    assert camera.read().depth.shape == (180, 320) and robot.read_state().q_rad.shape == (7,)
+    metres = Setup(preset, SessionOptions(camera="realsense"), describe("float32_m"), SimClock())
+    with pytest.raises(UserError, match="the policy takes float32_m: export it"):
+        registry.make_devices(metres)
+
+
 def test_sigterm_holds_and_stops_the_robot_as_ctrl_c_does(tmp_path, monkeypatch):
     devices = []
 
-    def kinematic(config, options, info, clock):
-        devices.extend([KinematicRobot(clock), ScriptedCamera(clock, [depth_mm()])])
+    def kinematic(setup):
+        devices.extend([KinematicRobot(setup.clock), ScriptedCamera(setup.clock, [depth_mm()])])
         return devices
 
     def terminate_twice():  # `timeout` and supervisors signal the process and its group
         for _ in range(2):
             os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr("deploy.session._devices", kinematic)
+    monkeypatch.setattr("deploy.session.make_devices", kinematic)
     before, said = signal.getsignal(signal.SIGTERM), []
     path = write_policy(tmp_path / "p.onnx", describe(), bias=constant_bias(0.2))
     threading.Timer(0.5, terminate_twice).start()

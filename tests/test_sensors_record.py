@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ddgrasp import contract
+from ddgrasp.config import RandomConfig
 from ddgrasp.presets import get_preset
 from rig.camera import RigCamera
 from rig.stage import act, record_trajectory
@@ -21,7 +22,7 @@ def config():
 
 
 def _record(config, path, index=0) -> Recording:
-    world = rig.RigWorld(objects=config.world.objects, randomise=True)
+    world = rig.make_world(config.world)
     camera = RigCamera(world.model, config.record.stereo, config.world.profile)
 
     def reach_down(observation: np.ndarray) -> np.ndarray:
@@ -54,7 +55,7 @@ def test_same_index_gives_the_same_recording_another_index_another_view(config, 
 
 
 def test_action_is_scaled_and_clipped_to_the_joint_limits(config):
-    world = rig.RigWorld(objects=config.world.objects, randomise=False)
+    world = rig.RigWorld(config.world.objects, RandomConfig(friction_nm=0.0, joint_rad=0.0))
     world.reset(0, "cube")
     before, _ = world.state()
     for _ in range(10):

@@ -17,6 +17,7 @@ ORDER = (
 JAX = {"jax", "jaxlib", "flax", "optax", "brax", "orbax", "mujoco.mjx", "mujoco_playground"}
 JAX_FREE = (
     "ddgrasp", "deploy", "evaluation", "ddgrasp.policy_metadata", "mjx_envs.scene", "mjx_envs.objects",
+    "mjx_envs.object_spec", "mjx_envs.draws",
     "mjx_envs.render.ray_geometry", "mjx_envs.render.raycast_numpy", "mjx_envs.camera", "rig.world",
     "sensors.models.active_stereo", "sensors.recordings.recording",
     "evaluation.camera_comparison", "sensors.recordings.importers",

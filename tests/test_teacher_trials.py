@@ -101,7 +101,10 @@ def _nominal_params(env: GraspEnv):
     params = env.reset(jax.random.PRNGKey(0)).info["episode"].params
     table = env.table
     return replace(
-        params, slot_size=table.slot_size[0], slot_pos=table.slot_pos[0], slot_quat=table.slot_quat[0]
+        params,
+        slot_size=table.model.slot_size[0],
+        slot_pos=table.model.slot_pos[0],
+        slot_quat=table.model.slot_quat[0],
     )
 
 

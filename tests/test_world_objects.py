@@ -15,16 +15,8 @@ from evaluation import object_sheet
 from mjx_envs import grasp_math, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import GraspEnv
-from mjx_envs.objects import (
-    DEFAULT_SLOTS,
-    OBJECTS,
-    Box,
-    Capsule,
-    ObjectSpec,
-    SlotLayout,
-    get_object,
-    slot_layout,
-)
+from mjx_envs.object_spec import DEFAULT_SLOTS, Box, Capsule, ObjectSpec, SlotLayout, slot_layout
+from mjx_envs.objects import OBJECTS, get_object
 from mjx_envs.randomize import ObjectTable, sample_params
 from mjx_envs.render import raycast_numpy
 from mjx_envs.render.visual import Viewer
@@ -213,7 +205,7 @@ def test_the_scene_has_as_many_slots_as_the_chosen_objects_need():
     assert ObjectTable(("cube", "wheel")).layout == SlotLayout(capsules=8, cylinders=2)
     twelve = ObjectTable(TWELVE)
     assert twelve.layout == SlotLayout(capsules=8, cylinders=2, plates=5)
-    assert twelve.slot_size.shape == (12 + len(BOTH_POSES), 16, 3) and twelve.rgb.shape == (12, 16, 3)
+    assert twelve.model.slot_size.shape == (12 + len(BOTH_POSES), 16, 3) and twelve.rgb.shape == (12, 16, 3)
     model = scene.build_model(layout=twelve.layout)
     assert [model.geom(i).name for i in scene.slot_ids(model)] == list(twelve.layout.names)
 

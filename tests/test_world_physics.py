@@ -9,7 +9,8 @@ from ddgrasp.config import RandomConfig
 from ddgrasp.errors import UserError
 from mjx_envs import inverse_kinematics, kinematics, randomize, scene
 from mjx_envs.grasp_math import HAND_DOWN
-from mjx_envs.objects import DEFAULT_SLOTS, OBJECTS
+from mjx_envs.object_spec import DEFAULT_SLOTS
+from mjx_envs.objects import OBJECTS
 from mjx_envs.physics import backends, conformance
 from mjx_envs.physics import mjx_warp as physics_warp
 

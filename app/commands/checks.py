@@ -34,11 +34,12 @@ def check_options(command: Any) -> None:
 def check_config_values(config: Config) -> Config:
     """`config` if the names and files in it exist; UserError with the remedy otherwise."""
     from ddg_jax.prior import make_prior
+    from student_jax.depth_source import check_source
 
     check_objects(config.world)
     for stage, file in CHECKPOINTS.items():
         _check_start(stage, getattr(config, stage).init_from, file)
-    make_prior(config.ddg)
+    check_source(config, make_prior(config.ddg))
     if config.student.encoder.weights:
         from student_jax import pretrained_encoder
 

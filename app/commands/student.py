@@ -23,7 +23,7 @@ class StudentTrain(OneStage):
 
 @dataclass(frozen=True)
 class StudentEval:
-    """Measure a trained student again, closed loop in simulation: clean and generated depth, same seeds."""
+    """Measure a trained student again, closed loop in simulation: clean and sensed depth, same seeds."""
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run."""
@@ -34,11 +34,11 @@ class StudentEval:
 
     def run(self) -> None:
         """Prints success on clean and on generated depth, with Wilson intervals."""
-        from ddg_jax.sample import Generator
         from ddgrasp.progress import Progress
         from evaluation import wilson
         from learning.params import load_params
         from ppo.policy import load_policy
+        from student_jax.depth_source import make_source
         from student_jax.evaluate import closed_loop
         from student_jax.policy import PARAMS_FILE
 
@@ -46,9 +46,9 @@ class StudentEval:
         evaluation = replace(config.evaluation, student_trials=self.trials)
         config = replace(config, seed=self.seed, evaluation=evaluation)
         params = load_params(self.run_dir / "student" / PARAMS_FILE)
-        generator = Generator.load(self.run_dir / "ddg")
+        source = make_source(config, self.run_dir / "ddg")
         teacher = load_policy(self.run_dir / "teacher")
-        result = closed_loop(config, teacher, generator, params, Progress(name="student eval"))
+        result = closed_loop(config, teacher, source, params, Progress(name="student eval"))
         for name, counts in result.items():
             success = counts["success"]
             print(f"{name:<14} {wilson.describe(wilson.success(success['successes'], success['n']))}")

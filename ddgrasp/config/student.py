@@ -18,6 +18,7 @@ from ddgrasp.config.checks import (
     WeightDecay,
     Width,
 )
+from ddgrasp.config.sensors import Sensor
 from ddgrasp.errors import UserError
 
 Channel = Literal["relief", "valid", "depth"]
@@ -226,6 +227,9 @@ class StudentConfig(Section, name="student"):
     dagger: DaggerConfig = field(default_factory=DaggerConfig)
     init_from: Text = ""
     """Run directory or pretrained folder whose student to start from; empty starts from nothing."""
+    depth_source: Sensor = "learned"
+    """What gives the demos' clean depth a camera's artefacts: learned (the run's generator), ideal (nothing),
+    dextrah, kinect or stereo (the rig's camera on the clean picture; needs demos.rgb)."""
 
     def check(self) -> None:
         """See `Section.check`."""

@@ -14,12 +14,24 @@ import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
+from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotState
 
 GRIPPER_SPEED_M_S = 0.1
 GRASP_ANY_WIDTH_M = contract.GRIPPER_MAX_WIDTH_M
 """franky's outer tolerance: a grasp of any width counts, as in simulation."""
 WIDTH_PERIOD_S = 0.03
+
+
+def make(setup: Setup) -> "FrankaRobot":
+    """The configured arm, not connected yet."""
+    config = setup.config.deploy.franka
+    return FrankaRobot(
+        config.host,
+        setup.clock,
+        dynamics=config.dynamics,
+        grip_force_n=config.grip_force_n,
+    )
 
 
 class FrankaRobot:

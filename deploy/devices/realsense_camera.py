@@ -11,12 +11,25 @@ import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
-from deploy.interfaces import CameraError, Clock, Frame
+from deploy.devices.options import Setup
+from deploy.interfaces import CameraError, Clock, Frame, Robot
 from sensors.recordings.realsense import load_pyrealsense2
 
 STREAM_WIDTH_PX, STREAM_HEIGHT_PX = 1280, 720
 FOCAL_TOLERANCE = 0.1
 """A focal length further than this (relative) from the policy's is another camera."""
+
+
+def make(setup: Setup, robot: Robot) -> "RealSenseCamera":
+    """At the policy's picture size; UserError for a policy that takes no millimetres."""
+    info = setup.info
+    if info.depth_dtype != "uint16_mm":
+        raise UserError(
+            f"camera 'realsense' gives uint16 millimetres, the policy takes {info.depth_dtype}: export it "
+            "with export.depth_dtype uint16_mm."
+        )
+    profile = contract.D455.scaled(info.depth_width / contract.D455.width_px)
+    return RealSenseCamera(setup.clock, profile, serial=setup.config.deploy.realsense.serial)
 
 
 class RealSenseCamera:

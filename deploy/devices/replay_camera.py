@@ -4,10 +4,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ddgrasp import contract
-from deploy.interfaces import Clock, Frame
+from deploy.devices.options import Setup
+from deploy.interfaces import Clock, Frame, Robot
 
 if TYPE_CHECKING:
     from sensors.recordings.recording import Recording
+
+
+def make(setup: Setup, robot: Robot) -> "ReplayCamera":
+    """Plays the chosen recording; UserError if there is none."""
+    assert setup.options.recording is not None  # `registry.check_devices` sees to it
+    return ReplayCamera.open(setup.options.recording, setup.clock)
 
 
 class ReplayCamera:

@@ -5,11 +5,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deploy.interfaces import Frame
+from deploy.devices.options import Setup
+from deploy.devices.rig_robot import SimRobot
+from deploy.interfaces import Frame, Robot
 
 if TYPE_CHECKING:
     from rig.camera import RigCamera
     from rig.world import RigWorld
+
+
+def make(setup: Setup, robot: Robot) -> "StereoCamera":
+    """Before the simulated robot's world, within the calibration error."""
+    from rig.camera import camera_pose, make_camera
+
+    assert isinstance(robot, SimRobot)  # `registry.REFUSED` sees to it
+    config, world = setup.config, robot.world
+    rng = np.random.default_rng(config.seed)
+    camera, pose = make_camera(config, world), camera_pose(config, rng)
+    return StereoCamera(world, camera, pose, rng, robot.catch_up, next(iter(world.objects)))
 
 
 class StereoCamera:

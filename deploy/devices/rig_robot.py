@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ddgrasp import contract
+from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotState
 
 if TYPE_CHECKING:
@@ -13,6 +14,18 @@ if TYPE_CHECKING:
 
 _EARLY_S = 1e-6
 """Clock readings this much before a period's end count as its end (rounding)."""
+
+
+def make(setup: Setup) -> "SimRobot":
+    """Before a fresh world with the chosen object; UserError for an unknown one."""
+    from mjx_envs.objects import get_object
+    from rig.world import make_world
+
+    config = setup.config
+    name = get_object(setup.options.object_name or config.world.objects[0]).name
+    world = make_world(config.world, (name,))
+    world.reset(config.seed, name)
+    return SimRobot(world, setup.clock, 1.0 / setup.info.control_hz)
 
 
 class SimRobot:

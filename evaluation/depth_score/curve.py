@@ -147,16 +147,16 @@ def _frames(
 def _record_more(config: Config, teacher: Path, numbers: range, directory: Path, progress: Progress) -> None:
     """Trajectories that the run's record stage would have recorded next; finished ones are kept."""
     from ppo import policy as teacher_policy
-    from rig.camera import RigCamera
+    from rig.camera import make_camera
     from rig.stage import record_trajectory
-    from rig.world import RigWorld
+    from rig.world import make_world
     from sensors.recordings.recording import is_recording
 
     missing = [n for n in numbers if not is_recording(directory / f"rig_{n:04d}")]
     if not missing:
         return
     policy = teacher_policy.load(teacher)
-    world = RigWorld(objects=config.world.objects, randomise=True)
-    camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+    world = make_world(config.world)
+    camera = make_camera(config, world)
     for number in progress.track(missing, "more trajectories"):
         record_trajectory(config, number, directory / f"rig_{number:04d}", world, camera, policy)

@@ -96,12 +96,12 @@ def record_rig(
 
 def _rig_recorder(config: Config, teacher: Path, with_rgb: bool) -> Callable[[str, int], Episode]:
     from ppo import policy as teacher_policy
-    from rig.camera import RigCamera
-    from rig.world import RigWorld
+    from rig.camera import make_camera
+    from rig.world import make_world
 
     policy = teacher_policy.load(teacher)
-    world = RigWorld(objects=config.world.objects, randomise=True)
-    camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+    world = make_world(config.world)
+    camera = make_camera(config, world)
     return lambda side, number: _record(config, side, number, world, camera, policy, with_rgb)
 
 

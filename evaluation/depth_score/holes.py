@@ -20,7 +20,7 @@ BINS: dict[str, Sequence[float]] = {
     "depth_m": DEPTH_EDGES_M, "edge_distance_px": EDGE_DISTANCE_PX, "incidence_deg": INCIDENCE_DEG,
 }  # fmt: skip
 """Quantities of the clean geometry that hole rates are drawn against, and their bins' edges."""
-SIZE_BINS = 17
+SIZE_EDGES_PX = (*(2**b for b in range(17)), np.inf)
 """Hole sizes 1, 2-3, 4-7, ... pixels."""
 OUTLIER_M = 0.05
 """A valid pixel farther than this from the clean depth is an outlier."""
@@ -75,7 +75,7 @@ def episode_sums(depth_m: np.ndarray, clean_m: np.ndarray, places: Sequence[Mapp
     holes, surface = depth_m <= 0, clean_m > 0
     both = ~holes & surface
     error = (depth_m - clean_m)[both].astype(np.float64)
-    changed = holes[1:] != holes[:-1]
+    changed = stats.validity_changes(depth_m)
     sums: Sums = {
         "pixels": np.array(holes.size), "holes": np.array(holes.sum()), "frames": np.array(len(depth_m)),
         "valid": np.array(both.sum()), "error": np.array(error.sum()),
@@ -83,22 +83,13 @@ def episode_sums(depth_m: np.ndarray, clean_m: np.ndarray, places: Sequence[Mapp
         "outliers": np.array((np.abs(error) > OUTLIER_M).sum()),
         "pairs": np.array(changed.size), "changed": np.array(changed.sum()),
         "hole_before": np.array(holes[:-1].sum()), "hole_stayed": np.array((holes[1:] & holes[:-1]).sum()),
-        "size_counts": size_counts(holes),
+        "size_counts": stats.size_counts(depth_m, SIZE_EDGES_PX),
     }  # fmt: skip
     for name, edges in BINS.items():
         values = np.stack([place[name] for place in places])
-        bins = np.digitize(values[surface], edges[1:-1])
-        count = len(edges) - 1
-        sums[f"{name}_pixels"] = np.bincount(bins, minlength=count)
-        sums[f"{name}_holes"] = np.bincount(bins, weights=holes[surface], minlength=count)
+        lost, count = stats.lost_by_bin(values[surface], holes[surface], edges)
+        sums[f"{name}_pixels"], sums[f"{name}_holes"] = count, lost
     return sums
-
-
-def size_counts(holes: np.ndarray) -> np.ndarray:
-    """(SIZE_BINS,) connected regions of (T, H, W) bool holes; bin b counts those of 2^b to 2^(b+1) - 1 px."""
-    sizes = np.concatenate([stats.hole_sizes_px((~frame).astype(np.uint16)) for frame in holes])
-    bins = np.minimum(np.log2(np.maximum(sizes, 1)).astype(int), SIZE_BINS - 1)
-    return np.bincount(bins, minlength=SIZE_BINS)
 
 
 def repeat_sums(depth_m: np.ndarray) -> Sums:
@@ -113,7 +104,7 @@ def repeat_sums(depth_m: np.ndarray) -> Sums:
     deviation = np.std(depth_m[:, always], axis=0, ddof=1, dtype=np.float64)
     return {
         "overlap": np.array(sum(overlaps)), "overlap_pairs": np.array(len(overlaps)),
-        "still_changed": np.array((holes[1:] != holes[:-1]).sum()),
+        "still_changed": np.array(stats.validity_changes(depth_m).sum()),
         "still_pairs": np.array(holes[1:].size),
         "deviation": np.array(deviation.sum()), "deviation_pixels": np.array(always.sum()),
     }  # fmt: skip

@@ -3,7 +3,7 @@
 from ddgrasp import contract
 from ddgrasp.config import BACKENDS
 from ddgrasp.errors import unknown_name
-from mjx_envs.objects import DEFAULT_SLOTS, SlotLayout
+from mjx_envs.object_spec import DEFAULT_SLOTS, SlotLayout
 from mjx_envs.physics.interface import Physics
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from mjx_envs import devices, scene
-from mjx_envs.objects import SlotLayout
+from mjx_envs.object_spec import SlotLayout
 from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
 
 

@@ -16,7 +16,8 @@ import numpy as np
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
 from mjx_envs import grasp_math, inverse_kinematics, randomize, scene
-from mjx_envs.objects import DEFAULT_SLOTS, OBJECTS
+from mjx_envs.object_spec import DEFAULT_SLOTS
+from mjx_envs.objects import OBJECTS
 from mjx_envs.physics import interface as physics
 from mjx_envs.physics.backends import make_physics
 from mjx_envs.physics.interface import ModelParams, PhysicsState

@@ -5,7 +5,7 @@ import jax.numpy as jp
 from mujoco import mjx
 
 from mjx_envs import scene
-from mjx_envs.objects import SlotLayout
+from mjx_envs.object_spec import SlotLayout
 from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
 
 

@@ -7,7 +7,7 @@ from mujoco import mjx
 
 from ddgrasp.errors import UserError
 from mjx_envs import scene
-from mjx_envs.objects import SlotLayout
+from mjx_envs.object_spec import SlotLayout
 from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
 
 CONTACTS_PER_ENV = 40

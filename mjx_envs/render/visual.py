@@ -9,7 +9,7 @@ import numpy as np
 from ddgrasp import contract
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import Camera, nominal_camera
-from mjx_envs.objects import DEFAULT_SLOTS, SlotLayout
+from mjx_envs.object_spec import DEFAULT_SLOTS, SlotLayout
 from mjx_envs.physics.interface import ModelParams
 from mjx_envs.render.batch_render import make_renderer
 from mjx_envs.render.raycast import Geoms, render

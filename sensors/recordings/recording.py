@@ -8,8 +8,6 @@ whose depth cannot be what it claims (unit, type, size) is refused. NumPy and Op
 import json
 import os
 import shutil
-import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,7 @@ import numpy as np
 
 from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
+from sensors.recordings.integrity import inspect_frame
 
 META_FILE = "meta.json"
 JPEG_QUALITY = 95
@@ -32,9 +31,6 @@ UNIT_CHECK_FRAMES = 5
 
 D4XX_BASELINE_M = {"D435": 0.050, "D415": 0.055, "D455": 0.095}
 """Distance between the imagers, from the D400 series datasheet."""
-
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_GREY = 0
 
 
 @dataclass(frozen=True)
@@ -80,7 +76,7 @@ class Recording:
         kept, skipped, size = [], [], None
         for depth_file in depth_files:
             color_file = _color_file(path, depth_file)
-            reason, frame_size = _inspect(depth_file, color_file)
+            reason, frame_size = inspect_frame(depth_file, color_file)
             if reason:
                 skipped.append(SkippedFrame(depth_file, reason))
                 continue
@@ -344,65 +340,6 @@ def _depth_files(path: Path) -> list[Path]:
 def _color_file(path: Path, depth_file: Path) -> Path:
     png = path / "color" / f"{depth_file.stem}.png"
     return png if png.is_file() else path / "color" / f"{depth_file.stem}.jpg"
-
-
-def _inspect(depth_file: Path, color_file: Path) -> tuple[str, tuple[int, int]]:
-    """(why the frame must be left out or "", (height, width) of its depth)."""
-    data = depth_file.read_bytes()
-    header = _png_header(data)
-    if header is None:
-        return "depth picture is truncated or corrupt", (0, 0)
-    height, width, bits, kind = header
-    if bits != 16 or kind != _PNG_GREY:
-        channels = "grey" if kind == _PNG_GREY else "colour"
-        raise UserError(
-            f"{depth_file}: depth is a {bits}-bit {channels} PNG; expected 16-bit grey in millimetres "
-            "(a colourised or 8-bit picture has lost the depth: record again)."
-        )
-    if not color_file.is_file():
-        return f"colour picture {color_file.name} is missing", (0, 0)
-    if not _color_complete(color_file):
-        return f"colour picture {color_file.name} is truncated or corrupt", (0, 0)
-    if _all_invalid(data, height, width):
-        return "no valid depth pixel", (0, 0)
-    return "", (height, width)
-
-
-def _png_header(data: bytes) -> tuple[int, int, int, int] | None:
-    """(height, width, bit depth, colour type) of an intact PNG, None if any chunk is damaged."""
-    if data[:8] != _PNG_SIGNATURE:
-        return None
-    offset, header = 8, None
-    while offset + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, offset)
-        end = offset + 8 + length
-        if end + 4 > len(data):
-            return None
-        if zlib.crc32(memoryview(data)[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            return None
-        if kind == b"IHDR":
-            width, height, bits, color = struct.unpack_from(">IIBB", data, offset + 8)
-            header = (height, width, bits, color)
-        if kind == b"IEND":
-            return header
-        offset = end + 4
-    return None
-
-
-def _color_complete(file: Path) -> bool:
-    data = file.read_bytes()
-    if file.suffix == ".png":
-        return _png_header(data) is not None
-    # Some cameras pad after the end-of-image marker; look for it near the end.
-    return data[:2] == b"\xff\xd8" and b"\xff\xd9" in data[-64:]
-
-
-def _all_invalid(data: bytes, height: int, width: int) -> bool:
-    # Only constant pictures shrink this far, so only they need decoding here.
-    if len(data) > 200 + height * width / 50:
-        return False
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    return image is None or not image.any()
 
 
 def _check_unit(recording: Recording) -> None:

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from sensors.models import planes
+from sensors.statistics import stats
 from sensors.statistics.holes import fill_from_background
-from sensors.statistics.stats import STEADY_FRACTION, hole_sizes_px
 
 DEPTH_BINS_M = (0.3, 0.5, 0.7, 0.9, 1.2, 1.6, 2.2, 3.0)
 EDGE_BINS_PX = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0, 20.0, 40.0)
@@ -151,7 +151,7 @@ def by_surface(stream: Stream) -> tuple[dict[str, Curve], float]:
 class _Tally:
     """What one frame adds to the curves."""
 
-    rates: dict[str, list[np.ndarray]]
+    rates: dict[str, tuple[np.ndarray, np.ndarray]]
     """Per curve: invalid pixels and pixels in each bin."""
     shadow: tuple[int, int]
     spatial: tuple[np.ndarray, np.ndarray]
@@ -168,7 +168,7 @@ def _tally(frame: np.ndarray, stream: Stream) -> _Tally:
         "angle_deg": (s.angle_deg, smooth),
     }
     rates = {
-        name: [np.histogram(values[mask], RATE_BINS[name])[0] for mask in (where & lost, where)]
+        name: stats.lost_by_bin(values[where], lost[where], RATE_BINS[name])
         for name, (values, where) in counted.items()
     }
     kernel = np.ones((PLANE_WINDOW_PX, PLANE_WINDOW_PX), np.uint8)
@@ -180,8 +180,7 @@ def _tally(frame: np.ndarray, stream: Stream) -> _Tally:
 
 def hole_spectrum(stream: Stream) -> Curve:
     """Holes per 10,000 pixels, by their size in pixels."""
-    sizes = np.concatenate([hole_sizes_px(frame) for frame in stream.depth_mm])
-    count = np.histogram(sizes, SIZE_BINS_PX)[0]
+    count = stats.size_counts(stream.depth_mm, SIZE_BINS_PX)
     pixels = stream.depth_mm.size
     return Curve(
         tuple(map(float, SIZE_BINS_PX)), tuple((1e4 * count / pixels).tolist()), tuple(map(int, count))
@@ -196,7 +195,7 @@ def temporal_deviation_px(stream: Stream) -> Curve:
     ranges, deviations = [np.zeros(0)], [np.zeros(0)]
     for run in stream.static:
         frames = stream.depth_mm[run]
-        steady = np.mean(frames > 0, axis=0) >= STEADY_FRACTION
+        steady = np.mean(frames > 0, axis=0) >= stats.STEADY_FRACTION
         disparity = _disparity(frames[:, steady], stream.fb_px_m)
         ranges.append(stream.fb_px_m / np.nanmedian(disparity, axis=0))
         deviations.append(np.nanstd(disparity, axis=0, ddof=1))
@@ -216,9 +215,7 @@ def _plane_deviation(disparity_px: np.ndarray) -> np.ndarray:
 def flicker(stream: Stream) -> float:
     """Share of pixels that change validity from frame to frame in the static runs; nan without one."""
     changes = [
-        np.mean((a > 0) != (b > 0))
-        for run in stream.static
-        for a, b in zip(stream.depth_mm[run][:-1], stream.depth_mm[run][1:], strict=True)
+        np.mean(pair) for run in stream.static for pair in stats.validity_changes(stream.depth_mm[run])
     ]
     return float(np.mean(changes)) if changes else float("nan")
 
@@ -232,7 +229,7 @@ def flicker_by_edge(stream: Stream) -> Curve:
     for run in stream.static:
         frames = stream.depth_mm[run]
         s = surface(_typical_mm(frames), stream.fx_px, stream.fb_px_m)
-        rate = np.mean((frames[1:] > 0) != (frames[:-1] > 0), axis=0)
+        rate = np.mean(stats.validity_changes(frames), axis=0)
         inside = s.seen & (s.depth_m >= DEPTH_BINS_M[0]) & (s.depth_m < DEPTH_BINS_M[-1])
         count += np.histogram(s.edge_px[inside], EDGE_BINS_PX)[0]
         changed += np.histogram(s.edge_px[inside], EDGE_BINS_PX, weights=rate[inside])[0]

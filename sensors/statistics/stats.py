@@ -3,6 +3,7 @@
 All functions take (T, H, W) or (H, W) uint16 millimetres with 0 = invalid.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import cv2
@@ -56,7 +57,7 @@ def measure(depth_mm: np.ndarray, range_mm: float = 750.0) -> DepthStatistics:
 
 def hole_sizes_px(depth_mm: np.ndarray, connectivity: int = 8) -> np.ndarray:
     """(n,) pixel counts of the connected invalid regions of one (H, W) frame."""
-    holes = (depth_mm == 0).astype(np.uint8)
+    holes = (depth_mm <= 0).astype(np.uint8)
     _, _, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=connectivity)
     return stats[1:, cv2.CC_STAT_AREA]
 
@@ -67,10 +68,33 @@ def left_band_px(depth_mm: np.ndarray) -> int:
     return int(valid_columns[0]) if len(valid_columns) else depth_mm.shape[1]
 
 
+def size_counts(depth: np.ndarray, edges_px: Sequence[float]) -> np.ndarray:
+    """(bins,) connected invalid regions of a (T, H, W) stream, in any unit, by size."""
+    sizes = [hole_sizes_px(frame) for frame in depth]
+    return np.histogram(np.concatenate(sizes), edges_px)[0]
+
+
+def lost_by_bin(
+    values: np.ndarray, lost: np.ndarray, edges: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(bins,) invalid pixels and (bins,) pixels between consecutive `edges` of a quantity.
+
+    Args:
+      values: (n,) of the pixels that count.
+      lost: (n,) bool, whether they are invalid.
+    """
+    return np.histogram(values[lost], edges)[0], np.histogram(values, edges)[0]
+
+
+def validity_changes(depth: np.ndarray) -> np.ndarray:
+    """(T - 1, ...) bool: pixels of a (T, ...) stream whose validity the next frame changes."""
+    valid = depth > 0
+    return valid[1:] != valid[:-1]
+
+
 def flicker_fraction(depth_mm: np.ndarray) -> float:
     """Share of pixels of a (T, H, W) stream that change validity from one frame to the next."""
-    valid = depth_mm > 0
-    return float(np.mean(valid[1:] != valid[:-1])) if len(depth_mm) > 1 else float("nan")
+    return float(np.mean(validity_changes(depth_mm))) if len(depth_mm) > 1 else float("nan")
 
 
 def temporal_deviation_mm(depth_mm: np.ndarray, range_mm: float = 750.0) -> float:

@@ -1,0 +1,70 @@
+"""Whole episodes of a deterministic teacher, on all devices, keeping of every step what is asked for."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jp
+import numpy as np
+from flax import struct
+from jax.sharding import Mesh
+from mujoco_playground import State
+
+from mjx_envs import devices
+from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.physics.interface import ModelParams
+from ppo.policy import TeacherPolicy
+
+Keep = Callable[[State, jax.Array, State], dict[str, jax.Array]]
+"""(states before a step (N, ...), actions (N, 8), states after it) -> what to keep by name, (N, ...)."""
+
+
+@struct.dataclass
+class Rollout:
+    """N episodes of T control steps, NumPy."""
+
+    params: ModelParams
+    """Of each environment, (N, ...)."""
+    object_index: np.ndarray
+    """(N,)"""
+    success: np.ndarray
+    """(N,) bool."""
+    running: np.ndarray
+    """(T, N) bool, whether the episode was still going on as the step began."""
+    kept: dict[str, np.ndarray]
+    """(T, N, ...) each."""
+
+
+def roll_out(env: GraspEnv, policy: TeacherPolicy, keys: jax.Array | np.ndarray, keep: Keep) -> Rollout:
+    """The episodes of `keys` (N, 2). Every process of `ppo.hosts` must call it, and gets all of them.
+
+    `keep` is compiled in: give the same function again and again, not a new one each time.
+    """
+    mesh, keys = devices.make_mesh(), np.asarray(keys)
+    surplus = -len(keys) % mesh.size  # the devices share evenly: some repeat the last episode
+    padded = np.concatenate([keys, np.repeat(keys[-1:], surplus, axis=0)])
+    made = _roll_out(env, mesh, keep, policy.layers, policy.mean, policy.std, padded)
+    (params, index, success), per_step = jax.tree.map(np.asarray, made)
+    first = partial(jax.tree.map, lambda values: values[: len(keys)])
+    running, kept = jax.tree.map(lambda values: values[:, : len(keys)], per_step)
+    return Rollout(first(params), first(index), first(success), running, kept)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _roll_out(env: GraspEnv, mesh: Mesh, keep: Keep, layers, mean, std, keys) -> Any:
+    policy = TeacherPolicy(mean, std, layers)
+    state = devices.each(mesh, env.reset)(keys)
+    episode = state.info["episode"]
+
+    def step(carry, _):
+        state, alive, success = carry
+        action = policy(state.obs, jp)
+        new = devices.each(mesh, env.step)(state, action)
+        success = jp.where(alive, new.metrics["success"] > 0, success)
+        return (new, alive & (new.done == 0), success), (alive, keep(state, action, new))
+
+    start = (state, jp.ones(len(keys), bool), jp.zeros(len(keys), bool))
+    (*_, success), per_step = jax.lax.scan(step, start, None, env.config.episode_steps)
+    outcome = (episode.params, episode.object_index, success), per_step
+    return jax.lax.with_sharding_constraint(outcome, devices.replicated(mesh))

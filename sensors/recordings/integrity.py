@@ -1,0 +1,75 @@
+"""Whether a frame's files are whole: PNG checksums, JPEG markers, a single valid pixel. Few are decoded."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ddgrasp.errors import UserError
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_GREY = 0
+
+
+def inspect_frame(depth_file: Path, color_file: Path) -> tuple[str, tuple[int, int]]:
+    """(why the frame must be left out or "", (height, width) of its depth).
+
+    Raises UserError for depth that is no 16-bit grey PNG: that is no damage, but another kind of recording.
+    """
+    data = depth_file.read_bytes()
+    header = _png_header(data)
+    if header is None:
+        return "depth picture is truncated or corrupt", (0, 0)
+    height, width, bits, kind = header
+    if bits != 16 or kind != _PNG_GREY:
+        channels = "grey" if kind == _PNG_GREY else "colour"
+        raise UserError(
+            f"{depth_file}: depth is a {bits}-bit {channels} PNG; expected 16-bit grey in millimetres "
+            "(a colourised or 8-bit picture has lost the depth: record again)."
+        )
+    if not color_file.is_file():
+        return f"colour picture {color_file.name} is missing", (0, 0)
+    if not _color_complete(color_file):
+        return f"colour picture {color_file.name} is truncated or corrupt", (0, 0)
+    if _all_invalid(data, height, width):
+        return "no valid depth pixel", (0, 0)
+    return "", (height, width)
+
+
+def _png_header(data: bytes) -> tuple[int, int, int, int] | None:
+    """(height, width, bit depth, colour type) of an intact PNG, None if any chunk is damaged."""
+    if data[:8] != _PNG_SIGNATURE:
+        return None
+    offset, header = 8, None
+    while offset + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, offset)
+        end = offset + 8 + length
+        if end + 4 > len(data):
+            return None
+        if zlib.crc32(memoryview(data)[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            return None
+        if kind == b"IHDR":
+            width, height, bits, color = struct.unpack_from(">IIBB", data, offset + 8)
+            header = (height, width, bits, color)
+        if kind == b"IEND":
+            return header
+        offset = end + 4
+    return None
+
+
+def _color_complete(file: Path) -> bool:
+    data = file.read_bytes()
+    if file.suffix == ".png":
+        return _png_header(data) is not None
+    # Some cameras pad after the end-of-image marker; look for it near the end.
+    return data[:2] == b"\xff\xd8" and b"\xff\xd9" in data[-64:]
+
+
+def _all_invalid(data: bytes, height: int, width: int) -> bool:
+    # Only constant pictures shrink this far, so only they need decoding here.
+    if len(data) > 200 + height * width / 50:
+        return False
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return image is None or not image.any()

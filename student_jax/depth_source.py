@@ -1,0 +1,181 @@
+"""Where the student's depth comes from in training: clean depth in, depth as a camera would report it out.
+
+`student.depth_source` names one: `learned` is the run's fitted generator, the others are the camera models of
+`ddg_jax/sensor.py`.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ddg_jax.generate import Clip, noisy_episodes
+from ddg_jax.prior import Prior
+from ddg_jax.sample import Generator, generate
+from ddg_jax.sensor import BY_COLOUR, make_sensor
+from ddgrasp import contract
+from ddgrasp.config import Config, SensorConfig
+from ddgrasp.errors import UserError
+from demos.store import EpisodeStore
+from sensors.models.sense import Sense
+
+_BATCH = 16
+"""Frames that a camera model gets at once: one size, compiled once."""
+
+
+class DepthSource(Protocol):
+    """Gives clean depth a camera's artefacts.
+
+    What a frame gets depends on its episode's number and its own within it alone, however frames are batched.
+    """
+
+    @property
+    def needs_rgb(self) -> bool:
+        """Whether it must be given colour."""
+        ...
+
+    def episodes(
+        self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
+    ) -> Iterator[np.ndarray]:
+        """(T, H, W) uint16 millimetres of episodes `first`, `first` + 1, ... in order.
+
+        Args:
+          lengths: frames of every episode, those before `first` included.
+          read: position in `lengths` -> clean frames.
+        """
+        ...
+
+    def frames(
+        self, depth_mm: np.ndarray, rgb: np.ndarray | None, episode: np.ndarray, frame: np.ndarray
+    ) -> np.ndarray:
+        """(B, H, W) uint16 millimetres of B frames that have nothing to do with each other.
+
+        Args:
+          depth_mm: (B, H, W) uint16, clean.
+          rgb: (B, H, W, 3) uint8, where `needs_rgb`.
+          episode, frame: (B,) their numbers.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class GeneratorSource:
+    """A fitted generator; frames of one episode share noise over time."""
+
+    generator: Generator
+    key: jax.Array
+
+    @property
+    def needs_rgb(self) -> bool:
+        """See `DepthSource`."""
+        return self.generator.prior.needs_sim_rgb
+
+    def episodes(
+        self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
+    ) -> Iterator[np.ndarray]:
+        """See `DepthSource`."""
+        return noisy_episodes(self.key, self.generator, lengths, read, first)
+
+    def frames(
+        self, depth_mm: np.ndarray, rgb: np.ndarray | None, episode: np.ndarray, frame: np.ndarray
+    ) -> np.ndarray:
+        """See `DepthSource`."""
+        rgb = rgb if self.needs_rgb else None
+        noisy = generate(self.key, self.generator, _metres(depth_mm), rgb, episode=episode, frame=frame)
+        return _millimetres(noisy.depth_m)
+
+
+@dataclass(frozen=True)
+class SenseSource:
+    """A camera model; every frame has noise of its own."""
+
+    sense: Sense
+    key: jax.Array
+    needs_rgb: bool = False
+
+    def episodes(
+        self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
+    ) -> Iterator[np.ndarray]:
+        """See `DepthSource`."""
+        for i in range(first, len(lengths)):
+            clip = read(i)
+            number = np.full(len(clip.depth_mm), clip.number)
+            yield self.frames(clip.depth_mm, clip.rgb, number, np.arange(len(number)))
+
+    def frames(
+        self, depth_mm: np.ndarray, rgb: np.ndarray | None, episode: np.ndarray, frame: np.ndarray
+    ) -> np.ndarray:
+        """See `DepthSource`."""
+        colour = rgb if self.needs_rgb else None
+        parts = []
+        for start in range(0, len(depth_mm), _BATCH):
+            now = slice(start, start + _BATCH)
+            batch = (
+                _metres(depth_mm[now]),
+                None if colour is None else colour[now],
+                episode[now],
+                frame[now],
+            )
+            count = len(batch[0])
+            sensed = _sensed(self.sense, self.key, *jax.tree.map(_filled_up, batch))
+            parts.append(np.asarray(sensed)[:count])
+        return _millimetres(np.concatenate(parts))
+
+
+def make_source(config: Config, ddg: Path) -> DepthSource:
+    """The source that `config.student.depth_source` names; `ddg` is the stage directory of the generator.
+
+    Raises UserError for an unknown name, or where `learned` finds no generator.
+    """
+    name, key = config.student.depth_source, jax.random.key(config.seed)
+    if name == "learned":
+        return GeneratorSource(Generator.load(ddg), key)
+    sensor = SensorConfig(name=name, stereo=config.record.stereo)
+    return SenseSource(make_sensor(sensor, config.world.profile), key, name in BY_COLOUR)
+
+
+def check_source(config: Config, prior: Prior) -> None:
+    """UserError if the demos will lack the colour that the source needs; `prior` is the generator's."""
+    name = config.student.depth_source
+    needs_rgb = prior.needs_sim_rgb if name == "learned" else name in BY_COLOUR
+    if needs_rgb and not config.demos.rgb:
+        raise UserError(
+            f"student.depth_source {name!r} needs colour in the demos, and demos.rgb is false: add "
+            "--demos.rgb, or take another source."
+        )
+
+
+def check_colour(source: DepthSource, demos: EpisodeStore) -> None:
+    """UserError if `source` needs colour that the demos lack."""
+    if source.needs_rgb and "rgb" not in demos.fields:
+        raise UserError(
+            f"{demos.path} holds no colour, which the student's depth source needs: collect demos with "
+            "--demos.rgb, or take another student.depth_source."
+        )
+
+
+@partial(jax.jit, static_argnums=0)
+def _sensed(sense: Sense, key, depth_m, rgb, episode, frame):
+    def one(depth, picture, e, t):
+        return sense(jax.random.fold_in(jax.random.fold_in(key, e), t), depth, picture)
+
+    return jax.vmap(one)(depth_m, rgb, jnp.asarray(episode), jnp.asarray(frame))
+
+
+def _filled_up(values: np.ndarray) -> np.ndarray:
+    """`values` (n <= _BATCH, ...) with zeros behind them."""
+    return np.concatenate([values, np.zeros((_BATCH - len(values), *values.shape[1:]), values.dtype)])
+
+
+def _metres(depth_mm: np.ndarray) -> np.ndarray:
+    return depth_mm.astype(np.float32) * np.float32(contract.DEPTH_UNIT_M)
+
+
+def _millimetres(depth_m: np.ndarray) -> np.ndarray:
+    counts = np.minimum(depth_m / contract.DEPTH_UNIT_M, np.iinfo(np.uint16).max)
+    return np.round(counts).astype(np.uint16)

@@ -1,0 +1,195 @@
+"""Depth sources of the student stage: by name, keyed by episode and frame, on demos and in closed loop."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from app.commands.checks import check_config_values
+from ddg_jax import generate, sample, train
+from ddg_jax.prior import make_prior
+from ddg_jax.sensor import BY_COLOUR, SENSORS
+from ddgrasp import artifacts, config, contract
+from ddgrasp.config import (
+    Config,
+    DDGConfig,
+    DDGDepthConfig,
+    DDGDiffusionConfig,
+    DextrahConfig,
+    GraftConfig,
+    PictureConfig,
+    SamplingConfig,
+    StudentConfig,
+    StudentTrainingConfig,
+    UNetConfig,
+    WorldConfig,
+)
+from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
+from ddgrasp.progress import Progress
+from demos.rollout import Scene
+from demos.store import EpisodeStore
+from learning.params import save_params
+from student_jax import frames_io
+from student_jax.act import SourceCamera
+from student_jax.depth_source import GeneratorSource, SenseSource, make_source
+
+CONFIG = Config(
+    preset="test",
+    seed=3,
+    world=WorldConfig(camera_scale=0.125),
+    ddg=DDGConfig(
+        depth=DDGDepthConfig(height_px=18, width_px=32),
+        unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
+        diffusion=DDGDiffusionConfig(steps=50),
+        sampling=SamplingConfig(steps=2, batch_size=4),
+        graft=GraftConfig(noise_threshold=-0.02),
+    ),
+    student=StudentConfig(
+        picture=PictureConfig(height_px=32, width_px=40),
+        training=StudentTrainingConfig(clean_share=0.0, demo_held_steps=99, crop_shift_px=2),
+    ),
+)
+PROFILE = CONFIG.world.profile
+LENGTHS = (5, 20, 3)
+
+
+def with_source(name: str, clean_share: float = 0.0) -> Config:
+    training = replace(CONFIG.student.training, clean_share=clean_share)
+    return replace(CONFIG, student=replace(CONFIG.student, depth_source=name, training=training))
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory) -> EpisodeStore:
+    """Tables at 0.7 to 1.5 m without noise."""
+    store = EpisodeStore(tmp_path_factory.mktemp("demos") / "episodes.zarr", create=True)
+    rng = np.random.default_rng(0)
+    rows = np.linspace(1500, 700, PROFILE.height_px)[:, None]
+    for length in LENGTHS:
+        depth = np.broadcast_to(rows, (length, PROFILE.height_px, PROFILE.width_px)) + rng.integers(9)
+        numbers = rng.random((length, 40)).astype(np.float32)
+        steps = {"state": numbers[:, :8], "action": numbers[:, :8], "observation": numbers}
+        store.append(
+            {"depth_mm": depth.astype(np.uint16), "held": np.arange(length) > 2, **steps},
+            {"object_index": np.int32(0)},
+        )
+    return store
+
+
+@pytest.fixture(scope="module")
+def generator() -> sample.Generator:
+    params = train.init_params(CONFIG.ddg, jax.random.key(0))
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    noisy = [leaf + 0.1 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)]
+    return sample.Generator(CONFIG.ddg, jax.tree.unflatten(tree, noisy), make_prior(CONFIG.ddg))
+
+
+def training_depth(settings: Config, source, demos: EpisodeStore, folder: Path, have: int = 0) -> np.ndarray:
+    """(N, H, W) what the student trains on; the first `have` episodes as an interrupted stage left them."""
+    frames = EpisodeStore(folder / "frames.zarr", create=True)
+    frames_io.add_noisy_demos(demos, frames, source, settings, Progress(quiet=True))
+    if have:
+        begun = EpisodeStore(folder / "begun.zarr", create=True)
+        for i in range(have):
+            rows = ([0, *frames.ends][i], frames.ends[i])
+            begun.append(
+                {name: frames.steps(name, *rows) for name in frames.fields}, {"from_demo": np.bool_(True)}
+            )
+        frames_io.add_noisy_demos(demos, begun, source, settings, Progress(quiet=True))
+        np.testing.assert_array_equal(begun.steps("depth_mm"), frames.steps("depth_mm"))
+    return frames.steps("depth_mm")
+
+
+def test_every_camera_model_is_a_choice_and_a_wrong_name_is_refused_with_them():
+    assert set(config.SENSORS) == set(SENSORS)
+    assert StudentConfig().depth_source == "learned"
+    with pytest.raises(UserError, match=r"student.depth_source 'dextra'. Did you mean 'dextrah'"):
+        with_source("dextra")
+
+
+def test_ideal_depth_is_the_demos(demos, tmp_path):
+    settings = with_source("ideal")
+    source = make_source(settings, tmp_path / "no generator needed")
+    seen = training_depth(settings, source, demos, tmp_path)
+    np.testing.assert_array_equal(seen, demos.steps("depth_mm"))
+
+
+def test_dextrah_loses_and_replaces_the_expected_shares(demos, tmp_path):
+    settings = with_source("dextrah")
+    seen = training_depth(settings, make_source(settings, tmp_path), demos, tmp_path, have=2)
+    clean, strengths = demos.steps("depth_mm"), DextrahConfig()
+    # Sticks cover a little besides; random values fall near the table now and then.
+    assert np.mean(seen == 0) == pytest.approx(strengths.dropout, rel=0.15)
+    far = np.abs(seen.astype(int) - clean) > 60
+    assert np.mean(far & (seen > 0)) > 0.8 * strengths.random_value
+    assert np.mean(seen != clean) > 0.3
+
+
+def test_the_clean_share_keeps_clean_depth_whatever_the_source(demos, tmp_path):
+    settings = with_source("dextrah", clean_share=1.0)
+    seen = training_depth(settings, make_source(settings, tmp_path), demos, tmp_path)
+    np.testing.assert_array_equal(seen, demos.steps("depth_mm"))
+
+
+def test_a_frame_hangs_on_its_own_numbers_alone(demos):
+    source = make_source(with_source("kinect"), Path())
+    assert isinstance(source, SenseSource)
+    depth = demos.steps("depth_mm")[:6]
+    episode, frame = np.array([7, 7, 7, 8, 8, 9]), np.array([0, 1, 2, 0, 1, 0])
+    together = source.frames(depth, None, episode, frame)
+    apart = [source.frames(depth[i][None], None, episode[[i]], frame[[i]])[0] for i in range(6)]
+    np.testing.assert_array_equal(together, np.stack(apart))
+    again = source.frames(depth, None, episode, frame + 10)
+    assert all(np.any(a != b) for a, b in zip(together, again, strict=True))
+
+
+def test_learned_is_the_generator_of_the_run_to_the_bit(demos, generator, tmp_path):
+    save_params(tmp_path / "ddg" / sample.PARAMS_FILE, generator.params)
+    artifacts.finish(tmp_path / "ddg", "ddg", CONFIG, seconds=1, metrics={})
+    source = make_source(CONFIG, tmp_path / "ddg")
+    assert isinstance(source, GeneratorSource) and not source.needs_rgb
+    seen = training_depth(CONFIG, source, demos, tmp_path)
+    clips = np.split(demos.steps("depth_mm"), demos.ends[:-1])
+    key = jax.random.key(CONFIG.seed)
+    expected = generate.noisy_episodes(
+        key, generator, [len(clip) for clip in clips], lambda i: generate.Clip(i, clips[i])
+    )
+    np.testing.assert_array_equal(seen, np.concatenate(list(expected)))
+    assert 0.01 < np.mean(seen == 0) < 0.99
+
+    rest = {name: np.zeros(3) for name in ("state", "expert", "observation", "held")}
+    scene = Scene(depth_mm=clips[0][:3], step=4, **rest)
+    metres = scene.depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
+    direct = sample.generate(key, generator, metres, episode=100 + np.arange(3), frame=np.full(3, 4))
+    np.testing.assert_array_equal(
+        SourceCamera(source, first=100)(scene),
+        np.round(direct.depth_m / contract.DEPTH_UNIT_M).astype(np.uint16),
+    )
+
+
+def test_the_rigs_camera_looks_at_clean_depth_in_colour(demos, tmp_path):
+    settings = with_source("stereo")
+    source = make_source(settings, tmp_path)
+    assert source.needs_rgb and BY_COLOUR == ("stereo",)
+    depth = demos.steps("depth_mm")[:1]
+    bright, dark = (np.full((1, *depth.shape[1:], 3), value, np.uint8) for value in (150, 2))
+    number = np.zeros(1, int)
+    seen = source.frames(depth, bright, number, number)
+    assert 0.6 < np.mean(seen > 0) < 1.0
+    assert np.median(np.abs(seen.astype(int) - depth)[seen > 0]) < 20
+    assert np.mean(source.frames(depth, dark, number, number) > 0) < np.mean(seen > 0) - 0.2
+    with pytest.raises(UserError, match=r"holds no colour, .* --demos.rgb"):
+        training_depth(settings, source, demos, tmp_path)
+
+
+def test_missing_colour_is_refused_before_the_first_stage():
+    preset = get_preset("debug")
+    coloured = replace(preset, student=replace(preset.student, depth_source="stereo"))
+    wanting = replace(coloured, demos=replace(preset.demos, rgb=False))
+    with pytest.raises(UserError, match=r"'stereo' needs colour in the demos, .* --demos.rgb") as error:
+        check_config_values(wanting)
+    assert "\n" not in str(error.value)
+    check_config_values(replace(coloured, demos=replace(preset.demos, rgb=True)))
