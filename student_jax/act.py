@@ -4,12 +4,12 @@ from collections.abc import Callable
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ddg_jax.sample import Generator, generate
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
+from ddgrasp.depth import to_metres, to_millimetres
 from demos.rollout import Scene
 from student_jax.policy import sample_actions
 
@@ -35,10 +35,10 @@ class DDGCamera:
         """(B, H, W) uint16 with artefacts."""
         episode = self._first + np.arange(len(scene.depth_mm))
         frame = np.full(len(scene.depth_mm), scene.step)
-        depth_m = scene.depth_mm.astype(np.float32) * contract.DEPTH_UNIT_M
         rgb = scene.rgb if self._generator.prior.needs_sim_rgb else None
-        noisy = generate(self._key, self._generator, depth_m, rgb, episode=episode, frame=frame)
-        return np.round(noisy.depth_m / contract.DEPTH_UNIT_M).astype(np.uint16)
+        clean_m = to_metres(scene.depth_mm)
+        noisy = generate(self._key, self._generator, clean_m, rgb, episode=episode, frame=frame)
+        return to_millimetres(noisy.depth_m)
 
 
 class StudentActor:
@@ -83,5 +83,4 @@ class StudentActor:
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _act(config, profile, params, depth_mm, state, noise):
-    depth_m = depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
-    return sample_actions(params, depth_m, state, noise, config, profile)
+    return sample_actions(params, to_metres(depth_mm), state, noise, config, profile)

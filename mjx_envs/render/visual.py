@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jp
 import numpy as np
 
-from ddgrasp import contract
+from ddgrasp import contract, depth
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.objects import DEFAULT_SLOTS, SlotLayout
@@ -65,7 +65,7 @@ class Viewer:
 
     def depth_mm(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
         """(B, H, W) uint16 planar depth of a batch of scenes, 0 where nothing is hit."""
-        return to_mm(self._draw_depth(geoms, T_world_cam).depth_m)
+        return depth.to_millimetres(self._draw_depth(geoms, T_world_cam).depth_m, jp)
 
     def rgb(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
         """(B, H, W, 3) uint8 colour of a batch of scenes."""
@@ -83,8 +83,3 @@ class Viewer:
 
     def _seen_from(self, T_world_cam: jax.Array) -> Camera:
         return dataclasses.replace(self._camera, T_world_cam=T_world_cam)
-
-
-def to_mm(depth_m: jax.Array) -> jax.Array:
-    """Metres to the uint16 millimetres that cameras and disks use."""
-    return jp.round(depth_m / contract.DEPTH_UNIT_M).astype(jp.uint16)
