@@ -19,7 +19,8 @@ from benchmarks import playground_pick
 from benchmarks.compare import Contender, Row, compare, measure
 from ddgrasp import contract
 from ddgrasp.config import Config
-from mjx_envs import grasp_math, scene
+from ddgrasp.layout import QPOS
+from mjx_envs import grasp_math
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState
 from ppo import learner
@@ -108,7 +109,7 @@ def rollout_rows(config: Config, rounds: int) -> list[Row]:
     params = jax.tree.map(np.asarray, state.info["episode"].params)
     start = jax.tree.map(np.asarray, state.data)
     action, _ = jax.jit(policy)(state.obs, jax.random.key(1))
-    ctrl = grasp_math.controls(start.qpos[:, : scene.N_ARM], np.asarray(action))
+    ctrl = grasp_math.controls(start.qpos[:, QPOS.arm], np.asarray(action))
     bare = bare_contenders(env.env.mj_model, params, start, ctrl, substeps)
     rates = measure(contenders | bare, rounds)
     return [compare(rates, "PPO rollout", "physics steps/s", ours, peer, target=BARE_TARGET) for peer in bare]

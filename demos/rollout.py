@@ -10,6 +10,7 @@ import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.config import Config
+from ddgrasp.layout import ACTION, QPOS
 from mjx_envs import randomize
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.render.visual import Viewer
@@ -152,7 +153,7 @@ class Roller:
 
 def student_state(qpos):
     """(..., 8) what the student knows of the joints: seven positions and the gripper's width."""
-    return jp.concatenate([qpos[..., :7], qpos[..., 7:8] + qpos[..., 8:9]], axis=-1)
+    return jp.concatenate([qpos[..., QPOS.arm], qpos[..., QPOS.fingers].sum(-1, keepdims=True)], axis=-1)
 
 
 def noisy_teacher(rng: np.random.Generator, count: int, noise: float, share: float) -> Actor:
@@ -170,7 +171,7 @@ def noisy_teacher(rng: np.random.Generator, count: int, noise: float, share: flo
     def actor(scene: Scene) -> np.ndarray:
         start = (left == 0) & (rng.random(count) < share)
         left[start] = 4
-        push[start, :7] = noise * rng.standard_normal((int(start.sum()), 7))
+        push[start, ACTION.arm] = noise * rng.standard_normal(push[start, ACTION.arm].shape)
         active = left > 0
         left[active] -= 1
         return np.clip(scene.expert + push * active[:, None], -1.0, 1.0)

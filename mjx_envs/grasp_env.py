@@ -16,6 +16,7 @@ from mujoco_playground._src import mjx_env
 
 from ddgrasp import contract
 from ddgrasp.config import WorldConfig
+from ddgrasp.layout import ACTION, QPOS, QVEL, closes
 from mjx_envs import devices, grasp_math, kinematics, randomize, rewards, scene
 from mjx_envs.physics import interface as physics
 from mjx_envs.physics.backends import make_physics
@@ -80,7 +81,7 @@ class GraspEnv(mjx_env.MjxEnv):
         params, size = randomize.sample_params(k_params, self.config.random, self.table, variant)
         rest = jp.asarray(self.table.rest_height, jp.float32)[variant] * size
         qpos = randomize.sample_qpos(k_qpos, self.config.random, rest)
-        branch = grasp_math.yaw_branch(qpos[12:16], self._symmetry(variant), jp)
+        branch = grasp_math.yaw_branch(qpos[QPOS.object_quat], self._symmetry(variant), jp)
         if self.config.random.pregrasp_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
             qpos = randomize.maybe_pregrasp(k_start, self.config.random, qpos, *grasp)
@@ -92,7 +93,7 @@ class GraspEnv(mjx_env.MjxEnv):
             rest_height=rest,
             branch=branch,
             distances=self._distances(state.qpos, variant, branch),
-            action=jp.zeros(contract.ACTION_SIZE).at[7].set(-1.0),
+            action=jp.zeros(contract.ACTION_SIZE).at[ACTION.gripper].set(-1.0),
             steps=jp.zeros((), jp.int32),
             hold_count=jp.zeros((), jp.int32),
             grasped=jp.zeros((), bool),
@@ -112,21 +113,23 @@ class GraspEnv(mjx_env.MjxEnv):
         """One control step with `action` (8,)."""
         old: physics.PhysicsState = state.data
         episode: Episode = state.info["episode"]
-        controls, latency = self._delayed(episode.latency, grasp_math.controls(old.qpos[:7], action, jp))
+        controls, latency = self._delayed(
+            episode.latency, grasp_math.controls(old.qpos[QPOS.arm], action, jp)
+        )
         new = self.physics.step(episode.params, old, controls)
         finite = jp.all(jp.isfinite(new.qpos)) & jp.all(jp.isfinite(new.qvel))
         new = jax.tree.map(lambda a, b: jp.where(finite, a, b), new, old)
 
         distances = self._distances(new.qpos, episode.variant, episode.branch)
-        object_pos = new.qpos[9:12]
-        grasped = jp.all(new.touch > TOUCH_N) & (action[7] > 0)
+        object_pos = new.qpos[QPOS.object_pos]
+        grasped = jp.all(new.touch > TOUCH_N) & closes(action)
         held = jp.linalg.norm(object_pos - jp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
         hold_count = jp.where(held & grasped, episode.hold_count + 1, 0)
         terms = rewards.terms(
             self.config.reward,
             rewards.Transition(
                 before=episode.distances, after=distances, action=action, last_action=episode.action,
-                acceleration=(new.qvel[:7] - old.qvel[:7]) / contract.CONTROL_DT_S,
+                acceleration=(new.qvel[QVEL.arm] - old.qvel[QVEL.arm]) / contract.CONTROL_DT_S,
                 grasped=grasped, lifted=grasped & (object_pos[2] > episode.rest_height + LIFTED_M),
                 hold_count=hold_count,
             ),
@@ -142,7 +145,7 @@ class GraspEnv(mjx_env.MjxEnv):
         )  # fmt: skip
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jp.float32)
-        metrics["saturated"] = jp.mean(jp.abs(action[:7]) > 0.95)
+        metrics["saturated"] = jp.mean(jp.abs(action[ACTION.arm]) > 0.95)
         info = state.info | {"episode": episode, "truncation": (over & ~lost).astype(jp.float32)}
         return replace(
             state,
@@ -163,7 +166,7 @@ class GraspEnv(mjx_env.MjxEnv):
 
     def _distances(self, qpos, variant, branch) -> rewards.Distances:
         grasp_pos, grasp_quat = self._grasp_pose(qpos, variant, branch)
-        return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[:7], jp))
+        return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[QPOS.arm], jp))
 
     def _latency(self, rng, qpos) -> Latency | None:
         """At the start: the robot holds its pose, gripper open."""
@@ -171,7 +174,7 @@ class GraspEnv(mjx_env.MjxEnv):
         if share == 0:
             return None
         late = jax.random.uniform(jax.random.fold_in(rng, 1)) < share
-        return Latency(late, grasp_math.controls(qpos[:7], jp.zeros(contract.ACTION_SIZE), jp))
+        return Latency(late, grasp_math.controls(qpos[QPOS.arm], jp.zeros(contract.ACTION_SIZE), jp))
 
     def _delayed(self, latency: Latency | None, controls) -> tuple[jax.Array, Latency | None]:
         """The controls in force now, and what is on its way then."""
@@ -182,7 +185,8 @@ class GraspEnv(mjx_env.MjxEnv):
 
     def _grasp_pose(self, qpos, variant, branch) -> tuple[jax.Array, jax.Array]:
         symmetry, offset = self._symmetry(variant), self._grasp_offset(variant)
-        return grasp_math.grasp_pose(qpos[9:12], qpos[12:16], symmetry, branch, jp, offset)
+        pose = qpos[QPOS.object_pos], qpos[QPOS.object_quat]
+        return grasp_math.grasp_pose(*pose, symmetry, branch, jp, offset)
 
     def _symmetry(self, variant) -> jax.Array:
         return jp.asarray(self.table.symmetry)[variant]

@@ -5,7 +5,9 @@ from types import ModuleType
 import numpy as np
 
 from ddgrasp import contract
+from ddgrasp.layout import ACTION, QPOS, closes
 from mjx_envs import kinematics as kin
+from mjx_envs import scene
 
 HAND_DOWN = (0.0, 1.0, 0.0, 0.0)
 """Hand orientation with the fingers down and opening along world y."""
@@ -48,13 +50,13 @@ def canonical(quat, axis: int, xp: ModuleType = np):
 
 
 def observation(qpos, qvel, symmetry, branch, log_category, xp: ModuleType = np, offset_m=NO_OFFSET_M):
-    """(40,) teacher observation (ddgrasp.contract.OBSERVATION_SIZE lists its parts)."""
-    grip_pos, grip_quat = kin.grip_pose(qpos[..., :7], xp)
-    object_pos, object_quat = qpos[..., 9:12], qpos[..., 12:16]
+    """(40,) teacher observation (`ddgrasp.layout.OBSERVATION` lists its parts)."""
+    grip_pos, grip_quat = kin.grip_pose(qpos[..., QPOS.arm], xp)
+    object_pos, object_quat = qpos[..., QPOS.object_pos], qpos[..., QPOS.object_quat]
     grasp_pos, grasp_quat = grasp_pose(object_pos, object_quat, symmetry, branch, xp, offset_m)
     return xp.concatenate(
         [
-            qpos[..., :9], qvel[..., :9],
+            qpos[..., : scene.N_ROBOT], qvel[..., : scene.N_ROBOT],
             grip_pos, canonical(grip_quat, 1, xp),
             object_pos, canonical(object_quat, 0, xp),
             grasp_pos, grasp_quat,
@@ -66,7 +68,7 @@ def observation(qpos, qvel, symmetry, branch, log_category, xp: ModuleType = np,
 
 def controls(q_arm, action, xp: ModuleType = np):
     """(9,) actuator targets of an action (8,): clipped joint targets and the fingers' opening."""
-    target = q_arm + contract.ACTION_SCALE_RAD * xp.clip(action[..., :7], -1.0, 1.0)
+    target = q_arm + contract.ACTION_SCALE_RAD * xp.clip(action[..., ACTION.arm], -1.0, 1.0)
     target = xp.clip(target, xp.asarray(contract.JOINT_LOWER_RAD), xp.asarray(contract.JOINT_UPPER_RAD))
-    finger = xp.where(action[..., 7:8] > 0, 0.0, contract.GRIPPER_MAX_WIDTH_M / 2)
+    finger = xp.where(closes(action)[..., None], 0.0, contract.GRIPPER_MAX_WIDTH_M / 2)
     return xp.concatenate([target, finger, finger], axis=-1)

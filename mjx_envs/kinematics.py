@@ -8,7 +8,11 @@ from types import ModuleType
 
 import numpy as np
 
+from ddgrasp.layout import QPOS
 from mjx_envs import scene
+
+_FINGER_TURNS = {"left_finger": (1.0, 0, 0, 0), "right_finger": (0.0, 0, 0, 1)}
+"""Quaternions in the hand's frame; a finger moves along its own y axis."""
 
 
 def quat_mul(a, b, xp: ModuleType = np):
@@ -70,17 +74,18 @@ def body_poses(qpos, xp: ModuleType = np) -> dict:
     """
     batch = qpos.shape[:-1]
     zero = xp.zeros(batch + (3,)), xp.broadcast_to(xp.asarray([1.0, 0.0, 0.0, 0.0]), batch + (4,))
-    positions, quats = _arm_chain(zero, xp.moveaxis(qpos[..., : scene.N_ARM], -1, 0), xp)
+    positions, quats = _arm_chain(zero, xp.moveaxis(qpos[..., QPOS.arm], -1, 0), xp)
     poses = {"link0": zero}
     poses |= {link.name: (positions[i], quats[i]) for i, link in enumerate(scene.ARM_LINKS)}
     hand_pos, hand_quat = _child(positions[-1], quats[-1], scene.HAND_POS_M, scene.HAND_QUAT, xp)
     poses["hand"] = hand_pos, hand_quat
-    for name, turn, index in (("left_finger", (1.0, 0, 0, 0), 7), ("right_finger", (0.0, 0, 0, 1), 8)):
+    fingers = zip(_FINGER_TURNS.items(), range(QPOS.fingers.start, QPOS.fingers.stop), strict=True)
+    for (name, turn), index in fingers:
         pos, quat = _child(hand_pos, hand_quat, scene.FINGER_POS_M, turn, xp)
         slide = qpos[..., index, None] * xp.asarray([0.0, 1.0, 0.0])
         poses[name] = (pos + rotate(quat, slide, xp), quat)
     if qpos.shape[-1] > scene.N_ROBOT:
-        poses["object"] = (qpos[..., 9:12], qpos[..., 12:16])
+        poses["object"] = (qpos[..., QPOS.object_pos], qpos[..., QPOS.object_quat])
     return poses
 
 

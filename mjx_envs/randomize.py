@@ -6,6 +6,7 @@ import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
+from ddgrasp.layout import QPOS
 from mjx_envs import inverse_kinematics, kinematics, scene
 from mjx_envs.objects import get_object, slot_layout
 from mjx_envs.physics.interface import ModelParams
@@ -94,9 +95,9 @@ def maybe_pregrasp(key: jax.Array, config: RandomConfig, qpos: jax.Array, grasp_
     offset = jax.random.uniform(k_offset, (3,), minval=-1.0, maxval=1.0)
     height = PREGRASP_HEIGHT_M * (0.5 + 0.5 * offset[2])
     target = grasp_pos + jp.stack([0.005 * offset[0], 0.005 * offset[1], height])
-    joints = inverse_kinematics.solve(qpos[:7], target, grasp_quat)
+    joints = inverse_kinematics.solve(qpos[QPOS.arm], target, grasp_quat)
     chosen = jax.random.uniform(k_choice) < config.pregrasp_share
-    return qpos.at[:7].set(jp.where(chosen, joints, qpos[:7]))
+    return qpos.at[QPOS.arm].set(jp.where(chosen, joints, qpos[QPOS.arm]))
 
 
 def sample_camera(key: jax.Array, config: RandomConfig, T_world_cam) -> jax.Array:

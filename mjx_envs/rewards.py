@@ -6,6 +6,7 @@ from flax import struct
 
 from ddgrasp import contract
 from ddgrasp.config import RewardConfig
+from ddgrasp.layout import ACTION, QPOS, closes
 from mjx_envs import grasp_math, kinematics
 
 TERMS = ("reach", "lift", "orient", "bonus", "accel", "align", "grasp", "saturation", "toggle")
@@ -52,7 +53,9 @@ def distances(qpos, grasp_pos, grasp_quat, grip_pose) -> Distances:
     grip_pos, grip_quat = grip_pose
     return Distances(
         hand=jp.minimum(approach_distance(grip_pos, grasp_pos), MAX_DISTANCE_M),
-        object=jp.minimum(jp.linalg.norm(qpos[9:12] - jp.asarray(contract.LIFT_TARGET_M)), MAX_DISTANCE_M),
+        object=jp.minimum(
+            jp.linalg.norm(qpos[QPOS.object_pos] - jp.asarray(contract.LIFT_TARGET_M)), MAX_DISTANCE_M
+        ),
         grasp_angle=kinematics.angle_between(grip_quat, grasp_quat, jp),
         upright_angle=kinematics.angle_between(grip_quat, jp.asarray(grasp_math.HAND_DOWN), jp),
     )
@@ -74,8 +77,8 @@ def terms(weights: RewardConfig, t: Transition) -> dict[str, jax.Array]:
     """Weighted reward terms, by name; their sum is the reward (paper Eq. 2)."""
     grasped, lifted = t.grasped.astype(jp.float32), t.lifted.astype(jp.float32)
     count = jp.minimum(t.hold_count, weights.bonus_max_count)
-    excess = jp.maximum(jp.abs(t.action[:7]) - 0.8, 0.0)
-    toggled = (t.action[7] > 0) != (t.last_action[7] > 0)
+    excess = jp.maximum(jp.abs(t.action[ACTION.arm]) - 0.8, 0.0)
+    toggled = closes(t.action) != closes(t.last_action)
     return {
         "reach": weights.reach * (t.before.hand - t.after.hand) * (1 - grasped),
         "lift": weights.lift * grasped * (t.before.object - t.after.object),

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from ddgrasp import contract
+from ddgrasp.layout import CONTROLS, QPOS, QVEL
 from mjx_envs.objects import DEFAULT_SLOTS, OBJECTS, ObjectSpec, SlotLayout
 
 _S = 0.7071067811865476  # cos 45 degrees
@@ -81,7 +82,8 @@ FINGER_ARMATURE_KG = 1.0
 PAD_FRICTION = 1.0
 JOINT_DAMPING_NMS_RAD = 1.0
 
-N_ARM, N_ROBOT, NQ, NV, NU = 7, 9, 16, 15, 9
+N_ARM, N_ROBOT = QPOS.arm.stop, QPOS.fingers.stop
+NQ, NV, NU = QPOS.size, QVEL.size, CONTROLS.size
 
 
 def _arm_xml(depth: int = 0) -> str:

@@ -7,6 +7,7 @@ import jax.numpy as jp
 import numpy as np
 from jax.sharding import Mesh
 
+from ddgrasp.layout import QVEL
 from mjx_envs import devices
 from mjx_envs.grasp_env import GraspEnv
 from ppo.motion import motion_metrics
@@ -30,7 +31,7 @@ def _episodes(env: GraspEnv, mesh: Mesh, count: int, layers, mean, std, key):
         action = policy(state.obs, jp)
         state = devices.each(mesh, env.step)(state, action)
         success = jp.where(alive, state.metrics["success"], success)
-        motion = (state.data.qvel[:, :7], action, alive)
+        motion = (state.data.qvel[:, QVEL.arm], action, alive)
         return (state, alive & (state.done == 0), success), motion
 
     start = (state, jp.ones(len(keys), bool), jp.zeros(len(keys)))

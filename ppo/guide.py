@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jp
 
 from ddgrasp import contract
+from ddgrasp.layout import OBSERVATION
 from mjx_envs import inverse_kinematics, kinematics
 
 REACH_STEP_M, LIFT_STEP_M = 0.04, 0.045
@@ -24,9 +25,10 @@ CLEARANCE_M = 0.10
 
 def guide(observation: jax.Array) -> jax.Array:
     """(8,) action for one observation (40,)."""
-    q, fingers, finger_speed = observation[:7], observation[7:9].sum(), observation[16:18].sum()
-    grip, grip_quat, object_pos = observation[18:21], observation[21:25], observation[25:28]
-    grasp, grasp_quat = observation[32:35], observation[35:39]
+    part = {name: observation[where] for name, where in OBSERVATION.items()}
+    q, fingers, finger_speed = part["arm"], part["fingers"].sum(), part["finger_velocity"].sum()
+    grip, grip_quat, object_pos = part["grip_pos"], part["grip_quat"], part["object_pos"]
+    grasp, grasp_quat = part["grasp_pos"], part["grasp_quat"]
 
     lateral = jp.linalg.norm(grip[:2] - grasp[:2])
     angle = kinematics.angle_between(grip_quat, grasp_quat, jp)

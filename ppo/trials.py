@@ -10,6 +10,7 @@ import jax.numpy as jp
 import numpy as np
 from flax import struct
 
+from ddgrasp.layout import QVEL
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import TOUCH_N, GraspEnv
 from mjx_envs.physics.interface import ModelParams
@@ -68,7 +69,7 @@ def _record(env: GraspEnv, layers, mean, std, keys):
         action = policy(state.obs, jp)
         new = jax.vmap(env.step)(state, action)
         success = jp.where(alive, new.metrics["success"] > 0, success)
-        kept = (state.data.qpos, touched, alive, action, new.data.qvel[:, :7])
+        kept = (state.data.qpos, touched, alive, action, new.data.qvel[:, QVEL.arm])
         return (new, alive & (new.done == 0), touched, success), kept
 
     never = jp.zeros(len(keys), bool)

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from ddgrasp import contract
+from ddgrasp.layout import QPOS
 from mjx_envs import kinematics, randomize
 from mjx_envs.camera import look_at
 from mjx_envs.grasp_env import GraspEnv
@@ -101,11 +102,12 @@ def moments(qpos: np.ndarray, touched: np.ndarray, running: np.ndarray) -> np.nd
       running: (T,) bool.
     """
     last = int(np.flatnonzero(running)[-1])
-    grip_pos, _ = kinematics.grip_pose(qpos[:, :7], np)
+    grip_pos, _ = kinematics.grip_pose(qpos[:, QPOS.arm], np)
     contact = _first(touched & running, 0)
-    high = np.flatnonzero(grip_pos[:contact, 2] - qpos[:contact, 11] > ABOVE_M)
+    height = qpos[:, QPOS.object_pos][:, 2]
+    high = np.flatnonzero((grip_pos[:, 2] - height)[:contact] > ABOVE_M)
     above = int(high[-1]) if len(high) else 0
-    lifted = _first((qpos[:, 11] > qpos[0, 11] + LIFTED_M) & running, contact)
+    lifted = _first((height > height[0] + LIFTED_M) & running, contact)
     return np.array([0, above, contact, lifted, last])
 
 

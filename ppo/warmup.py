@@ -11,6 +11,7 @@ from brax.training.acme import running_statistics
 
 from ddgrasp.config import TeacherConfig
 from ddgrasp.errors import UserError
+from ddgrasp.layout import ACTION
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import GraspEnv
 from ppo import learner
@@ -89,7 +90,7 @@ class _Collector:
             noise = (
                 ACTION_NOISE * rng.standard_normal(label.shape) * (rng.random((self._count, 1)) < NOISE_SHARE)
             )
-            noise[:, 7] = 0.0
+            noise[:, ACTION.gripper] = 0.0
             action = np.clip(np.where(guided, label, policy(seen)) + noise, -1, 1)
             state = self._step(state, action.astype(np.float32))
             alive &= np.asarray(state.done) == 0

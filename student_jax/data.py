@@ -8,12 +8,9 @@ import numpy as np
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
+from ddgrasp.layout import ACTION, OBSERVATION, closes
 from student_jax.policy import Aux, position_from_world
 
-GRIP_POS = slice(18, 21)
-OBJECT_POS = slice(25, 28)
-_GRASP_QUAT = slice(35, 39)
-"""Parts of the teacher's observation (ddgrasp/contract.py)."""
 YAW_MULTIPLE = 2
 """The gripper looks the same after half a turn: the auxiliary target is the angle's double."""
 
@@ -70,9 +67,9 @@ class Frames:
 
 def aux_targets(observation: np.ndarray, held: np.ndarray) -> Aux:
     """What perception is to report of the teacher's observations (N, 40); `held_logit` is 0 or 1."""
-    quat = observation[:, _GRASP_QUAT]
+    quat = observation[:, OBSERVATION.grasp_quat]
     yaw = 2.0 * np.arctan2(quat[:, 2], quat[:, 1]) * YAW_MULTIPLE
-    position = position_from_world(observation[:, OBJECT_POS])
+    position = position_from_world(observation[:, OBSERVATION.object_pos])
     return Aux(
         position.astype(np.float32),
         np.stack([np.cos(yaw), np.sin(yaw)], axis=1).astype(np.float32),
@@ -106,7 +103,7 @@ def make_frames(
 def sharpen_gripper(action: np.ndarray) -> np.ndarray:
     """Labels with the gripper command at -1 or 1: the robot only looks at its sign."""
     sharp = np.array(action)
-    sharp[..., 7] = np.where(sharp[..., 7] > 0, 1.0, -1.0)
+    sharp[..., ACTION.gripper] = np.where(closes(sharp), 1.0, -1.0)[..., None]
     return sharp
 
 

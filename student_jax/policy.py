@@ -19,6 +19,7 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
+from ddgrasp.layout import STATE, Layout
 from learning.diffusion import Schedule
 from mjx_envs import kinematics
 from student_jax import action_diffusion as diffusion
@@ -29,9 +30,10 @@ from student_jax.preprocess import crop_origin, prepare_depth
 
 Positions = TypeVar("Positions", jax.Array, np.ndarray)
 
-AUX_SIZE = 6
-BESIDE_SIZE = 4
-"""What the hand view adds to the auxiliary output: the object's offset from the hand, and a gate."""
+AUX = Layout(position=3, yaw=2, held=1)
+"""The auxiliary output, see `Aux`."""
+AUX_BESIDE = Layout(position=3, yaw=2, held=1, beside=3, near=1)
+"""The same with the hand view: the object's offset from the hand too, and a gate between the two places."""
 BESIDE_SCALE = 0.25
 """Network units per unit of that offset: 5 cm."""
 HEAD_PARAMS = ("state_stream", "denoiser")
@@ -80,7 +82,7 @@ class StudentPolicy(nn.Module):
         check_head(self.config)
         self.encoder = DepthEncoder(self.config, self.profile)
         self.aux_hidden = nn.Dense(self.config.feature_size)
-        self.aux_output = nn.Dense(AUX_SIZE + (BESIDE_SIZE if self.config.hand_view_px else 0))
+        self.aux_output = nn.Dense((AUX_BESIDE if self.config.hand_view_px else AUX).size)
         self.state_stream = StateStream(self.config)
         self.denoiser = Denoiser(self.config)
         if self.config.hand_view_px:
@@ -97,14 +99,15 @@ class StudentPolicy(nn.Module):
         features = self.encoder(picture, origin)
         if not self.config.hand_view_px:
             raw = self._aux(features, normalise_state(state))
-            return Seen(features, Aux(raw[:, :3], raw[:, 3:5], raw[:, 5]))
+            return Seen(features, Aux(raw[:, AUX.position], raw[:, AUX.yaw], raw[:, AUX.held][:, 0]))
         grip_m = grip_position(state)
         grip = position_from_world(grip_m)
         features = jnp.concatenate([features, self.hand_view(picture, grip_m, origin)], axis=-1)
         raw = self._aux(features, normalise_state(state), grip)
-        near = nn.sigmoid(raw[:, 9:])
-        position = near * (grip + BESIDE_SCALE * raw[:, 6:9]) + (1.0 - near) * raw[:, :3]
-        return Seen(features, Aux(position, raw[:, 3:5], raw[:, 5]))
+        near = nn.sigmoid(raw[:, AUX_BESIDE.near])
+        beside = grip + BESIDE_SCALE * raw[:, AUX_BESIDE.beside]
+        position = near * beside + (1.0 - near) * raw[:, AUX.position]
+        return Seen(features, Aux(position, raw[:, AUX.yaw], raw[:, AUX.held][:, 0]))
 
     def _aux(self, *parts: jax.Array) -> jax.Array:
         return self.aux_output(nn.relu(self.aux_hidden(jnp.concatenate(parts, axis=-1))))
@@ -145,7 +148,7 @@ def check_head(config: StudentConfig) -> None:
 
 def grip_position(state: jax.Array) -> jax.Array:
     """(B, 3) the point between the finger pads (m, robot base) from the joint state (B, 8)."""
-    return kinematics.grip_pose(state[:, :7], jnp)[0]
+    return kinematics.grip_pose(state[:, STATE.arm], jnp)[0]
 
 
 def feature_count(config: StudentConfig) -> int:

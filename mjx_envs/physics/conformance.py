@@ -15,6 +15,7 @@ import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
+from ddgrasp.layout import CONTROLS, QPOS, QVEL
 from mjx_envs import grasp_math, inverse_kinematics, randomize, scene
 from mjx_envs.objects import DEFAULT_SLOTS, OBJECTS
 from mjx_envs.physics import interface as physics
@@ -121,7 +122,7 @@ def judge_fall(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict[st
     """Semi-implicit Euler over n steps of h falls g h^2 n (n + 1) / 2."""
     n = _substeps(scenario)
     expected = GRAVITY_M_S2 * SIM_DT_S**2 * n * (n + 1) / 2
-    fallen = seen.qpos[0, :, 11] - seen.qpos[-1, :, 11]
+    fallen = -_travelled(seen)[:, 2]
     return {
         "fall_relative": float(np.max(np.abs(fallen / expected - 1))),
         "fall_from_cpu_m": _object_difference(seen, cpu),
@@ -139,7 +140,7 @@ def sliding() -> Scenario:
     params, rest = _params(names)
     friction = jp.repeat(jp.asarray(SLIDE_FRICTION), 2)
     start = _start([(0.6, 0.2, height) for height in rest])
-    start = replace(start, qvel=start.qvel.at[:, 9].set(SLIDE_SPEED_M_S))
+    start = replace(start, qvel=start.qvel.at[:, QVEL.object_linear.start].set(SLIDE_SPEED_M_S))
     return Scenario(replace(params, object_friction=friction), start, _hold(5))
 
 
@@ -147,7 +148,7 @@ def judge_sliding(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict
     """v^2 / (2 mu g), less the half step by which semi-implicit Euler falls short."""
     mu = contact_friction(np.asarray(scenario.params.object_friction))
     expected = SLIDE_SPEED_M_S**2 / (2 * mu * GRAVITY_M_S2) - SLIDE_SPEED_M_S * SIM_DT_S / 2
-    slid = seen.qpos[-1, :, 9] - seen.qpos[0, :, 9]
+    slid = _travelled(seen)[:, 0]
     return {
         "slide_relative": float(np.max(np.abs(slid / expected - 1))),
         "slide_from_cpu_m": _object_difference(seen, cpu),
@@ -171,14 +172,14 @@ def moving_arm() -> Scenario:
     params, rest = _params()
     start = _start([(0.65, 0.25, height) for height in rest])
     controls = _hold(5)
-    controls[..., :7] += np.array([0.3, -0.2, 0.2, -0.3, 0.3, 0.3, -0.4])
-    controls[..., 7:] = 0.0
+    controls[..., CONTROLS.arm] += np.array([0.3, -0.2, 0.2, -0.3, 0.3, 0.3, -0.4])
+    controls[..., CONTROLS.fingers] = 0.0
     return Scenario(params, start, controls)
 
 
 def judge_arm(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict[str, float]:
     """Joints and fingers at every step against the C engine."""
-    return {"arm_from_cpu_rad": float(np.max(np.abs(seen.qpos[..., :9] - cpu.qpos[..., :9])))}
+    return {"arm_from_cpu_rad": float(np.max(np.abs((seen.qpos - cpu.qpos)[..., : scene.N_ROBOT])))}
 
 
 LIFT_M = 0.12
@@ -195,8 +196,9 @@ def grasp_and_lift() -> Scenario:
     above = jp.array([0.0, 0.0, LIFT_M])
 
     def joints(qpos, symmetry, offset):
-        branch = grasp_math.yaw_branch(qpos[12:16], symmetry, jp)
-        pos, quat = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], symmetry, branch, jp, offset)
+        branch = grasp_math.yaw_branch(qpos[QPOS.object_quat], symmetry, jp)
+        pose = qpos[QPOS.object_pos], qpos[QPOS.object_quat]
+        pos, quat = grasp_math.grasp_pose(*pose, symmetry, branch, jp, offset)
         home = jp.asarray(scene.HOME_RAD)
         at = inverse_kinematics.solve(home, pos, quat)
         return at, inverse_kinematics.solve(at, pos + above, quat)
@@ -205,13 +207,13 @@ def grasp_and_lift() -> Scenario:
     time = np.arange(_GRASP_STEPS + _LIFT_STEPS + _SETTLE_STEPS)
     share = np.clip((time - _GRASP_STEPS + 1) / _LIFT_STEPS, 0, 1)[:, None, None]
     controls = np.zeros((len(time), len(specs), scene.NU), np.float32)
-    controls[..., :7] = np.asarray(at) + share * np.asarray(lifted - at)
-    return Scenario(params, replace(start, qpos=start.qpos.at[:, :7].set(at)), controls)
+    controls[..., CONTROLS.arm] = np.asarray(at) + share * np.asarray(lifted - at)
+    return Scenario(params, replace(start, qpos=start.qpos.at[:, QPOS.arm].set(at)), controls)
 
 
 def judge_lift(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict[str, float]:
     """Every object risen as commanded; forces on the pads and heights against the C engine."""
-    risen = seen.qpos[-1, :, 11] - seen.qpos[0, :, 11]
+    risen = _travelled(seen)[:, 2]
     held, expected = seen.touch[_GRASP_STEPS - 1 :], cpu.touch[_GRASP_STEPS - 1 :]
     return {
         "lift_error_m": float(np.max(np.abs(risen - LIFT_M))),
@@ -269,4 +271,10 @@ def _substeps(scenario: Scenario) -> int:
 
 def _object_difference(seen: Trajectory, cpu: Trajectory) -> float:
     """Largest distance between the objects' positions in the end, m."""
-    return float(np.max(np.linalg.norm(seen.qpos[-1, :, 9:12] - cpu.qpos[-1, :, 9:12], axis=-1)))
+    apart = (seen.qpos[-1] - cpu.qpos[-1])[:, QPOS.object_pos]
+    return float(np.max(np.linalg.norm(apart, axis=-1)))
+
+
+def _travelled(seen: Trajectory) -> np.ndarray:
+    """(B, 3) m, where the objects are in the end less where they began."""
+    return (seen.qpos[-1] - seen.qpos[0])[:, QPOS.object_pos]

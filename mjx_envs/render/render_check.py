@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
+from ddgrasp.layout import QPOS
 from mjx_envs import randomize, scene
 from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.objects import OBJECTS
@@ -63,7 +64,9 @@ def random_scenes(count: int, seed: int = 0, camera_scale: float = 0.25) -> Scen
         params, size = randomize.sample_params(key[0], config, table, index)
         qpos = randomize.sample_qpos(key[1], config, jp.asarray(table.rest_height)[index] * size)
         quat = jax.random.normal(key[2], (4,))
-        qpos = qpos.at[11].add(0.05).at[12:].set(quat / jp.linalg.norm(quat))
+        qpos = (
+            qpos.at[QPOS.object_pos.stop - 1].add(0.05).at[QPOS.object_quat].set(quat / jp.linalg.norm(quat))
+        )
         T = randomize.sample_camera(key[3], config, viewer.nominal_pose)
         return params, qpos, T, viewer.geoms(qpos, params, jp.asarray(table.rgb, jp.float32)[index])
 
