@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from brax.training import acting
@@ -58,7 +58,7 @@ def playground_rows(config: Config, rounds: int) -> list[Row]:
     first = jax.jit(pick.reset)(jax.random.key(0))
     peers = [f"PandaPickCube, batch {batch}" for batch in PLAYGROUND_BATCHES]
     for peer, batch in zip(peers, PLAYGROUND_BATCHES, strict=True):
-        start = jax.tree.map(lambda x, n=batch: jp.broadcast_to(x, (n, *x.shape)), first)
+        start = jax.tree.map(lambda x, n=batch: jnp.broadcast_to(x, (n, *x.shape)), first)
         contenders[peer] = stepping(pick, start, pick.n_substeps, calls=max(1, 16 // batch))
     rates = measure(contenders, rounds)
     peer = max(peers, key=lambda name: float(np.median(rates[name])))

@@ -52,7 +52,7 @@ class Generator:
         directory = Path(directory)
         manifest = artifacts.read_manifest(directory)
         if manifest.stage != "ddg":
-            raise UserError(f"{directory} holds a {manifest.stage!r} artefact; expected one of stage 'ddg'.")
+            raise UserError(f"{directory} holds a {manifest.stage!r} artifact; expected one of stage 'ddg'.")
         config = artifacts.config_from_json(manifest.config).ddg
         sampler, steps = sampler or config.sampler, steps or config.sample_steps
         file = directory / (params_file(steps) if sampler == PROGRESSIVE else PARAMS_FILE)

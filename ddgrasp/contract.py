@@ -2,7 +2,7 @@
 
 This module imports the standard library alone, so that the robot side can use it. Which number of a vector
 is what: `ddgrasp.layout`.
-Change a value here and `CONTRACT_VERSION` with it: artefacts of another version are refused.
+Change a value here and `CONTRACT_VERSION` with it: artifacts of another version are refused.
 """
 
 import math

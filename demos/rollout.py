@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 
 from ddgrasp import contract
@@ -106,7 +106,7 @@ class Roller:
             scene = self._scene(state, cameras, t)
             scenes.append(scene)
             length += alive
-            state = self._advance(state, jp.asarray(actor(scene), jp.float32))
+            state = self._advance(state, jnp.asarray(actor(scene), jnp.float32))
             success |= alive & (np.asarray(state.metrics["success"]) > 0)
             alive &= np.asarray(state.done) == 0
             on_step(t)
@@ -140,20 +140,20 @@ class Roller:
     def _look_batch(self, state):
         return {
             "state": student_state(state.data.qpos),
-            "expert": self._teacher(state.obs, jp),
+            "expert": self._teacher(state.obs, jnp),
             "observation": state.obs,
             "held": state.info["episode"].grasped,
         }
 
     def _pose_batch(self, state):
         episode = state.info["episode"]
-        colours = jp.asarray(self.env.table.rgb, jp.float32)[episode.object_index]
+        colours = jnp.asarray(self.env.table.rgb, jnp.float32)[episode.object_index]
         return jax.vmap(self.viewer.geoms)(state.data.qpos, episode.params, colours)
 
 
 def student_state(qpos):
     """(..., 8) what the student knows of the joints: seven positions and the gripper's width."""
-    return jp.concatenate([qpos[..., QPOS.arm], qpos[..., QPOS.fingers].sum(-1, keepdims=True)], axis=-1)
+    return jnp.concatenate([qpos[..., QPOS.arm], qpos[..., QPOS.fingers].sum(-1, keepdims=True)], axis=-1)
 
 
 def noisy_teacher(rng: np.random.Generator, count: int, noise: float, share: float) -> Actor:

@@ -1,7 +1,7 @@
 """What differs from episode to episode: object, its pose and size, dynamics, joints, camera."""
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 
 from ddgrasp import contract
@@ -43,7 +43,7 @@ class ObjectTable:
 def sample_variant(key: jax.Array, config: RandomConfig, table: ObjectTable, index) -> jax.Array:
     """() index into the table's arrays of object `index`, in one of its rest poses."""
     other = jax.random.uniform(key) < config.other_pose_share
-    return jp.where(other, jp.asarray(table.other_variant)[index], index)
+    return jnp.where(other, jnp.asarray(table.other_variant)[index], index)
 
 
 def _around(key, half_range, shape=()):
@@ -58,7 +58,7 @@ def sample_params(
     keys = jax.random.split(key, 7)
     size = _around(keys[0], config.size)
     mass = _around(keys[1], config.object_mass)
-    take = lambda a: jp.asarray(a, jp.float32)[variant]  # noqa: E731
+    take = lambda a: jnp.asarray(a, jnp.float32)[variant]  # noqa: E731
     params = ModelParams(
         slot_size=take(table.slot_size) * size,
         slot_pos=take(table.slot_pos) * size,
@@ -77,16 +77,16 @@ def sample_params(
 def sample_qpos(key: jax.Array, config: RandomConfig, rest_height_m) -> jax.Array:
     """(16,) initial joints around home, gripper open, object on the table with any yaw."""
     k_joint, k_xy, k_yaw = jax.random.split(key, 3)
-    joints = jp.asarray(scene.HOME_RAD) + config.joint_rad * jax.random.uniform(
+    joints = jnp.asarray(scene.HOME_RAD) + config.joint_rad * jax.random.uniform(
         k_joint, (scene.N_ARM,), minval=-1.0, maxval=1.0
     )
-    half = jp.asarray(contract.WORKSPACE_SIZE_M) / 2
-    xy = jp.asarray(contract.WORKSPACE_CENTER_M) + half * jax.random.uniform(
+    half = jnp.asarray(contract.WORKSPACE_SIZE_M) / 2
+    xy = jnp.asarray(contract.WORKSPACE_CENTER_M) + half * jax.random.uniform(
         k_xy, (2,), minval=-1.0, maxval=1.0
     )
-    yaw = jax.random.uniform(k_yaw, (), minval=-jp.pi, maxval=jp.pi)
-    fingers = jp.full(2, contract.GRIPPER_MAX_WIDTH_M / 2)
-    return jp.concatenate([joints, fingers, xy, rest_height_m[None], kinematics.quat_about_z(yaw, jp)])
+    yaw = jax.random.uniform(k_yaw, (), minval=-jnp.pi, maxval=jnp.pi)
+    fingers = jnp.full(2, contract.GRIPPER_MAX_WIDTH_M / 2)
+    return jnp.concatenate([joints, fingers, xy, rest_height_m[None], kinematics.quat_about_z(yaw, jnp)])
 
 
 def maybe_pregrasp(key: jax.Array, config: RandomConfig, qpos: jax.Array, grasp_pos, grasp_quat) -> jax.Array:
@@ -94,10 +94,10 @@ def maybe_pregrasp(key: jax.Array, config: RandomConfig, qpos: jax.Array, grasp_
     k_choice, k_offset = jax.random.split(key)
     offset = jax.random.uniform(k_offset, (3,), minval=-1.0, maxval=1.0)
     height = PREGRASP_HEIGHT_M * (0.5 + 0.5 * offset[2])
-    target = grasp_pos + jp.stack([0.005 * offset[0], 0.005 * offset[1], height])
+    target = grasp_pos + jnp.stack([0.005 * offset[0], 0.005 * offset[1], height])
     joints = inverse_kinematics.solve(qpos[QPOS.arm], target, grasp_quat)
     chosen = jax.random.uniform(k_choice) < config.pregrasp_share
-    return qpos.at[QPOS.arm].set(jp.where(chosen, joints, qpos[QPOS.arm]))
+    return qpos.at[QPOS.arm].set(jnp.where(chosen, joints, qpos[QPOS.arm]))
 
 
 def sample_camera(key: jax.Array, config: RandomConfig, T_world_cam) -> jax.Array:
@@ -106,7 +106,7 @@ def sample_camera(key: jax.Array, config: RandomConfig, T_world_cam) -> jax.Arra
     shift = config.camera_position_m * jax.random.uniform(k_pos, (3,), minval=-1.0, maxval=1.0)
     rx, ry, rz = config.camera_angle_rad * jax.random.uniform(k_rot, (3,), minval=-1.0, maxval=1.0)
     # First-order rotation, made orthonormal: the angles are a few hundredths of a radian.
-    quat = jp.array([1.0, rx / 2, ry / 2, rz / 2])
-    turn = kinematics.quat_to_mat(quat / jp.linalg.norm(quat), jp)
-    T = jp.asarray(T_world_cam, jp.float32)
+    quat = jnp.array([1.0, rx / 2, ry / 2, rz / 2])
+    turn = kinematics.quat_to_mat(quat / jnp.linalg.norm(quat), jnp)
+    T = jnp.asarray(T_world_cam, jnp.float32)
     return T.at[:3, :3].set(T[:3, :3] @ turn).at[:3, 3].add(shift)

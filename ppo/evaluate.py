@@ -3,7 +3,7 @@
 from functools import partial
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
@@ -23,18 +23,18 @@ def _episodes(env: GraspEnv, mesh: Mesh, count: int, layers, mean, std, key):
     policy = TeacherPolicy(mean, std, layers)
     keys = jax.random.split(key, count)
     surplus = -count % mesh.size
-    keys = jp.concatenate([keys, jp.tile(keys[-1:], (surplus, 1))]) if surplus else keys
+    keys = jnp.concatenate([keys, jnp.tile(keys[-1:], (surplus, 1))]) if surplus else keys
     state = devices.each(mesh, env.reset)(keys)
 
     def step(carry, _):
         state, alive, success = carry
-        action = policy(state.obs, jp)
+        action = policy(state.obs, jnp)
         state = devices.each(mesh, env.step)(state, action)
-        success = jp.where(alive, state.metrics["success"], success)
+        success = jnp.where(alive, state.metrics["success"], success)
         motion = (state.data.qvel[:, QVEL.arm], action, alive)
         return (state, alive & (state.done == 0), success), motion
 
-    start = (state, jp.ones(len(keys), bool), jp.zeros(len(keys)))
+    start = (state, jnp.ones(len(keys), bool), jnp.zeros(len(keys)))
     (state, _, success), motion = jax.lax.scan(step, start, None, env.config.episode_steps)
     outcome = (success, state.info["episode"].object_index, motion)
     return jax.lax.with_sharding_constraint(outcome, devices.replicated(mesh))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
@@ -53,7 +53,7 @@ def episode_keys(env: GraspEnv, per_object: int, seed: int) -> np.ndarray:
 
 def record(env: GraspEnv, policy: TeacherPolicy, keys: np.ndarray) -> Trials:
     """The deterministic `policy` in the episodes of `keys` (N, 2)."""
-    recorded = _record(env, policy.layers, policy.mean, policy.std, jp.asarray(keys))
+    recorded = _record(env, policy.layers, policy.mean, policy.std, jnp.asarray(keys))
     return Trials(*jax.tree.map(np.asarray, recorded))
 
 
@@ -65,14 +65,14 @@ def _record(env: GraspEnv, layers, mean, std, keys):
 
     def step(carry, _):
         state, alive, touched, success = carry
-        touched = touched | jp.any(state.data.touch > TOUCH_N, axis=-1)
-        action = policy(state.obs, jp)
+        touched = touched | jnp.any(state.data.touch > TOUCH_N, axis=-1)
+        action = policy(state.obs, jnp)
         new = jax.vmap(env.step)(state, action)
-        success = jp.where(alive, new.metrics["success"] > 0, success)
+        success = jnp.where(alive, new.metrics["success"] > 0, success)
         kept = (state.data.qpos, touched, alive, action, new.data.qvel[:, QVEL.arm])
         return (new, alive & (new.done == 0), touched, success), kept
 
-    never = jp.zeros(len(keys), bool)
+    never = jnp.zeros(len(keys), bool)
     start = (state, ~never, never, never)
     (*_, success), kept = jax.lax.scan(step, start, None, env.config.episode_steps)
     return (params, *kept, success)

@@ -11,6 +11,7 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.depth import to_metres, to_millimetres
 from demos.rollout import Scene
+from student_jax.data import stack_steps
 from student_jax.policy import sample_actions
 
 Corrupt = Callable[[Scene], np.ndarray]
@@ -70,7 +71,7 @@ class StudentActor:
         self.seen_mm.append(self._corrupt(scene))
         position = scene.step % self._config.execute_steps
         if position == 0:
-            frames = [self.seen_mm[max(0, scene.step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)]
+            frames = [self.seen_mm[t] for t in stack_steps(scene.step)]
             shape = (len(scene.state), self._config.chunk, contract.ACTION_SIZE)
             noise = self._noise_scale * self._rng.standard_normal(shape)
             self._chunk = np.asarray(

@@ -54,7 +54,7 @@ class Frames:
 
     def _stack_one(self, episode: int, step: int) -> np.ndarray:
         frames = self.depth_mm[episode]
-        return np.stack([frames[max(0, step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)])
+        return np.stack([frames[t] for t in stack_steps(step)])
 
     def action_chunks(self, index: np.ndarray, chunk: int) -> np.ndarray:
         """(B, chunk, 8) labels from each index on, the episode's last one repeated at its end."""
@@ -63,6 +63,11 @@ class Frames:
         inside = self.episode[ahead] == self.episode[index][:, None]
         last = np.where(inside, ahead, 0).max(axis=1, keepdims=True)
         return self.action[np.where(inside, ahead, last)]
+
+
+def stack_steps(step: int) -> list[int]:
+    """The steps whose frames are the student's stack at `step`, oldest first; at the start, 0 repeated."""
+    return [max(0, step - k) for k in reversed(range(contract.DEPTH_FRAMES))]
 
 
 def aux_targets(observation: np.ndarray, held: np.ndarray) -> Aux:

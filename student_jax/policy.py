@@ -39,7 +39,7 @@ BESIDE_SCALE = 0.25
 HEAD_PARAMS = ("state_stream", "denoiser")
 """The parameters that act; all others see."""
 PARAMS_FILE = "params.msgpack"
-"""Name of the parameter file in the student's artefact (`artifacts.save_params`)."""
+"""Name of the parameter file in the student's artifact (`artifacts.save_params`)."""
 Numbers = jax.Array | np.ndarray
 
 

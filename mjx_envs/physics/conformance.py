@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 
 from ddgrasp import contract
@@ -138,7 +138,7 @@ def sliding() -> Scenario:
     """Cube and block pushed off along x with three friction coefficients each, until they stand still."""
     names = ("cube", "block") * len(SLIDE_FRICTION)
     params, rest = _params(names)
-    friction = jp.repeat(jp.asarray(SLIDE_FRICTION), 2)
+    friction = jnp.repeat(jnp.asarray(SLIDE_FRICTION), 2)
     start = _start([(0.6, 0.2, height) for height in rest])
     start = replace(start, qvel=start.qvel.at[:, QVEL.object_linear.start].set(SLIDE_SPEED_M_S))
     return Scenario(replace(params, object_friction=friction), start, _hold(5))
@@ -191,15 +191,15 @@ def grasp_and_lift() -> Scenario:
     params, rest = _params()
     start = _start([(0.5, 0.0, height) for height in rest])
     specs = [OBJECTS[name] for name in OBJECTS_TRIED]
-    symmetry = jp.array([spec.grasp_symmetry for spec in specs])
-    offset = jp.array([spec.grasp_offset_m for spec in specs])
-    above = jp.array([0.0, 0.0, LIFT_M])
+    symmetry = jnp.array([spec.grasp_symmetry for spec in specs])
+    offset = jnp.array([spec.grasp_offset_m for spec in specs])
+    above = jnp.array([0.0, 0.0, LIFT_M])
 
     def joints(qpos, symmetry, offset):
-        branch = grasp_math.yaw_branch(qpos[QPOS.object_quat], symmetry, jp)
+        branch = grasp_math.yaw_branch(qpos[QPOS.object_quat], symmetry, jnp)
         pose = qpos[QPOS.object_pos], qpos[QPOS.object_quat]
-        pos, quat = grasp_math.grasp_pose(*pose, symmetry, branch, jp, offset)
-        home = jp.asarray(scene.HOME_RAD)
+        pos, quat = grasp_math.grasp_pose(*pose, symmetry, branch, jnp, offset)
+        home = jnp.asarray(scene.HOME_RAD)
         at = inverse_kinematics.solve(home, pos, quat)
         return at, inverse_kinematics.solve(at, pos + above, quat)
 
@@ -246,7 +246,7 @@ def _params(names: tuple[str, ...] = OBJECTS_TRIED) -> tuple[ModelParams, np.nda
     assert table.layout == DEFAULT_SLOTS
     keys = jax.random.split(jax.random.PRNGKey(0), len(names))
     sample = jax.vmap(lambda key, i: randomize.sample_params(key, RandomConfig(), table, i))
-    params, size = sample(keys, jp.arange(len(names)))
+    params, size = sample(keys, jnp.arange(len(names)))
     return params, table.rest_height[: len(names)] * np.asarray(size)
 
 
@@ -254,7 +254,7 @@ def _start(places) -> PhysicsState:
     """At rest, arm home, gripper open, objects upright at `places` (B, 3)."""
     robot = np.tile([*scene.HOME_RAD, *_OPEN], (len(places), 1))
     qpos = np.concatenate([robot, places, np.tile([1.0, 0, 0, 0], (len(places), 1))], axis=1)
-    return jax.vmap(physics.initial_state)(jp.asarray(qpos, jp.float32))
+    return jax.vmap(physics.initial_state)(jnp.asarray(qpos, jnp.float32))
 
 
 _OPEN = (contract.GRIPPER_MAX_WIDTH_M / 2,) * 2

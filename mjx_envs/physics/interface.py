@@ -9,7 +9,7 @@ for one environment; use `jax.vmap` for many.
 from typing import Protocol
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
@@ -68,7 +68,9 @@ class Physics(Protocol):
 
 def initial_state(qpos: jax.Array) -> PhysicsState:
     """At rest in `qpos` (16,), touching nothing."""
-    return PhysicsState(qpos=qpos, qvel=jp.zeros(scene.NV), warmstart=jp.zeros(scene.NV), touch=jp.zeros(2))
+    return PhysicsState(
+        qpos=qpos, qvel=jnp.zeros(scene.NV), warmstart=jnp.zeros(scene.NV), touch=jnp.zeros(2)
+    )
 
 
 def touch_from_sensors(sensordata, xp):
@@ -132,10 +134,10 @@ class ModelIndex:
         """
         obj = self.object_body
         mass, inertia = fields["body_mass"][obj], fields["body_inertia"][obj]
-        inverse = jp.stack([1 / mass, jp.mean(1 / inertia)])
+        inverse = jnp.stack([1 / mass, jnp.mean(1 / inertia)])
         return {
-            "body_subtreemass": jp.asarray(self._in_subtree, jp.float32) @ fields["body_mass"],
-            "body_invweight0": jp.asarray(model.body_invweight0).at[obj].set(inverse),
+            "body_subtreemass": jnp.asarray(self._in_subtree, jnp.float32) @ fields["body_mass"],
+            "body_invweight0": jnp.asarray(model.body_invweight0).at[obj].set(inverse),
         }
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 
 from ddgrasp import contract, depth
@@ -48,28 +48,28 @@ class Viewer:
 
     def geoms(self, qpos: jax.Array, params: ModelParams, object_rgb) -> Geoms:
         """World geometry of the configuration qpos (16,) with the slots' colours (S, 3), or one (3,)."""
-        poses = kinematics.body_poses(qpos, jp)
-        poses["world"] = (jp.zeros(3), jp.asarray([1.0, 0.0, 0.0, 0.0]))
-        body_pos = jp.stack([poses[name][0] for name in self._bodies])
-        body_quat = jp.stack([poses[name][1] for name in self._bodies])
-        local_pos = jp.asarray(self._pos, jp.float32).at[self._slots].set(params.slot_pos)
-        local_quat = jp.asarray(self._quat, jp.float32).at[self._slots].set(params.slot_quat)
-        quat = kinematics.quat_mul(body_quat, local_quat, jp)
+        poses = kinematics.body_poses(qpos, jnp)
+        poses["world"] = (jnp.zeros(3), jnp.asarray([1.0, 0.0, 0.0, 0.0]))
+        body_pos = jnp.stack([poses[name][0] for name in self._bodies])
+        body_quat = jnp.stack([poses[name][1] for name in self._bodies])
+        local_pos = jnp.asarray(self._pos, jnp.float32).at[self._slots].set(params.slot_pos)
+        local_quat = jnp.asarray(self._quat, jnp.float32).at[self._slots].set(params.slot_quat)
+        quat = kinematics.quat_mul(body_quat, local_quat, jnp)
         return Geoms(
             types=self._types,
-            pos_w=body_pos + kinematics.rotate(body_quat, local_pos, jp),
-            rot_w=kinematics.quat_to_mat(quat, jp),
-            size=jp.asarray(self._size).at[self._slots].set(params.slot_size),
-            rgb=jp.asarray(self._rgb).at[self._slots].set(jp.asarray(object_rgb, jp.float32)),
+            pos_w=body_pos + kinematics.rotate(body_quat, local_pos, jnp),
+            rot_w=kinematics.quat_to_mat(quat, jnp),
+            size=jnp.asarray(self._size).at[self._slots].set(params.slot_size),
+            rgb=jnp.asarray(self._rgb).at[self._slots].set(jnp.asarray(object_rgb, jnp.float32)),
         )
 
     def depth_mm(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
         """(B, H, W) uint16 planar depth of a batch of scenes, 0 where nothing is hit."""
-        return depth.to_millimetres(self._draw_depth(geoms, T_world_cam).depth_m, jp)
+        return depth.to_millimetres(self._draw_depth(geoms, T_world_cam).depth_m, jnp)
 
     def rgb(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
         """(B, H, W, 3) uint8 colour of a batch of scenes."""
-        return jp.round(255 * self._draw(geoms, T_world_cam).rgb).astype(jp.uint8)
+        return jnp.round(255 * self._draw(geoms, T_world_cam).rgb).astype(jnp.uint8)
 
     def object_pixels(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
         """(B,) int32 pixels of the object in the centred crop window, for a batch of scenes."""
@@ -77,7 +77,7 @@ class Viewer:
 
         def count(a):
             picture = render(a[0], self._seen_from(a[1]), *self.profile.crop_origin_px, window)
-            return jp.isin(picture.segmentation, self._slots).sum()
+            return jnp.isin(picture.segmentation, self._slots).sum()
 
         return jax.lax.map(count, (geoms, T_world_cam))
 
