@@ -227,7 +227,7 @@ def test_the_stream_hands_colour_to_a_prior_that_needs_it(run):
 def test_wrong_input_is_refused(run, tmp_path, straight):
     config = dataclasses.replace(CONFIG, ddg=dataclasses.replace(CONFIG.ddg, prior_in_sim="rgb"))
     assert make_prior(config.ddg).needs_sim_rgb is False  # the built-in prior needs none
-    with pytest.raises(UserError, match="holds no finished artefact"):
+    with pytest.raises(UserError, match="holds no finished artifact"):
         artifacts.read_artifact(tmp_path)
     old = tmp_path / "demos"
     artifacts.finish(old, "demos", CONFIG, seconds=1, metrics={})
