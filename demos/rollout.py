@@ -7,6 +7,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp import contract
 from ddgrasp.config import Config
@@ -151,7 +152,7 @@ class Roller:
         return jax.vmap(self.viewer.geoms)(state.data.qpos, episode.params, colours)
 
 
-def student_state(qpos):
+def student_state(qpos: Float[jax.Array, "*batch 16"]) -> Float[jax.Array, "*batch 8"]:
     """(..., 8) what the student knows of the joints: seven positions and the gripper's width."""
     return jnp.concatenate([qpos[..., QPOS.arm], qpos[..., QPOS.fingers].sum(-1, keepdims=True)], axis=-1)
 

@@ -10,11 +10,13 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax.sharding import Mesh
+from jaxtyping import Float, Int
 from ml_collections import config_dict
 from mujoco import mjx
 from mujoco_playground._src import mjx_env
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import WorldConfig
 from ddgrasp.layout import ACTION, QPOS, QVEL, closes
 from mjx_envs import devices, grasp_math, kinematics, randomize, rewards, scene
@@ -73,7 +75,7 @@ class GraspEnv(mjx_env.MjxEnv):
         self.physics = make_physics(config.backend, config.sim_dt_s, self.table.layout)
         self._mj_model = scene.build_model(config.sim_dt_s, self.table.layout)
 
-    def reset(self, rng: jax.Array) -> mjx_env.State:
+    def reset(self, rng: randomize.Key) -> mjx_env.State:
         """A new episode: object, pose, dynamics and joints drawn from `rng`."""
         _, k_variant, k_params, k_qpos, k_start, k_next = jax.random.split(rng, 6)
         index = self.object_drawn(rng)
@@ -105,11 +107,11 @@ class GraspEnv(mjx_env.MjxEnv):
         info = {"episode": episode, "rng": k_next, "truncation": jnp.zeros(())}
         return mjx_env.State(state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
 
-    def object_drawn(self, rng: jax.Array) -> jax.Array:
+    def object_drawn(self, rng: randomize.Key) -> Int[jax.Array, ""]:
         """() index of the object that `reset(rng)` takes."""
         return jax.random.randint(jax.random.split(rng, 6)[0], (), 0, len(self.table.names))
 
-    def step(self, state: mjx_env.State, action: jax.Array) -> mjx_env.State:
+    def step(self, state: mjx_env.State, action: Float[jax.Array, "8"]) -> mjx_env.State:
         """One control step with `action` (8,)."""
         old: physics.PhysicsState = state.data
         episode: Episode = state.info["episode"]
@@ -241,7 +243,7 @@ class AutoReset:
         waiting = (fresh.data, fresh.obs, fresh.info["episode"])
         return replace(state, info=state.info | {"next": waiting, "rng": fresh.info["rng"]})
 
-    def step(self, state: mjx_env.State, action: jax.Array) -> mjx_env.State:
+    def step(self, state: mjx_env.State, action: Float[AnyArray, "b 8"]) -> mjx_env.State:
         """One control step of the batch with `action` (B, 8)."""
         waiting = state.info["next"]
         bare = {k: v for k, v in state.info.items() if k != "next"}

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from ddgrasp import contract
 from mjx_envs import kinematics, scene
@@ -10,7 +11,9 @@ ITERATIONS = 10
 DAMPING = 1e-4
 
 
-def solve(q_start: jax.Array, position_m: jax.Array, quat: jax.Array) -> jax.Array:
+def solve(
+    q_start: Float[jax.Array, "7"], position_m: Float[jax.Array, "3"], quat: Float[jax.Array, "4"]
+) -> Float[jax.Array, "7"]:
     """(7,) rad near `q_start`: ITERATIONS damped least-squares steps (Wampler 1986), joint limits kept."""
     lower, upper = jnp.asarray(contract.JOINT_LOWER_RAD), jnp.asarray(contract.JOINT_UPPER_RAD)
 

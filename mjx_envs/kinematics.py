@@ -7,15 +7,22 @@ leading batch dimensions. This module imports NumPy alone.
 from types import ModuleType
 
 import numpy as np
+from jaxtyping import Float
 
+from ddgrasp.arrays import AnyArray
 from ddgrasp.layout import QPOS
 from mjx_envs import scene
 
+Quats = Float[AnyArray, "*#batch 4"]
+Vectors = Float[AnyArray, "*#batch 3"]
+"""Batches that NumPy's rules make alike."""
+Pose = tuple[Float[AnyArray, "*batch 3"], Float[AnyArray, "*batch 4"]]
+"""Position (m) and unit quaternion in the world."""
 _FINGER_TURNS = {"left_finger": (1.0, 0, 0, 0), "right_finger": (0.0, 0, 0, 1)}
 """Quaternions in the hand's frame; a finger moves along its own y axis."""
 
 
-def quat_mul(a, b, xp: ModuleType = np):
+def quat_mul(a: Quats, b: Quats, xp: ModuleType = np) -> Quats:
     """(..., 4) Hamilton product a * b."""
     aw, ax, ay, az = (a[..., i] for i in range(4))
     bw, bx, by, bz = (b[..., i] for i in range(4))
@@ -30,43 +37,43 @@ def quat_mul(a, b, xp: ModuleType = np):
     )
 
 
-def quat_conj(q, xp: ModuleType = np):
+def quat_conj(q: Float[AnyArray, "*batch 4"], xp: ModuleType = np) -> Float[AnyArray, "*batch 4"]:
     """(..., 4) conjugate = inverse of a unit quaternion."""
     return xp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
-def rotate(q, v, xp: ModuleType = np):
+def rotate(q: Quats, v: Vectors, xp: ModuleType = np) -> Vectors:
     """(..., 3) vector v turned by the unit quaternion q."""
     u = q[..., 1:]
     t = 2.0 * xp.cross(u, v)
     return v + q[..., :1] * t + xp.cross(u, t)
 
 
-def quat_to_mat(q, xp: ModuleType = np):
+def quat_to_mat(q: Float[AnyArray, "*batch 4"], xp: ModuleType = np) -> Float[AnyArray, "*batch 3 3"]:
     """(..., 3, 3) rotation matrix of a unit quaternion."""
     columns = [rotate(q, xp.broadcast_to(xp.eye(3)[i], q.shape[:-1] + (3,)), xp) for i in range(3)]
     return xp.stack(columns, axis=-1)
 
 
-def quat_about_z(angle_rad, xp: ModuleType = np):
+def quat_about_z(angle_rad: Float[AnyArray, "*batch"], xp: ModuleType = np) -> Float[AnyArray, "*batch 4"]:
     """(..., 4) rotation about the z axis."""
     zero = xp.zeros_like(angle_rad)
     return xp.stack([xp.cos(angle_rad / 2), zero, zero, xp.sin(angle_rad / 2)], axis=-1)
 
 
-def yaw_of(q, xp: ModuleType = np):
+def yaw_of(q: Float[AnyArray, "*batch 4"], xp: ModuleType = np) -> Float[AnyArray, "*batch"]:
     """(...,) angle about world z of the horizontal projection of the turned x axis."""
     w, x, y, z = (q[..., i] for i in range(4))
     return xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def angle_between(a, b, xp: ModuleType = np):
+def angle_between(a: Quats, b: Quats, xp: ModuleType = np) -> Float[AnyArray, "*#batch"]:
     """(...,) angle (rad, 0..pi) of the rotation from unit quaternion a to b."""
     dot = xp.abs(xp.sum(a * b, axis=-1))
     return 2.0 * xp.arccos(xp.clip(dot, 0.0, 1.0 - 1e-7))
 
 
-def body_poses(qpos, xp: ModuleType = np) -> dict:
+def body_poses(qpos: Float[AnyArray, "*batch joints"], xp: ModuleType = np) -> dict[str, Pose]:
     """World pose of every moving body: name -> ((..., 3) position m, (..., 4) quaternion).
 
     Args:
@@ -118,7 +125,9 @@ def _arm_chain(base, joints, xp):
     return np.stack([p for p, _ in poses]), np.stack([q for _, q in poses])
 
 
-def grip_pose(q_arm, xp: ModuleType = np):
+def grip_pose(
+    q_arm: Float[AnyArray, "*batch 7"], xp: ModuleType = np
+) -> tuple[Float[AnyArray, "*batch 3"], Float[AnyArray, "*batch 4"]]:
     """((..., 3) position m, (..., 4) quaternion) of the site between the finger pads.
 
     Args:

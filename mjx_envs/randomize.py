@@ -3,8 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float, Int, PRNGKeyArray, UInt32
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import RandomConfig
 from ddgrasp.layout import QPOS
 from mjx_envs import inverse_kinematics, kinematics, scene
@@ -12,6 +15,9 @@ from mjx_envs.objects import get_object, slot_layout
 from mjx_envs.physics.interface import ModelParams
 
 PREGRASP_HEIGHT_M = 0.15
+
+Key = PRNGKeyArray | UInt32[Array, "2"]
+Index = Int[AnyArray, ""] | int
 
 
 class ObjectTable:
@@ -40,7 +46,7 @@ class ObjectTable:
         self.grasp_offset = np.array([s.grasp_offset_m for s in specs])
 
 
-def sample_variant(key: jax.Array, config: RandomConfig, table: ObjectTable, index) -> jax.Array:
+def sample_variant(key: Key, config: RandomConfig, table: ObjectTable, index: Index) -> Int[Array, ""]:
     """() index into the table's arrays of object `index`, in one of its rest poses."""
     other = jax.random.uniform(key) < config.other_pose_share
     return jnp.where(other, jnp.asarray(table.other_variant)[index], index)
@@ -52,8 +58,8 @@ def _around(key, half_range, shape=()):
 
 
 def sample_params(
-    key: jax.Array, config: RandomConfig, table: ObjectTable, variant
-) -> tuple[ModelParams, jax.Array]:
+    key: Key, config: RandomConfig, table: ObjectTable, variant: Index
+) -> tuple[ModelParams, Float[Array, ""]]:
     """Model parameters of one episode with `variant` of the table; also the object's size factor ()."""
     keys = jax.random.split(key, 7)
     size = _around(keys[0], config.size)
@@ -74,7 +80,7 @@ def sample_params(
     return params, size
 
 
-def sample_qpos(key: jax.Array, config: RandomConfig, rest_height_m) -> jax.Array:
+def sample_qpos(key: Key, config: RandomConfig, rest_height_m: Float[Array, ""]) -> Float[Array, "16"]:
     """(16,) initial joints around home, gripper open, object on the table with any yaw."""
     k_joint, k_xy, k_yaw = jax.random.split(key, 3)
     joints = jnp.asarray(scene.HOME_RAD) + config.joint_rad * jax.random.uniform(
@@ -89,7 +95,10 @@ def sample_qpos(key: jax.Array, config: RandomConfig, rest_height_m) -> jax.Arra
     return jnp.concatenate([joints, fingers, xy, rest_height_m[None], kinematics.quat_about_z(yaw, jnp)])
 
 
-def maybe_pregrasp(key: jax.Array, config: RandomConfig, qpos: jax.Array, grasp_pos, grasp_quat) -> jax.Array:
+def maybe_pregrasp(
+    key: Key, config: RandomConfig, qpos: Float[Array, "16"], grasp_pos: Float[Array, "3"],
+    grasp_quat: Float[Array, "4"],
+) -> Float[Array, "16"]:  # fmt: skip
     """qpos (16,) with the hand, in a share of the episodes, up to PREGRASP_HEIGHT_M above the grasp pose."""
     k_choice, k_offset = jax.random.split(key)
     offset = jax.random.uniform(k_offset, (3,), minval=-1.0, maxval=1.0)
@@ -100,7 +109,7 @@ def maybe_pregrasp(key: jax.Array, config: RandomConfig, qpos: jax.Array, grasp_
     return qpos.at[QPOS.arm].set(jnp.where(chosen, joints, qpos[QPOS.arm]))
 
 
-def sample_camera(key: jax.Array, config: RandomConfig, T_world_cam) -> jax.Array:
+def sample_camera(key: Key, config: RandomConfig, T_world_cam: Float[AnyArray, "4 4"]) -> Float[Array, "4 4"]:
     """(4, 4) the nominal camera pose, moved and turned within the configured range."""
     k_pos, k_rot = jax.random.split(key)
     shift = config.camera_position_m * jax.random.uniform(k_pos, (3,), minval=-1.0, maxval=1.0)

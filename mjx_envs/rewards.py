@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax import Array
+from jaxtyping import Float
 
 from ddgrasp import contract
 from ddgrasp.config import RewardConfig
@@ -48,7 +50,12 @@ class Transition:
     hold_count: jax.Array
 
 
-def distances(qpos, grasp_pos, grasp_quat, grip_pose) -> Distances:
+def distances(
+    qpos: Float[Array, "16"],
+    grasp_pos: Float[Array, "3"],
+    grasp_quat: Float[Array, "4"],
+    grip_pose: tuple[Float[Array, "3"], Float[Array, "4"]],
+) -> Distances:
     """`Distances` in the configuration qpos (16,)."""
     grip_pos, grip_quat = grip_pose
     return Distances(
@@ -61,7 +68,7 @@ def distances(qpos, grasp_pos, grasp_quat, grip_pose) -> Distances:
     )
 
 
-def approach_distance(grip_pos, grasp_pos) -> jax.Array:
+def approach_distance(grip_pos: Float[Array, "3"], grasp_pos: Float[Array, "3"]) -> Float[Array, ""]:
     """() m to the grasp; to a point above it while the hand is off to the side.
 
     The paper's d_hand is the plain distance. Its gradient drives the fingers through the object
@@ -73,7 +80,7 @@ def approach_distance(grip_pos, grasp_pos) -> jax.Array:
     return lateral + jnp.abs(height)
 
 
-def terms(weights: RewardConfig, t: Transition) -> dict[str, jax.Array]:
+def terms(weights: RewardConfig, t: Transition) -> dict[str, Float[Array, ""]]:
     """Weighted reward terms, by name; their sum is the reward (paper Eq. 2)."""
     grasped, lifted = t.grasped.astype(jnp.float32), t.lifted.astype(jnp.float32)
     count = jnp.minimum(t.hold_count, weights.bonus_max_count)

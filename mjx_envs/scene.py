@@ -6,11 +6,14 @@ Identification of the Franka Emika Panda Robot", RA-L 2019. Geometry is our own:
 """
 
 from dataclasses import dataclass
+from types import ModuleType
 
 import mujoco
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.layout import CONTROLS, QPOS, QVEL
 from mjx_envs.objects import DEFAULT_SLOTS, OBJECTS, ObjectSpec, SlotLayout
 
@@ -247,7 +250,9 @@ def fill_slots(
     model.body_inertia[body] = spec.inertia_kg_m2() * mass * size**2
 
 
-def slot_bounding_radii(size, is_capsule, xp=np):
+def slot_bounding_radii(
+    size: Float[AnyArray, "*batch slots 3"], is_capsule: Bool[np.ndarray, " slots"], xp: ModuleType = np
+) -> Float[AnyArray, "*batch slots"]:
     """(..., S) radii of spheres that hold slots of `size` (..., S, 3); `is_capsule` (S,) bool."""
     return xp.sqrt(xp.sum(size**2, axis=-1)) + size[..., 1] * is_capsule
 

@@ -7,6 +7,7 @@ and its motions are what a student can copy: from above, unhurried, the object i
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from ddgrasp import contract
 from ddgrasp.layout import OBSERVATION
@@ -23,7 +24,7 @@ NEAR_M = 0.03
 CLEARANCE_M = 0.10
 
 
-def guide(observation: jax.Array) -> jax.Array:
+def guide(observation: Float[jax.Array, "40"]) -> Float[jax.Array, "8"]:
     """(8,) action for one observation (40,)."""
     part = {name: observation[where] for name, where in OBSERVATION.items()}
     q, fingers, finger_speed = part["arm"], part["fingers"].sum(), part["finger_velocity"].sum()

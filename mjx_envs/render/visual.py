@@ -5,8 +5,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int32, UInt8, UInt16
 
 from ddgrasp import contract, depth
+from ddgrasp.arrays import AnyArray
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.objects import DEFAULT_SLOTS, SlotLayout
@@ -46,7 +48,9 @@ class Viewer:
         """(4, 4) T_world_cam of the contract's camera."""
         return self._camera.T_world_cam
 
-    def geoms(self, qpos: jax.Array, params: ModelParams, object_rgb) -> Geoms:
+    def geoms(
+        self, qpos: Float[jax.Array, "16"], params: ModelParams, object_rgb: Float[AnyArray, "*slots 3"]
+    ) -> Geoms:
         """World geometry of the configuration qpos (16,) with the slots' colours (S, 3), or one (3,)."""
         poses = kinematics.body_poses(qpos, jnp)
         poses["world"] = (jnp.zeros(3), jnp.asarray([1.0, 0.0, 0.0, 0.0]))
@@ -63,15 +67,19 @@ class Viewer:
             rgb=jnp.asarray(self._rgb).at[self._slots].set(jnp.asarray(object_rgb, jnp.float32)),
         )
 
-    def depth_mm(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
+    def depth_mm(
+        self, geoms: Geoms, T_world_cam: Float[AnyArray, "b 4 4"]
+    ) -> UInt16[jax.Array, "b height width"]:
         """(B, H, W) uint16 planar depth of a batch of scenes, 0 where nothing is hit."""
         return depth.to_millimetres(self._draw_depth(geoms, T_world_cam).depth_m, jnp)
 
-    def rgb(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
+    def rgb(
+        self, geoms: Geoms, T_world_cam: Float[AnyArray, "b 4 4"]
+    ) -> UInt8[jax.Array, "b height width 3"]:
         """(B, H, W, 3) uint8 colour of a batch of scenes."""
         return jnp.round(255 * self._draw(geoms, T_world_cam).rgb).astype(jnp.uint8)
 
-    def object_pixels(self, geoms: Geoms, T_world_cam: jax.Array) -> jax.Array:
+    def object_pixels(self, geoms: Geoms, T_world_cam: Float[AnyArray, "b 4 4"]) -> Int32[jax.Array, " b"]:
         """(B,) int32 pixels of the object in the centred crop window, for a batch of scenes."""
         window = (self.profile.crop_height_px, self.profile.crop_width_px)
 
