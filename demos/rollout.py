@@ -7,7 +7,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import Config
@@ -25,44 +25,34 @@ Actor = Callable[["Scene"], np.ndarray]
 class Scene:
     """One control step of B environments, before the action is taken."""
 
-    depth_mm: np.ndarray
-    """(B, H, W) uint16, clean."""
-    state: np.ndarray
-    """(B, 8) joint positions and gripper width."""
-    expert: np.ndarray
-    """(B, 8) the teacher's action here: the label."""
-    observation: np.ndarray
-    """(B, 40)."""
-    held: np.ndarray
-    """(B,) bool, object in the hand."""
+    depth_mm: UInt16[np.ndarray, "B H W"]
+    """Clean."""
+    state: Float[np.ndarray, "B 8"]
+    """Joint positions and gripper width."""
+    expert: Float[np.ndarray, "B 8"]
+    """The teacher's action here: the label."""
+    observation: Float[np.ndarray, "B 40"]
+    held: Bool[np.ndarray, " B"]
+    """Object in the hand."""
     step: int
-    rgb: np.ndarray | None = None
-    """(B, H, W, 3) uint8."""
+    rgb: UInt8[np.ndarray, "B H W 3"] | None = None
 
 
 @dataclass
 class Episodes:
     """B episodes of equal allotted length T; `length` says how many steps of each count."""
 
-    depth_mm: np.ndarray
-    """(B, T, H, W) uint16."""
-    state: np.ndarray
-    """(B, T, 8)."""
-    action: np.ndarray
-    """(B, T, 8) the teacher's labels."""
-    observation: np.ndarray
-    """(B, T, 40)."""
-    held: np.ndarray
-    """(B, T) bool."""
-    length: np.ndarray
-    """(B,)."""
-    success: np.ndarray
-    """(B,) bool."""
-    object_index: np.ndarray
-    """(B,)."""
-    T_world_cam: np.ndarray
-    """(B, 4, 4)."""
-    rgb: np.ndarray | None = None
+    depth_mm: UInt16[np.ndarray, "B T H W"]
+    state: Float[np.ndarray, "B T 8"]
+    action: Float[np.ndarray, "B T 8"]
+    """The teacher's labels."""
+    observation: Float[np.ndarray, "B T 40"]
+    held: Bool[np.ndarray, "B T"]
+    length: Int[np.ndarray, " B"]
+    success: Bool[np.ndarray, " B"]
+    object_index: Int[np.ndarray, " B"]
+    T_world_cam: Float[np.ndarray, "B 4 4"]
+    rgb: UInt8[np.ndarray, "B T H W 3"] | None = None
 
 
 class Roller:

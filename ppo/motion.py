@@ -5,6 +5,7 @@ jitter from step to step, not what happens within one.
 """
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ddgrasp import contract
 from ddgrasp.layout import ACTION, closes
@@ -15,7 +16,11 @@ SATURATED = 0.95
 """An action component beyond this share of its range counts as saturated."""
 
 
-def motion_metrics(velocity_rad_s: np.ndarray, action: np.ndarray, running: np.ndarray) -> dict[str, float]:
+def motion_metrics(
+    velocity_rad_s: Float[np.ndarray, "steps n 7"],
+    action: Float[np.ndarray, "steps n 8"],
+    running: Bool[np.ndarray, "steps n"],
+) -> dict[str, float]:
     """Metrics over N episodes of T control steps that start at rest with the gripper open.
 
     Args:

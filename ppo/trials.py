@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, UInt32
 
 from ddgrasp.layout import QVEL
 from ddgrasp.progress import Progress
@@ -25,21 +26,18 @@ class Trials:
 
     params: ModelParams
     """Of each environment, (N, ...)."""
-    qpos: np.ndarray
-    """(T, N, 16)."""
-    touched: np.ndarray
-    """(T, N) bool, whether a finger pad touches the object or has touched it."""
-    running: np.ndarray
-    """(T, N) bool, whether the episode was still going on."""
-    action: np.ndarray
-    """(T, N, 8)."""
-    velocity_rad_s: np.ndarray
-    """(T, N, 7) of the joints at the end of each step."""
-    success: np.ndarray
-    """(N,) bool."""
+    qpos: Float[np.ndarray, "T N 16"]
+    touched: Bool[np.ndarray, "T N"]
+    """Whether a finger pad touches the object or has touched it."""
+    running: Bool[np.ndarray, "T N"]
+    """Whether the episode was still going on."""
+    action: Float[np.ndarray, "T N 8"]
+    velocity_rad_s: Float[np.ndarray, "T N 7"]
+    """Of the joints at the end of each step."""
+    success: Bool[np.ndarray, " N"]
 
 
-def episode_keys(env: GraspEnv, per_object: int, seed: int) -> np.ndarray:
+def episode_keys(env: GraspEnv, per_object: int, seed: int) -> UInt32[np.ndarray, "objects per_object 2"]:
     """(objects, per_object, 2) keys whose resets take each object equally often."""
     drawn = jax.jit(jax.vmap(env.object_drawn))
     found: list[np.ndarray] = [np.empty((0, 2), np.uint32) for _ in env.table.names]
@@ -51,7 +49,7 @@ def episode_keys(env: GraspEnv, per_object: int, seed: int) -> np.ndarray:
     return np.stack([have[:per_object] for have in found])
 
 
-def record(env: GraspEnv, policy: TeacherPolicy, keys: np.ndarray) -> Trials:
+def record(env: GraspEnv, policy: TeacherPolicy, keys: UInt32[np.ndarray, "N 2"]) -> Trials:
     """The deterministic `policy` in the episodes of `keys` (N, 2)."""
     recorded = _record(env, policy.layers, policy.mean, policy.std, jnp.asarray(keys))
     return Trials(*jax.tree.map(np.asarray, recorded))
