@@ -23,6 +23,7 @@ from typing import Any
 
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Backend
+from ddgrasp.files import atomic_write_json, read_json
 from ddgrasp.progress import Progress
 
 TOTAL_S = 530.0
@@ -265,7 +266,7 @@ def run_section(name: str, sizes: Sizes, out: Path) -> int:
 
     def save(**values: Any) -> None:
         result.update(values)
-        artifacts.atomic_write_json(out, result)
+        atomic_write_json(out, result)
 
     for error in SECTIONS[name][0](sizes, save):
         save(errors=[*result["errors"], error])
@@ -284,7 +285,7 @@ def run_all(sections: Sequence[str], device: str, out: Path) -> int:
         if status == NO_GPU:
             return 2
         report |= {"seconds": time.monotonic() - start, "complete": name == sections[-1]}
-        artifacts.atomic_write_json(out, report)
+        atomic_write_json(out, report)
         print(f"{name}: {report[name]['seconds']:.0f} s, {len(report[name]['errors'])} errors", flush=True)
     errors = [f"{name}: {error}" for name in sections for error in report[name]["errors"]]
     print("\n".join([str(out), *errors]))
@@ -307,7 +308,7 @@ def _in_process(name: str, device: str, allowed_s: float) -> tuple[dict[str, Any
         said = log.read_text(errors="replace").strip()
         if status == NO_GPU:
             print(said.splitlines()[-1], file=sys.stderr)
-        result = artifacts.read_json(out) if out.exists() else {"errors": []}
+        result = read_json(out) if out.exists() else {"errors": []}
     if status is None:
         result["errors"].append(f"cut off after {allowed_s:.0f} s")
     elif status and not result["errors"]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ddg_jax.data import surfaces
 from ddg_jax.inverse_depth import invert
-from ddg_jax.prior import SURFACES
+from ddgrasp.config import SURFACES
 from evaluation.depth_score import features as score_features
 from evaluation.depth_score.data import REAL, SIM, Episode, load_episode, metres, millimetres
 from evaluation.depth_score.distances import fid

@@ -18,7 +18,7 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(".cache/jax").absolu
 
 from benchmarks import physics_speed, render_speed
 from benchmarks.compare import as_json, print_table
-from ddgrasp import artifacts
+from ddgrasp.files import atomic_write_json
 from ddgrasp.presets import LAPTOP
 from evaluation.report.summary import describe_machine
 
@@ -41,7 +41,7 @@ def main() -> None:
         print(f"No OpenGL here: {trouble}")
     if arguments.out:
         figures = {"machine": machine, "load": loads, "seconds": seconds, "rows": as_json(rows)}
-        artifacts.atomic_write_json(arguments.out, figures)
+        atomic_write_json(arguments.out, figures)
         print(arguments.out)
 
 

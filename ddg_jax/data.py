@@ -9,10 +9,10 @@ import numpy as np
 
 from ddg_jax.inverse_depth import invert
 from ddg_jax.piecewise import piecewise_smooth
-from ddg_jax.prior import PIECEWISE, Prior
+from ddg_jax.prior import Prior
 from ddg_jax.representation import encode
 from ddgrasp import artifacts
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import PIECEWISE, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from sensors.recordings.recording import Recording, find_recordings, is_recording

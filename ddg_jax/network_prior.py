@@ -13,12 +13,11 @@ import numpy as np
 
 from ddg_jax.inverse_depth import invert, normalise
 from ddgrasp.config import DDGConfig
-from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.errors import UserError
 from foundation import catalog, store
 from foundation.long_video import fit_scale_shift
 
 NETWORKS = (catalog.VIDEO_DEPTH, catalog.IMAGE_DEPTH)
-IN_SIMULATION = ("depth", "rgb")
 _BATCH = 8
 """Pictures that the image network is given together."""
 
@@ -34,8 +33,6 @@ class DepthNetworkPrior:
     needs_rgb = True
 
     def __init__(self, config: DDGConfig):
-        if config.prior.in_sim not in IN_SIMULATION:
-            raise unknown_name("ddg.prior.in_sim", config.prior.in_sim, IN_SIMULATION)
         self.name, self._config = config.prior.source, config
         self.needs_sim_rgb = config.prior.in_sim == "rgb"
         self._directory = weights_folder(config)

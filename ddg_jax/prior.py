@@ -19,12 +19,9 @@ import numpy as np
 from ddg_jax.inverse_depth import invert, normalise
 from ddg_jax.network_prior import NETWORKS, DepthNetworkPrior
 from ddg_jax.piecewise import piecewise_smooth
-from ddgrasp.config import DDGConfig
-from ddgrasp.errors import unknown_name
+from ddgrasp.config import FILTERED, PIECEWISE, DDGConfig
 from sensors.statistics.holes import fill_from_background, smooth_surface
 
-FILTERED, PIECEWISE = SURFACES = ("filtered", "piecewise")
-"""Where the surface under recorded depth comes from: sensors/statistics/holes.py, ddg_jax/piecewise.py."""
 NEAREST_M = 0.15
 """Closer than any reading of the D435 that the metric prior was tried on (0.23 m): c stays the same from here
 on."""
@@ -112,19 +109,15 @@ class MetricInverseDepthPrior(InverseDepthPrior):
         return 2 * np.minimum(inverse, 1 / NEAREST_M) - 2
 
 
-_BUILT_IN = (InverseDepthPrior, MetricInverseDepthPrior)
+_BUILT_IN = {kind.name: kind for kind in (InverseDepthPrior, MetricInverseDepthPrior)}
 
 
 def make_prior(config: DDGConfig) -> Prior:
-    """The prior that the configuration names; UserError for another name, or weights that are not there."""
-    if config.depth.surface not in SURFACES:
-        raise unknown_name("ddg.depth.surface", config.depth.surface, SURFACES)
+    """The prior that the configuration names; UserError for weights that are not there."""
     if config.prior.source in NETWORKS:
         return DepthNetworkPrior(config)
-    for kind in _BUILT_IN:
-        if config.prior.source == kind.name:
-            return kind(config.prior.blur_px, config.prior.decoy_holes, config.depth.surface)
-    raise unknown_name("prior", config.prior.source, (*(kind.name for kind in _BUILT_IN), *NETWORKS))
+    kind = _BUILT_IN[config.prior.source]
+    return kind(config.prior.blur_px, config.prior.decoy_holes, config.depth.surface)
 
 
 def decoy_holes(holes: np.ndarray, rng: np.random.Generator) -> np.ndarray:

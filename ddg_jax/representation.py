@@ -21,10 +21,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from ddgrasp.config import DDGConfig
-from ddgrasp.errors import unknown_name
+from ddgrasp.config import DEPTH, DEVIATION, DDGConfig
 
-DEPTH, DEVIATION = REPRESENTATIONS = ("depth", "deviation")
 HOLE, VALID = -1.0, 1.0
 LIMIT_PER_M = 0.06
 """L: larger deviations of inverse depth (a pixel of disparity for a D455 at 320 px) are clipped."""
@@ -42,9 +40,7 @@ class Decoded(NamedTuple):
 
 
 def channels(config: DDGConfig) -> int:
-    """C, the length of x's last axis; UserError for an unknown representation."""
-    if config.depth.representation not in REPRESENTATIONS:
-        raise unknown_name("ddg.depth.representation", config.depth.representation, REPRESENTATIONS)
+    """C, the length of x's last axis."""
     return 2 if config.depth.representation == DEVIATION else 1
 
 

@@ -10,14 +10,14 @@ from jax import Array
 from ddg_jax.graft import graft
 from ddg_jax.representation import decode
 from ddg_jax.sample import Generator, check_aspect, sample
-from ddgrasp.config import SensorConfig
+from ddgrasp.config import Sensor, SensorConfig
 from ddgrasp.contract import CameraProfile
-from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.errors import UserError
 from sensors.models import procedural
 from sensors.models.sense import Sense, batched, ideal
 from sensors.models.stereo_sensor import stereo
 
-SENSORS: dict[str, Callable[[SensorConfig, CameraProfile], Sense]] = {
+SENSORS: dict[Sensor, Callable[[SensorConfig, CameraProfile], Sense]] = {
     "ideal": lambda config, profile: ideal(),
     "dextrah": lambda config, profile: procedural.dextrah(config.dextrah, profile),
     "kinect": lambda config, profile: procedural.kinect(config.kinect, profile),
@@ -33,10 +33,8 @@ def make_sensor(config: SensorConfig, profile: CameraProfile) -> Sense:
     """The camera model that `config` names, for pictures of `profile`.
 
     Raises:
-        UserError: unknown name, or no fitted generator where `learned` looks for one.
+        UserError: no fitted generator where `learned` looks for one.
     """
-    if config.name not in SENSORS:
-        raise unknown_name("sensor", config.name, SENSORS)
     return SENSORS[config.name](config, profile)
 
 

@@ -15,10 +15,10 @@ from ddg_jax.inverse_depth import invert
 from ddg_jax.prior import Prior, make_prior
 from ddg_jax.sample import Generator, grafted, predict
 from ddg_jax.train import fit
-from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE, DDGConfig
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_bytes
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
 from learning.params import Params
@@ -182,7 +182,7 @@ def _write_png(path: Path, panels: dict[str, np.ndarray]) -> None:
         rows.append(row)
     ok, png = cv2.imencode(".png", np.vstack(rows))
     assert ok
-    artifacts.atomic_write_bytes(path, png.tobytes())
+    atomic_write_bytes(path, png.tobytes())
 
 
 def _coloured(depth_m: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -16,11 +16,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ddg_jax import data
-from ddg_jax.representation import DEPTH
 from ddg_jax.sample import Generator, grafted, predict
 from ddg_jax.stage import hole_statistics
-from ddgrasp import artifacts
-from ddgrasp.config import DDGConfig
+from ddgrasp.config import DEPTH, DDGConfig
+from ddgrasp.files import atomic_write_bytes, atomic_write_json
 from ddgrasp.progress import Progress
 
 THRESHOLDS = tuple(round(-0.9 + 0.1 * i, 1) for i in range(9))
@@ -89,8 +88,8 @@ def analyse(
         "used": config.graft.noise_threshold,
         "thresholds": [asdict(r) for r in rows],
     }
-    artifacts.atomic_write_json(out / f"{FILE}.json", value)
-    artifacts.atomic_write_bytes(out / f"{FILE}.png", _drawn(rows, recorded, config.graft.noise_threshold))
+    atomic_write_json(out / f"{FILE}.json", value)
+    atomic_write_bytes(out / f"{FILE}.png", _drawn(rows, recorded, config.graft.noise_threshold))
     return rows
 
 

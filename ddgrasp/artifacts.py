@@ -1,8 +1,7 @@
 """What a stage leaves on disk: a directory with a manifest, written so that nothing half-done is ever read.
 
-A stage's directory is finished once it holds `manifest.json`, which is written last. Every file goes to a
-temporary name in the same directory, reaches the disk (fsync), then takes its name (os.replace): a crash, a
-full disk or Ctrl-C leaves the previous file as it was. This module imports no JAX.
+A stage's directory is finished once it holds `manifest.json`, which is written last (how: ddgrasp/files.py).
+This module imports no JAX.
 """
 
 import contextlib
@@ -10,7 +9,6 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
-import os
 import platform
 import time
 import typing
@@ -18,97 +16,16 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import contract
+from ddgrasp import contract, upgrades
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.files import TEMPORARY, atomic_write_json, read_json, to_json
 from ddgrasp.stages import config_fields, get_stage
 
 MANIFEST = "manifest.json"
 STARTED = "started.json"
 
 _LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
-_TEMPORARY = ".tmp-"
-
-
-# --- atomic files ------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Yields a temporary path beside `path`; on success it becomes `path`, on any error it goes away.
-
-    The temporary name keeps the suffix, since some writers (NumPy, ONNX, OpenCV) look at it.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{_TEMPORARY}{os.getpid()}-{path.name}")
-    try:
-        yield temporary
-        _fsync(temporary)
-        os.replace(temporary, path)
-        _fsync(path.parent)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-
-
-def atomic_write_bytes(path: Path | str, data: bytes) -> None:
-    """Writes `data` to `path`; on an error (full disk, Ctrl-C) the previous file survives."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(data)
-
-
-def atomic_write_text(path: Path | str, text: str) -> None:
-    """`atomic_write_bytes` of `text` in UTF-8."""
-    atomic_write_bytes(path, text.encode())
-
-
-def atomic_write_json(path: Path | str, value: Any) -> None:
-    """Writes `value` (dataclasses, paths and NumPy numbers included) as indented, strictly valid JSON."""
-    atomic_write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
-
-
-def read_json(path: Path | str) -> Any:
-    """The value in a JSON file; UserError naming the file if it is absent or damaged."""
-    path = Path(path)
-    try:
-        return json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise UserError(f"{path} does not exist.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is not valid JSON ({error}): delete it and make it again.") from None
-
-
-def to_json(value: Any) -> Any:
-    """`value` as plain JSON types: dataclasses become objects, tuples lists, NumPy numbers and arrays plain.
-
-    Not-a-number and infinities become null: JSON has no name for them.
-    """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): to_json(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [to_json(item) for item in value]
-    if (tolist := getattr(value, "tolist", None)) is not None:  # NumPy and JAX arrays and scalars
-        return to_json(tolist())
-    if isinstance(value, float):
-        return value if value == value and abs(value) != float("inf") else None
-    if isinstance(value, Path):
-        return str(value)
-    return value
-
-
-def _fsync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-# --- manifests ---------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,6 +52,8 @@ class Manifest:
     """What the stage measured; goes into report.json. A success rate is {"successes": k, "n": n}."""
     created: str = ""
     """UTC time."""
+    manifest_version: int = upgrades.VERSION
+    """Of the configuration's fields (ddgrasp/upgrades.py). In a Manifest they are always this code's."""
 
     def __post_init__(self):
         if self.origin not in ("trained", "loaded"):
@@ -166,14 +85,26 @@ def read_manifest(directory: Path | str) -> Manifest:
         )
     value = read_json(path)
     names = {field.name for field in dataclasses.fields(Manifest)}
-    if not isinstance(value, dict) or names - value.keys() - {"created"}:
+    if not isinstance(value, dict) or names - value.keys() - {"created", upgrades.VERSION_FIELD}:
         raise UserError(f"{path} is no manifest of this project: delete {directory} and run the stage again.")
     if value["contract_version"] != contract.CONTRACT_VERSION:
         raise UserError(
             f"{path} was made with contract version {value['contract_version']}, this code has "
             f"{contract.CONTRACT_VERSION}: make it again, or use the release that made it."
         )
-    return Manifest(**{name: value[name] for name in names & value.keys()})
+    known = {name: value[name] for name in names & value.keys()}
+    return Manifest(**known | {"config": _config_of(value, path), upgrades.VERSION_FIELD: upgrades.VERSION})
+
+
+def _config_of(value: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """The configuration in a manifest or started.json, with the fields that this code has."""
+    version = value.get(upgrades.VERSION_FIELD, 1)
+    if version > upgrades.VERSION:
+        raise UserError(
+            f"{path} is of version {version}, this code reads up to {upgrades.VERSION}: use the release that "
+            "made it, or make it again."
+        )
+    return upgrades.upgraded(value.get("config", {}), version)
 
 
 def read_artifact(directory: Path | str) -> Artifact:
@@ -239,6 +170,11 @@ def config_hash(config: Config, stage: str) -> str:
     return _hash(_relevant(to_json(config), stage))
 
 
+def config_hash_of_version_1(config: Config, stage: str) -> str:
+    """`config_hash` as it was before version 2: recorded by what was begun then."""
+    return _hash(_relevant(upgrades.as_version_1(to_json(config)), stage))
+
+
 def check_config(artifact: Artifact, config: Config) -> None:
     """UserError that names both values if `artifact` was made with another configuration than `config`."""
     _check_same_config(artifact.directory, artifact.manifest.stage, artifact.manifest.config, config)
@@ -266,7 +202,7 @@ def begin(
     """
     inputs = dict(inputs or {})
     if write:
-        for litter in Path(directory).glob(f"{_TEMPORARY}*"):  # of an attempt that was killed mid-write
+        for litter in Path(directory).glob(f"{TEMPORARY}*"):  # of an attempt that was killed mid-write
             litter.unlink(missing_ok=True)
     path = Path(directory) / STARTED
     if path.exists() and has_work(directory):
@@ -276,7 +212,7 @@ def begin(
                 f"{directory} was begun with contract version {started.get('contract_version')}, this code "
                 f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
             )
-        _check_same_config(Path(directory), stage, started.get("config", {}), config, "begun")
+        _check_same_config(Path(directory), stage, _config_of(started, path), config, "begun")
         before = started.get("inputs", {})
         if difference := next(_differences(before, {name: inputs.get(name) for name in before}), None):
             raise UserError(
@@ -284,7 +220,12 @@ def begin(
                 "the directory."
             )
     elif write:
-        value = {"contract_version": contract.CONTRACT_VERSION, "inputs": inputs, "config": config}
+        value = {
+            upgrades.VERSION_FIELD: upgrades.VERSION,
+            "contract_version": contract.CONTRACT_VERSION,
+            "inputs": inputs,
+            "config": config,
+        }
         atomic_write_json(path, value)
 
 

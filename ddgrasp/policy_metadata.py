@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ddgrasp import contract
-from ddgrasp.config import Config, ExportConfig, StudentConfig
+from ddgrasp.config import DEPTH_DTYPES, Config, ExportConfig, StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
 
-DEPTH_DTYPES = ("uint16_mm", "float32_m")
 STATE_LAYOUT = "q7 rad + gripper width m"
 REMEDY = "make one with `ddgrasp export`"
 
@@ -61,7 +60,6 @@ def describe(
     student_manifest_hash: str = "",
 ) -> PolicyMetadata:
     """Metadata of the policy that this configuration exports."""
-    check_depth_dtype(export.depth_dtype)
     row, column = profile.crop_origin_px
     return PolicyMetadata(
         contract_version=contract.CONTRACT_VERSION,
@@ -106,12 +104,6 @@ def describe_run(config: Config, *, project_version: str, student_manifest_hash:
         project_version=project_version,
         student_manifest_hash=student_manifest_hash,
     )
-
-
-def check_depth_dtype(depth_dtype: str) -> None:
-    """UserError for an unknown unit of the depth input."""
-    if depth_dtype not in DEPTH_DTYPES:
-        raise UserError(f"Depth type is {depth_dtype!r}; expected one of {', '.join(DEPTH_DTYPES)}.")
 
 
 def validate(properties: Mapping[str, str], source: str = "The ONNX file") -> PolicyMetadata:

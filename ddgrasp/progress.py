@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ddgrasp import artifacts
+from ddgrasp.files import atomic_path, atomic_write_json, to_json
 
 CURVES = "curves.jsonl"
 PICTURES = "pictures"
@@ -120,7 +120,7 @@ class Progress:
         plain = {name: float(value) for name, value in values.items()}
         self.directory.mkdir(parents=True, exist_ok=True)
         with open(self.directory / CURVES, "a") as file:
-            file.write(json.dumps(artifacts.to_json({"step": int(step), **plain})) + "\n")
+            file.write(json.dumps(to_json({"step": int(step), **plain})) + "\n")
         if self._writer is None:
             from tensorboardX import SummaryWriter
 
@@ -141,7 +141,7 @@ class Progress:
             return
         import numpy as np
 
-        with artifacts.atomic_path(self.directory / PICTURES / f"{name}.npz") as path:
+        with atomic_path(self.directory / PICTURES / f"{name}.npz") as path:
             arrays: dict[str, Any] = {title: np.asarray(panel) for title, panel in panels.items()}
             np.savez_compressed(path, **arrays)
 
@@ -202,7 +202,7 @@ class Progress:
         self._clock_saved = time.monotonic()
         if self.directory is not None and self.directory.exists():
             with contextlib.suppress(OSError):
-                artifacts.atomic_write_json(self.directory / _CLOCK, {"seconds": self.seconds})
+                atomic_write_json(self.directory / _CLOCK, {"seconds": self.seconds})
 
     def _read_clock(self) -> float:
         if self.directory is None:

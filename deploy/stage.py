@@ -12,6 +12,7 @@ from ddgrasp import artifacts, contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
 from deploy.policy import POLICY_FILE
@@ -27,7 +28,9 @@ def run(job: Job) -> Artifact:
     """Run the trials that are not in trials.jsonl yet, then write the manifest."""
     config, directory, progress = job.config, job.directory, job.progress
     policy_path = job.parents["export"].directory / POLICY_FILE
-    log = TrialLog(directory / TRIALS_FILE, _header(config, policy_path))
+    header = _header(config, policy_path)
+    earlier = header | {"config_hash": artifacts.config_hash_of_version_1(config, STAGE)}
+    log = TrialLog(directory / TRIALS_FILE, header, [earlier])
     trials = plan(config)
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(log.results))
@@ -64,12 +67,17 @@ def metrics(results: Sequence[TrialResult]) -> dict[str, Any]:
 class TrialLog:
     """Finished trials on disk, one JSON line each behind a header; a torn last line is dropped."""
 
-    def __init__(self, path: Path, header: dict[str, Any]):
-        """Read what is there. Raises UserError if it belongs to another policy or configuration."""
+    def __init__(self, path: Path, header: dict[str, Any], earlier: Sequence[dict[str, Any]] = ()):
+        """Read what is there. Raises UserError if it belongs to another policy or configuration.
+
+        Args:
+            header: what the trials belong to: the policy and the configuration.
+            earlier: the same as earlier versions wrote it.
+        """
         self._path = path
         self.results: dict[tuple[int, bool], TrialResult] = {}
         lines = _complete_lines(path)
-        if lines and lines[0] != header:
+        if lines and lines[0] not in (header, *earlier):
             raise UserError(
                 f"{path} holds trials of another policy or configuration: delete {path.parent} to start "
                 "them anew, or choose another --out."
@@ -79,7 +87,7 @@ class TrialLog:
             self.results[result.key] = result
         # Written anew, so that the next line starts on a line of its own.
         text = "".join(_line(value) for value in [header, *map(asdict, self.results.values())])
-        artifacts.atomic_write_text(path, text)
+        atomic_write_text(path, text)
 
     def append(self, result: TrialResult) -> None:
         """Add a finished trial; it is on the disk when this returns."""
@@ -125,7 +133,7 @@ def _keep_film(directory: Path, result: TrialResult, film: Film, progress: Progr
         return
     outcome = "success" if result.success else "failure"
     title = f"trial {result.index}, {result.object_name}: {outcome}"
-    artifacts.atomic_write_bytes(path, contact_sheet(film, title))
+    atomic_write_bytes(path, contact_sheet(film, title))
     progress.picture(name, rgb=film.rgb, depth=film.depth_mm)
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp import artifacts
+from ddgrasp.files import atomic_write_json, read_json
 from evaluation import wilson
 
 BACKENDS_FILE = "backends.json"
@@ -21,7 +22,7 @@ def save(directory: Path, results: Mapping[str, Mapping[str, Any]], seed: int) -
         rows[name] = {"backend": name, "seed": seed} | {key: result[key] for key in _KEPT}
     path = directory / BACKENDS_FILE
     teacher = artifacts.read_artifact(directory).hash
-    artifacts.atomic_write_json(path, {"teacher": teacher, "backends": list(rows.values())})
+    atomic_write_json(path, {"teacher": teacher, "backends": list(rows.values())})
     return path
 
 
@@ -30,7 +31,7 @@ def load(directory: Path) -> list[dict[str, Any]]:
     path = directory / BACKENDS_FILE
     if not path.exists():
         return []
-    saved = artifacts.read_json(path)
+    saved = read_json(path)
     return saved["backends"] if saved["teacher"] == artifacts.read_artifact(directory).hash else []
 
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ddgrasp import artifacts
 from ddgrasp.config import RecordConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_bytes, atomic_write_json
 from ddgrasp.progress import Progress
 from mjx_envs.objects import OBJECTS
 from rig.scenes import StandingScene, standing_scenes
@@ -118,8 +118,8 @@ def as_json(result: Comparison) -> dict[str, Any]:
 def write(result: Comparison, out: Path) -> tuple[Path, Path]:
     """Writes `out`/sensors.json and `out`/sensors.png; returns their paths."""
     json_file, png_file = out / "sensors.json", out / "sensors.png"
-    artifacts.atomic_write_json(json_file, as_json(result))
-    artifacts.atomic_write_bytes(png_file, plot(result))
+    atomic_write_json(json_file, as_json(result))
+    atomic_write_bytes(png_file, plot(result))
     return json_file, png_file
 
 

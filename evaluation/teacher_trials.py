@@ -8,6 +8,7 @@ import numpy as np
 
 from ddgrasp import artifacts, contract
 from ddgrasp.config import WorldConfig
+from ddgrasp.files import atomic_write_bytes, atomic_write_json, read_json, to_json
 from ddgrasp.progress import PICTURES
 from evaluation import wilson
 from evaluation.report import figures
@@ -40,7 +41,7 @@ def summarise(result: Mapping[str, Any], teacher: str, world: WorldConfig, seed:
         | {key: value for key, value in row.items() if key != "object"}
         for row in result["motion"]
     ]
-    origin = {"teacher": teacher, "seed": seed, "world": artifacts.to_json(world)}
+    origin = {"teacher": teacher, "seed": seed, "world": to_json(world)}
     return origin | {"success": _pool([result["success"]])} | pooled | {"objects": rows}
 
 
@@ -56,8 +57,8 @@ def save(
       titles: M names.
     """
     path, sheet = directory / TRIALS_FILE, directory / PICTURES / SHEET_FILE
-    artifacts.atomic_write_json(path, summary)
-    artifacts.atomic_write_bytes(sheet, figures.draw_sheet({k: list(v) for k, v in pictures.items()}, titles))
+    atomic_write_json(path, summary)
+    atomic_write_bytes(sheet, figures.draw_sheet({k: list(v) for k, v in pictures.items()}, titles))
     return path, sheet
 
 
@@ -66,7 +67,7 @@ def load(directory: Path) -> list[dict[str, Any]]:
     path = directory / TRIALS_FILE
     if not path.exists():
         return []
-    saved = artifacts.read_json(path)
+    saved = read_json(path)
     return saved["objects"] if saved["teacher"] == artifacts.read_artifact(directory).hash else []
 
 

@@ -15,13 +15,13 @@ from ddgrasp import contract
 from ddgrasp.config import ExportConfig, StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
-from ddgrasp.policy_metadata import PolicyMetadata, check_depth_dtype
+from ddgrasp.policy_metadata import PolicyMetadata
 from export.builder import GraphBuilder, tensor
 from export.condition_graph import write_condition
 from export.encoder_graph import write_encoder
 from export.layers import Params
 from export.sampler_graph import write_sampler
-from student_jax import denoiser, encoder, hand_view, policy, preprocess
+from student_jax import policy, preprocess
 
 
 def build_model(
@@ -39,9 +39,9 @@ def build_model(
         metadata: what the file shall say about itself (`ddgrasp.policy_metadata.describe`).
 
     Raises:
-        UserError: an option that does not exist, or parameters of another configuration.
+        UserError: more denoising iterations than diffusion steps, or parameters of another configuration.
     """
-    check_options(student, export)
+    check_steps(student, export)
     check_params(params, student, profile)
     g = GraphBuilder()
     picture, planes = write_picture(g, contract.ONNX_INPUT_DEPTH, student, export, profile)
@@ -65,19 +65,10 @@ def build_model(
 # --- checks ------------------------------------------------------------------------------------
 
 
-def check_options(student: StudentConfig, export: ExportConfig) -> None:
-    """UserError for an option that the graph cannot express."""
-    preprocess.check_channels(student)
-    encoder.check_encoder(student)
-    policy.check_head(student)
-    hand_view.check_hand_view(student)
-    denoiser.check_denoiser(student)
-    check_depth_dtype(export.depth_dtype)
-    steps = export.ddim_steps or student.head.ddim_steps
-    if not 1 <= steps <= student.head.diffusion_steps:
-        raise UserError(
-            f"ddim_steps is {steps}; expected 1 to {student.head.diffusion_steps} (diffusion_steps)."
-        )
+def check_steps(student: StudentConfig, export: ExportConfig) -> None:
+    """UserError for more denoising iterations than the student has diffusion steps."""
+    if export.ddim_steps > student.head.diffusion_steps:
+        raise export.error("ddim_steps", f"1 to {student.head.diffusion_steps} (diffusion_steps)")
 
 
 def check_params(params: Params, student: StudentConfig, profile: CameraProfile) -> None:

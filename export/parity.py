@@ -11,7 +11,6 @@ import onnxruntime as ort
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
-from ddgrasp.policy_metadata import check_depth_dtype
 from student_jax import denoiser, preprocess
 
 HOLE_SHARE = 0.1
@@ -63,7 +62,6 @@ def depth_in_metres(depth: np.ndarray) -> np.ndarray:
 
 def raw_depth(depth_m: np.ndarray, depth_dtype: str) -> np.ndarray:
     """Metres, 0 = invalid, as a camera of that type would give them."""
-    check_depth_dtype(depth_dtype)
     if depth_dtype == "float32_m":
         return depth_m.astype(np.float32)
     millimetres = np.nan_to_num(depth_m / contract.DEPTH_UNIT_M, posinf=0.0, neginf=0.0)

@@ -21,7 +21,7 @@ def write_sampler(
     x = g.reshape(contract.ONNX_INPUT_NOISE, [0, size])
     visited = diffusion.timesteps(schedule.steps, iterations, "trailing")
     for k, row in zip(visited, diffusion.ddim_table(schedule, visited), strict=True):
-        x = _write_ddim_step(g, x, network.predict(x, int(k)), diffusion.DDIMCoefficients(*row))
+        x = _write_ddim_step(g, x, network.predict(x, int(k)), diffusion.DDIMCoefficients(row))
     shape = g.integers([0, student.head.chunk, contract.ACTION_SIZE])
     g.nodes.append(onnx.helper.make_node("Reshape", [x, shape], [contract.ONNX_OUTPUT_ACTION], name="action"))
 

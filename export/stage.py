@@ -8,6 +8,7 @@ from ddgrasp import artifacts, contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_bytes
 from ddgrasp.job import Job
 from ddgrasp.policy_metadata import describe_run
 from ddgrasp.progress import Progress
@@ -31,7 +32,7 @@ def run(job: Job) -> Artifact:
     job.progress.note(f"policy.onnx: {len(model) / 1e6:.1f} MB")
     frames = demo_frames(student.directory.parent / "demos", config)
     metrics = measure(config, params, model, frames, job.progress)
-    artifacts.atomic_write_bytes(job.directory / POLICY_FILE, model)
+    atomic_write_bytes(job.directory / POLICY_FILE, model)
     return job.finish(metrics)
 
 

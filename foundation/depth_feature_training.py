@@ -19,6 +19,7 @@ from jax import Array
 from ddgrasp import artifacts
 from ddgrasp.config import DepthFeatureConfig
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_path, atomic_write_json, read_json, to_json
 from ddgrasp.progress import Progress
 from foundation import depth_features
 from foundation.depth_feature_data import MEASURED, TREATMENTS, Batch, Pool, make_batch
@@ -74,17 +75,17 @@ def train(config: DepthFeatureConfig, out: Path, *, quiet: bool = False) -> dict
         "seconds": round(progress.seconds),
     }
     progress.close()
-    artifacts.atomic_write_json(out / artifacts.MANIFEST, manifest)
+    atomic_write_json(out / artifacts.MANIFEST, manifest)
     shutil.rmtree(work, ignore_errors=True)
-    return artifacts.to_json(manifest)
+    return to_json(manifest)
 
 
 def _check_begun(config: DepthFeatureConfig, work: Path) -> None:
     path = work / artifacts.STARTED
-    wanted = artifacts.to_json(config)
-    if path.exists() and artifacts.read_json(path) != wanted:
+    wanted = to_json(config)
+    if path.exists() and read_json(path) != wanted:
         raise UserError(f"{work} was begun with other settings: use those, another --out, or delete it.")
-    artifacts.atomic_write_json(path, wanted)
+    atomic_write_json(path, wanted)
 
 
 # --- pictures ------------------------------------------------------------------------------------
@@ -110,7 +111,7 @@ def _take_pictures(config: DepthFeatureConfig, number: int, file: Path) -> None:
     device = random_device(rng, config.width_px)
     taken = [take_picture(rng, device) for _ in range(config.pictures)]
     arrays: dict[str, Any] = {name: np.stack([vars(p)[name] for p in taken]) for name in vars(taken[0])}
-    with artifacts.atomic_path(file) as path:
+    with atomic_path(file) as path:
         np.savez_compressed(path, **arrays)
 
 

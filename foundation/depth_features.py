@@ -19,6 +19,7 @@ from jax import Array
 
 from ddgrasp import artifacts
 from ddgrasp.errors import UserError
+from ddgrasp.files import read_json
 from learning.params import load_params
 
 NAME = "depthfeat-v1"
@@ -131,7 +132,7 @@ def read_manifest(directory: Path = DIRECTORY) -> dict[str, Any]:
             f"{directory} holds no feature extractor: it is part of the repository (pretrained/{NAME}); "
             "another is trained by `ddgrasp ddg features`."
         )
-    manifest = artifacts.read_json(path)
+    manifest = read_json(path)
     if not isinstance(manifest, dict) or not {"name", "sha256"} <= manifest.keys():
         raise UserError(f"{path} is no feature extractor's manifest: restore it from the repository.")
     return manifest

@@ -13,6 +13,7 @@ from typing import Any
 
 from ddgrasp import artifacts
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json, read_json
 from foundation import catalog
 
 MANIFEST = "manifest.json"
@@ -84,7 +85,7 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float
         versions=artifacts.library_versions(),
         created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     )
-    artifacts.atomic_write_json(fresh / MANIFEST, asdict(manifest))
+    atomic_write_json(fresh / MANIFEST, asdict(manifest))
     shutil.rmtree(directory, ignore_errors=True)
     fresh.rename(directory)
     return directory
@@ -98,7 +99,7 @@ def read_manifest(directory: Path) -> WeightsManifest:
             f"{directory} holds no converted weights: get a file that `ddgrasp weights list` names and run "
             "`ddgrasp weights convert FILE`."
         )
-    value = artifacts.read_json(path)
+    value = read_json(path)
     names = {field.name for field in fields(WeightsManifest)}
     if not isinstance(value, dict) or value.keys() != names or value["format_version"] != FORMAT_VERSION:
         raise UserError(f"{path} was written by another version of this project: convert the weights again.")

@@ -54,7 +54,7 @@ class Checkpoints:
         try:
             restored: Any = self._manager.restore(self.latest, args=ocp.args.StandardRestore(target))
         except (ValueError, KeyError, TypeError) as error:
-            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            reason = str(error).partition("\n")[0].partition(". ")[0].rstrip(":.")
             raise UserError(
                 f"The checkpoint {path} does not fit this training ({reason}): it is of another "
                 "configuration or version; delete the folder to start afresh."

@@ -10,7 +10,8 @@ Lu et al. 2022 (DPM-Solver++), Lin et al. 2024 (trailing steps), Hoogeboom et al
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -188,19 +189,40 @@ def ddpm_step(
     return posterior_mean(schedule, x_k, x_0, step, previous) + jnp.sqrt(variance) * noise
 
 
-class DDIMCoefficients(NamedTuple):
+@dataclass(frozen=True)
+class DDIMCoefficients:
     """One step x_k -> x_k' of DDIM, with a = alpha_bar at k and a' at k'.
 
     x_k explains itself by `x` x_k = `x_0` x_0 + `eps` eps; x_k' = `next_x_0` x_0 + `next_eps` eps + `sigma`
     noise.
     """
 
-    x: ArrayLike
-    eps: ArrayLike
-    next_x_0: ArrayLike
-    next_eps: ArrayLike
+    row: Sequence[ArrayLike] | Array | np.ndarray
+    """x, eps, next_x_0, next_eps: four numbers or arrays, or a row of `ddim_table`."""
     x_0: ArrayLike = 1.0
     sigma: ArrayLike = 0.0
+
+    # Read where they are used: a row taken apart ahead of the step makes XLA contract other products, and
+    # the student's actions move by 4e-7.
+    @property
+    def x(self) -> ArrayLike:
+        """Factor of x_k."""
+        return self.row[0]
+
+    @property
+    def eps(self) -> ArrayLike:
+        """Factor of eps in x_k."""
+        return self.row[1]
+
+    @property
+    def next_x_0(self) -> ArrayLike:
+        """Factor of x_0 in x_k'."""
+        return self.row[2]
+
+    @property
+    def next_eps(self) -> ArrayLike:
+        """Factor of eps in x_k'."""
+        return self.row[3]
 
 
 def ddim_coefficients(
@@ -215,11 +237,12 @@ def ddim_coefficients(
     sigma = eta * jnp.sqrt(posterior_variance(schedule, step, previous, x))
     # A step from pure noise has sigma^2 = 1 - alpha_bar_previous, and rounding may push the rest below 0.
     remainder = jnp.maximum(1 - a_prev - sigma**2, 0.0)
-    return DDIMCoefficients(1.0, jnp.sqrt(1 - a), jnp.sqrt(a_prev), jnp.sqrt(remainder), jnp.sqrt(a), sigma)
+    row = (1.0, jnp.sqrt(1 - a), jnp.sqrt(a_prev), jnp.sqrt(remainder))
+    return DDIMCoefficients(row, jnp.sqrt(a), sigma)
 
 
 def ddim_table(schedule: Schedule, visited: np.ndarray) -> np.ndarray:
-    """(len(visited), 4) float32: the first four of `DDIMCoefficients` for each visited step, eta = 0.
+    """(len(visited), 4) float32: `DDIMCoefficients.row` of each visited step, eta = 0.
 
     Of `q_sample` solved for x_0, 1/sqrt(a) x_k = x_0 + sqrt(1 - a)/sqrt(a) eps, so that an exported graph
     multiplies by constants; computed in float64, rounded once.
@@ -273,7 +296,7 @@ def ddim_sample(
     def body(x: Array, step: tuple[Array, Array]) -> tuple[Array, None]:
         k, row = step
         eps = predict(x, jnp.full((x.shape[0],), k))
-        return ddim_step(DDIMCoefficients(*row), x, eps, clip, after_clip=CONSISTENT), None
+        return ddim_step(DDIMCoefficients(row), x, eps, clip, after_clip=CONSISTENT), None
 
     steps = jnp.asarray(visited), jnp.asarray(ddim_table(schedule, visited))
     return jax.lax.scan(body, noise, steps)[0]

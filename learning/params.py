@@ -11,8 +11,8 @@ import jax
 import numpy as np
 from flax import serialization
 
-from ddgrasp import artifacts
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_bytes
 
 Params = Any
 """Nested dict of arrays."""
@@ -24,7 +24,7 @@ def save_params(path: Path | str, pytree: Any) -> None:
     """Writes a pytree of arrays (nested dicts, Flax or Brax parameters) as checksummed msgpack."""
     state = jax.tree.map(np.asarray, serialization.to_state_dict(pytree))
     payload = serialization.msgpack_serialize(state)
-    artifacts.atomic_write_bytes(path, _MAGIC + hashlib.sha256(payload).digest() + payload)
+    atomic_write_bytes(path, _MAGIC + hashlib.sha256(payload).digest() + payload)
 
 
 def load_params(path: Path | str, target: Any = None) -> Any:

@@ -25,9 +25,9 @@ class TrainState:
 
 def first_state(params: Params, optimizer: optax.GradientTransformation, key: Array) -> TrainState:
     """State before the first step. `key` is raw key data."""
-    # Copies: a donated state must not take the caller's parameters, or its own average, with it.
+    # Copies: a donated state must not take the caller's parameters and key, or its own average, with it.
     own, average = (jax.tree.map(jnp.array, params) for _ in range(2))
-    return TrainState(jnp.zeros((), jnp.int32), own, average, optimizer.init(params), key)
+    return TrainState(jnp.zeros((), jnp.int32), own, average, optimizer.init(params), jnp.array(key))
 
 
 def updated(

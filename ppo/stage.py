@@ -5,6 +5,7 @@ import shutil
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
+from ddgrasp.files import atomic_path
 from ddgrasp.job import Job
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
@@ -33,7 +34,7 @@ def run(job: Job) -> Artifact:
     if not _loads(config):
         train(config, directory, job.progress)
     elif hosts.leads():
-        with artifacts.atomic_path(path) as temporary:
+        with atomic_path(path) as temporary:
             shutil.copyfile(teacher_policy.find(config.teacher.init_from), temporary)
     hosts.wait_for_all("teacher is written")
     policy = teacher_policy.load(directory)

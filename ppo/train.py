@@ -7,8 +7,8 @@ from pathlib import Path
 
 import jax
 
-from ddgrasp import artifacts
 from ddgrasp.config import Config, WorldConfig
+from ddgrasp.files import atomic_write_json, read_json
 from ddgrasp.progress import Progress
 from learning.checkpoints import Checkpoints
 from mjx_envs import devices
@@ -112,13 +112,13 @@ class _Best:
         self._directory = directory
         self._rate = -1.0
         if (directory / BEST_RATE).exists() and (directory / PARAMS_FILE).exists():
-            self._rate = float(artifacts.read_json(directory / BEST_RATE))
+            self._rate = float(read_json(directory / BEST_RATE))
 
     def offer(self, rate: float, state: learner.LearnerState) -> None:
         if rate >= self._rate and hosts.leads():
             self._rate = rate
             save(self._directory / PARAMS_FILE, state.normalizer, state.params.policy)
-            artifacts.atomic_write_json(self._directory / BEST_RATE, rate)
+            atomic_write_json(self._directory / BEST_RATE, rate)
 
 
 def training_world(config: Config) -> WorldConfig:

@@ -14,8 +14,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from ddgrasp import artifacts
 from ddgrasp.config import Config
+from ddgrasp.files import atomic_write_json
 from ddgrasp.progress import Progress
 from demos.rollout import Roller
 from demos.store import EpisodeStore
@@ -80,7 +80,7 @@ class Trainer:
         self._done.append(name)
         self.history.append({"phase": name, "frames": self.frame_count} | measured)
         save_params(self._directory / PARAMS_FILE, self.params)
-        artifacts.atomic_write_json(self._directory / PLAN, {"done": self._done, "history": self.history})
+        atomic_write_json(self._directory / PLAN, {"done": self._done, "history": self.history})
         shutil.rmtree(self._directory / CHECKPOINTS, ignore_errors=True)
 
     def _restore(self) -> None:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddgrasp import contract
-from ddgrasp.config import StudentConfig
-from ddgrasp.errors import UserError
 from student_jax.policy import Aux, position_from_world
 
 GRIP_POS = slice(18, 21)
@@ -116,12 +114,3 @@ def random_crops(
     """(count, 2) int32 crop origins, the centred one shifted by up to `shift_px` pixels each way."""
     shift = rng.integers(-shift_px, shift_px + 1, (count, 2))
     return (np.array(profile.crop_origin_px) + shift).astype(np.int32)
-
-
-def check_chunk(config: StudentConfig) -> None:
-    """UserError if more actions are to be executed than a chunk holds."""
-    if not 1 <= config.head.execute_steps <= config.head.chunk:
-        raise UserError(
-            f"student.head.execute_steps is {config.head.execute_steps}: expected 1 to student.head.chunk = "
-            f"{config.head.chunk}."
-        )

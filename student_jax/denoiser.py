@@ -10,28 +10,11 @@ from flax import linen as nn
 
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
-from ddgrasp.errors import UserError, unknown_name
 from learning.layers import sinusoids, time_frequencies
 
-CONDITIONINGS = ("film", "concat")
 LAYER_NORM_EPSILON = 1e-5
 STATE_LOWER = np.array([*contract.JOINT_LOWER_RAD, 0.0], np.float32)
 STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M], np.float32)
-
-
-def check_denoiser(config: StudentConfig) -> None:
-    """UserError for options that do not exist."""
-    if config.head.conditioning not in CONDITIONINGS:
-        raise unknown_name("student conditioning", config.head.conditioning, CONDITIONINGS)
-    if config.head.time_features < 2 or config.head.time_features % 2:
-        raise UserError(
-            f"student.head.time_features is {config.head.time_features}; expected an even number."
-        )
-    if not 1 <= config.head.ddim_steps <= config.head.diffusion_steps:
-        raise UserError(
-            f"student.head.ddim_steps is {config.head.ddim_steps}; expected 1 to "
-            f"{config.head.diffusion_steps} (student.head.diffusion_steps)."
-        )
 
 
 def normalise_state(state: jax.Array) -> jax.Array:
@@ -79,7 +62,6 @@ class Denoiser(nn.Module):
     def __call__(self, noisy_action: jax.Array, k: jax.Array, cond: jax.Array) -> jax.Array:
         """(B, chunk, 8), (B,) int, (B, D) -> (B, chunk, 8)."""
         config = self.config
-        check_denoiser(config)
         film = config.head.conditioning == "film"
         embedded = nn.Dense(config.head.time_features, name="time_first")(
             embed_time(k, config.head.time_features)

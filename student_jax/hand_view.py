@@ -15,11 +15,10 @@ from flax import linen as nn
 
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
-from ddgrasp.errors import UserError
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import nominal_camera
 from student_jax import preprocess
-from student_jax.encoder import STEM_STRIDE, BasicBlock, Stem, newest_channel_index
+from student_jax.encoder import BasicBlock, Stem
 
 STEM = "space_to_depth"
 """Patches keep every pixel, and are cheap on CPU."""
@@ -42,17 +41,6 @@ class Projection(NamedTuple):
     """(2,) principal point in those pixels, had the crop window its origin at (0, 0)."""
     shrink: np.ndarray
     """(2,) picture pixels per camera pixel."""
-
-
-def check_hand_view(config: StudentConfig) -> None:
-    """UserError for sizes that do not work."""
-    if config.hand_view.size_px % STEM_STRIDE or config.hand_view.size_px < 0:
-        raise UserError(
-            f"student.hand_view.size_px is {config.hand_view.size_px}; "
-            f"expected a multiple of {STEM_STRIDE}, or 0 for none."
-        )
-    if config.hand_view.size_px:
-        newest_channel_index(config, "valid")
 
 
 def projection(profile: CameraProfile, config: StudentConfig) -> Projection:
@@ -142,7 +130,6 @@ class HandView(nn.Module):
     @nn.compact
     def __call__(self, picture: jax.Array, grip_m: jax.Array, origin_rc: jax.Array) -> jax.Array:
         config = self.config
-        check_hand_view(config)
         view = cut(picture, *place(grip_m, origin_rc, self.profile, config), config)
         x = Stem(STEM, config.hand_view.width, config.encoder.norm, name="stem")(view)
         for block in range(config.hand_view.blocks):

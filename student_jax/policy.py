@@ -18,7 +18,6 @@ from flax import linen as nn
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
-from ddgrasp.errors import UserError
 from learning import diffusion
 from mjx_envs import kinematics
 from student_jax.denoiser import Denoiser, StateStream, normalise_state
@@ -79,7 +78,6 @@ class StudentPolicy(nn.Module):
 
     def setup(self) -> None:
         """Flax: builds the parts that the configuration names."""
-        check_head(self.config)
         self.encoder = DepthEncoder(self.config, self.profile)
         self.aux_hidden = nn.Dense(self.config.encoder.features)
         self.aux_output = nn.Dense(AUX_SIZE + (BESIDE_SIZE if self.config.hand_view.size_px else 0))
@@ -137,14 +135,6 @@ class StudentPolicy(nn.Module):
         """Predicted noise and auxiliary predictions: everything a training step needs."""
         seen = self.encode(depth_m, state, crop_rc)
         return self.denoise(noisy_action, k, self.condition(seen, state)), seen.aux
-
-
-def check_head(config: StudentConfig) -> None:
-    """UserError if the head would see nothing."""
-    if not (config.head.features_to_head or config.head.aux_to_head):
-        raise UserError(
-            "student.head.features_to_head and student.head.aux_to_head are both off: turn one on."
-        )
 
 
 def grip_position(state: jax.Array) -> jax.Array:

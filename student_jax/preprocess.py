@@ -13,10 +13,9 @@ import numpy as np
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
-from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.errors import UserError
 from mjx_envs.camera import nominal_camera
 
-CHANNELS = ("relief", "valid", "depth")
 RELIEF_SCALE_M = 0.1
 """One unit of the relief channel: how much nearer than the empty table, along the optical axis."""
 RELIEF_MIN, RELIEF_MAX = -1.0, 4.0
@@ -70,15 +69,6 @@ def plan_window(profile: CameraProfile, config: StudentConfig) -> Window:
         plan_axis(profile.crop_height_px, config.picture.height_px),
         plan_axis(profile.crop_width_px, config.picture.width_px),
     )
-
-
-def check_channels(config: StudentConfig) -> None:
-    """UserError for an unknown or empty channel selection."""
-    if not config.picture.channels:
-        raise UserError(f"student.picture.channels is empty; expected some of {', '.join(CHANNELS)}.")
-    for name in config.picture.channels:
-        if name not in CHANNELS:
-            raise unknown_name("student channel", name, CHANNELS)
 
 
 def table_depth(profile: CameraProfile, max_depth_m: float) -> np.ndarray:
@@ -142,7 +132,6 @@ def prepare_depth(
         (B, h, w, 3 * channels) float32, channels of the oldest frame first. relief is in
         [RELIEF_MIN, RELIEF_MAX] and 0 where invalid; valid is 0 or 1; depth is in metres, 0 where invalid.
     """
-    check_channels(config)
     expected = (contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
     if depth_m.shape[1:] != expected:
         wanted = ", ".join(map(str, expected))

@@ -52,9 +52,7 @@ def load_into(encoder: Mapping[str, Any], config: StudentConfig) -> dict[str, An
 
 
 def _check(config: StudentConfig) -> None:
-    """UserError naming the first option that makes the encoder another network, or another start."""
-    if config.init_from:
-        raise UserError("student.init_from and student.encoder.weights both say where to start: give one.")
+    """UserError naming the first option that makes the encoder another network."""
     for name, wanted in _RESNET18.items():
         if (value := getattr(config.encoder, name)) != wanted:
             raise UserError(

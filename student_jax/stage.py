@@ -16,7 +16,6 @@ from demos.store import EpisodeStore
 from ppo import policy as teacher_policy
 from student_jax import evaluate, frames_io, pretrained_encoder
 from student_jax.dagger import Trainer
-from student_jax.data import check_chunk
 from student_jax.depth_source import make_source
 from student_jax.head import POSES
 
@@ -24,7 +23,6 @@ from student_jax.head import POSES
 def run(job: Job) -> Artifact:
     """Trains the student and evaluates it closed-loop on clean depth and on the source's."""
     config, directory, progress, parents = job.config, job.directory, job.progress, job.parents
-    check_chunk(config.student)
     encoder_weights = pretrained_encoder.source(config.student)
     source = make_source(config, parents["ddg"].directory)
     teacher = teacher_policy.load(parents["teacher"].directory)

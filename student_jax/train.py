@@ -103,14 +103,14 @@ def diffusion_loss(
     key: Array,
 ) -> Array:
     """mean |eps - eps_theta(a_k, k, s)|^2 (paper Eq. 6) over `noise_draws` noises for each sample."""
-    cond = policy.apply({"params": params}, seen, state, method="condition")
+    known: Any = policy.apply({"params": params}, seen, state, method="condition")
     draws = config.training.noise_draws
-    cond, action = (jnp.repeat(x, draws, axis=0) for x in (cond, action))
+    cond, action = (jnp.repeat(x, draws, axis=0) for x in (known, action))
     k_step, k_noise = jax.random.split(key)
     k = jax.random.randint(k_step, (len(cond),), 0, config.head.diffusion_steps)
     eps = jax.random.normal(k_noise, action.shape)
     noisy = q_sample(noise_schedule(config), action, k, eps)
-    predicted = policy.apply({"params": params}, noisy, k, cond, method="denoise")
+    predicted: Any = policy.apply({"params": params}, noisy, k, cond, method="denoise")
     return jnp.mean((eps - predicted) ** 2)
 
 

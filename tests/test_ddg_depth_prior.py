@@ -11,6 +11,7 @@ from ddg_jax.inverse_depth import invert, normalise
 from ddg_jax.prior import InverseDepthPrior, make_prior
 from ddgrasp.config import DDGConfig, DDGDepthConfig, PriorConfig, PriorInSim
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json
 from demos.rollout import Scene
 from foundation import convert, store
 from student_jax.act import SourceCamera
@@ -31,7 +32,7 @@ def weights(tmp_path_factory):
     manifest = store.WeightsManifest(
         "depth_anything_v2_small", "x.pth", "ab12", "Apache-2.0", "here", 1, 0.0, {}, "today"
     )
-    store.artifacts.atomic_write_json(directory / store.MANIFEST, vars(manifest))
+    atomic_write_json(directory / store.MANIFEST, vars(manifest))
     return directory
 
 

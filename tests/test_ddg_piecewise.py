@@ -6,8 +6,8 @@ import pytest
 from ddg_jax.data import surfaces
 from ddg_jax.inverse_depth import invert
 from ddg_jax.piecewise import piecewise_smooth
-from ddg_jax.prior import PIECEWISE, make_prior
-from ddgrasp.config import DDGConfig, DDGDepthConfig, PriorConfig
+from ddg_jax.prior import make_prior
+from ddgrasp.config import PIECEWISE, DDGConfig, DDGDepthConfig, PriorConfig
 from ddgrasp.errors import UserError
 
 HEIGHT, WIDTH = 60, 80

@@ -9,7 +9,15 @@ import pytest
 
 from ddgrasp import artifacts, contract
 from ddgrasp import policy_metadata as metadata
-from ddgrasp.config import Config, DeployConfig, EvalConfig, RandomConfig, WorldConfig
+from ddgrasp.config import (
+    Config,
+    DeployConfig,
+    EvalConfig,
+    PictureConfig,
+    RandomConfig,
+    StudentConfig,
+    WorldConfig,
+)
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from deploy import stage
@@ -26,6 +34,7 @@ from rig.camera import camera_pose
 CONFIG = Config(
     preset="test",
     world=WorldConfig(objects=("cube", "apple"), camera_scale=0.125, episode_steps=4),
+    student=StudentConfig(picture=PictureConfig(height_px=56, width_px=72)),
     deploy=DeployConfig(realtime_trials=1, film_every=2, workers=2),
     evaluation=EvalConfig(rig_trials=3),
 )

@@ -27,6 +27,7 @@ from ddgrasp.config import (
     UNetConfig,
 )
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json
 from ddgrasp.progress import Progress
 from evaluation.depth_score import data as score_data
 from evaluation.depth_score import features as score_features
@@ -308,7 +309,7 @@ def test_the_monocular_column_uses_the_users_weights(run_dir, tmp_path):
     arrays["depth_head.scratch.output_conv2.2.bias"] += 1
     store._save(tmp_path / store.CHECKPOINT, convert.convert(network, arrays))
     manifest = store.WeightsManifest(network, "x.pth", "ab12", "Apache-2.0", "here", 1, 0.0, {}, "today")
-    artifacts.atomic_write_json(tmp_path / store.MANIFEST, manifest)
+    atomic_write_json(tmp_path / store.MANIFEST, manifest)
     generator = Generator.load(run_dir / "ddg")
     methods = Methods(ScoreConfig(monocular_weights=str(tmp_path)), 0, generator)
     assert methods.needs_rgb

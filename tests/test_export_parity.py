@@ -119,7 +119,7 @@ def test_onnx_equals_jax(name):
     inputs = [parity.random_inputs(rng, n, config, PROFILE, options.depth_dtype) for n in [4] * 12 + [1] * 4]
     inputs[0].depth[0] = 0  # nothing seen at all
     actions = np.concatenate([parity.run_onnx(session, one) for one in inputs])
-    assert actions.shape == (52, config.chunk, 8)
+    assert actions.shape == (52, config.head.chunk, 8)
     assert np.mean(np.abs(actions) < 0.95) > 0.5  # a saturated policy would agree with anything
     assert parity.max_abs_diff(session, reference, iter(inputs)) <= 1e-4
 
@@ -158,7 +158,7 @@ def test_options_and_parameters_that_do_not_fit_are_refused():
 
     with pytest.raises(UserError, match="Did you mean 'tokens'"):
         build(replace(SMALL, encoder=replace(SMALL.encoder, pooling="token")), ExportConfig())
-    with pytest.raises(UserError, match="'uint8'; expected one of uint16_mm, float32_m"):
+    with pytest.raises(UserError, match="Unknown export.depth_dtype 'uint8'. Known: float32_m, uint16_mm"):
         build(SMALL, ExportConfig(depth_dtype="uint8"))
     with pytest.raises(UserError, match="ddim_steps is 51; expected 1 to 50"):
         build(SMALL, ExportConfig(ddim_steps=51))

@@ -7,6 +7,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 
+from config_support import unchecked
 from ddgrasp import artifacts
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import (
@@ -19,6 +20,7 @@ from ddgrasp.config import (
     WorldConfig,
 )
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_bytes
 from ddgrasp.progress import Progress
 from demos.stage import STORE
 from demos.store import EpisodeStore
@@ -60,10 +62,10 @@ def test_a_student_becomes_a_file_that_describes_itself(tmp_path):
 
 
 def test_a_missed_bound_writes_nothing_and_keeps_the_old_file(tmp_path):
-    config = replace(CONFIG, export=replace(CONFIG.export, max_abs_diff=-1.0))
+    config = replace(CONFIG, export=unchecked(CONFIG.export, max_abs_diff=-1.0))
     finish_student(tmp_path, config)
     old = tmp_path / "export" / stage.POLICY_FILE
-    artifacts.atomic_write_bytes(old, b"old")
+    atomic_write_bytes(old, b"old")
     with pytest.raises(UserError, match="differs from JAX by"):
         stage.run(make_job("export", config, tmp_path / "export"))
     assert old.read_bytes() == b"old"

@@ -8,6 +8,7 @@ import pytest
 import checkpoint_support as files
 import parity_support as parity
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json
 from foundation import convert, features, pictures, store
 from foundation.resnet import ResNet18
 
@@ -37,6 +38,6 @@ def test_published_weights_are_used_where_given(tmp_path):
     wanted, _ = ResNet18().apply(convert.convert("resnet18", arrays), pictures.standardise(IMAGES[:2]))
     np.testing.assert_allclose(extractor(IMAGES[:2]), wanted, atol=1e-4)
     manifest = asdict(store.read_manifest(directory)) | {"network": "video_depth_anything_small"}
-    store.artifacts.atomic_write_json(directory / store.MANIFEST, manifest)
+    atomic_write_json(directory / store.MANIFEST, manifest)
     with pytest.raises(UserError, match="expected fid_inception or resnet18"):
         features.load_extractor(directory)

@@ -175,7 +175,7 @@ def test_ddim_with_perfect_noise_prediction_returns_the_clean_sample(iterations)
 
 
 def test_ddim_step_clips_and_keeps_explaining_x():
-    step = s.DDIMCoefficients(2.0, np.sqrt(3.0), 0.8, 0.6)  # a = 1/4, a' = 0.64
+    step = s.DDIMCoefficients((2.0, np.sqrt(3.0), 0.8, 0.6))  # a = 1/4, a' = 0.64
     x, eps = jnp.array([1.0]), jnp.array([-1.0])  # x0 = 2 + 1.73, clipped to 1
     # eps' = (2 * 1 - 1) / sqrt(3); x' = 0.8 * 1 + 0.6 * eps'
     made = s.ddim_step(step, x, eps, 1.0, after_clip=s.CONSISTENT)
@@ -185,7 +185,7 @@ def test_ddim_step_clips_and_keeps_explaining_x():
 def test_ddim_step_may_keep_the_predicted_eps_after_clipping():
     """The same step as above: x0 is clipped to 1, the direction stays the predicted -1."""
     x, eps = jnp.array([1.0]), jnp.array([-1.0])
-    step = s.DDIMCoefficients(2.0, np.sqrt(3.0), 0.8, 0.6)
+    step = s.DDIMCoefficients((2.0, np.sqrt(3.0), 0.8, 0.6))
     np.testing.assert_allclose(s.ddim_step(step, x, eps, 1.0), [0.8 - 0.6], rtol=1e-6)
     # Unclipped the two agree: x0 = 2 + 1.73.
     for after_clip in (s.PREDICTED, s.CONSISTENT):
@@ -204,7 +204,7 @@ def test_both_sets_of_coefficients_take_the_same_step(after_clip, expected):
     computed = s.ddim_step(s.ddim_coefficients(made, 1, 0, x), x, eps, 1.0, after_clip=after_clip)
     row = s.ddim_table(made, np.array([1, 0]))[0]
     np.testing.assert_allclose(row, [2, np.sqrt(3), 0.8, 0.6], rtol=1e-6)
-    tabled = s.ddim_step(s.DDIMCoefficients(*row), x, eps, 1.0, after_clip=after_clip)
+    tabled = s.ddim_step(s.DDIMCoefficients(row), x, eps, 1.0, after_clip=after_clip)
     np.testing.assert_allclose(computed, expected, rtol=1e-5)
     np.testing.assert_allclose(tabled, expected, rtol=1e-5)
 

@@ -13,6 +13,7 @@ import pytest
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Config, ExportConfig, WorldConfig
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_path, atomic_write_bytes, atomic_write_json, read_json, to_json
 from ddgrasp.presets import PRESETS
 
 CONFIG = Config(preset="debug")
@@ -24,8 +25,8 @@ def _finish(directory, config=CONFIG, **kwargs):
 
 def test_a_failing_write_leaves_the_previous_file_and_no_litter(tmp_path):
     path = tmp_path / "params.bin"
-    artifacts.atomic_write_bytes(path, b"old")
-    with pytest.raises(KeyboardInterrupt), artifacts.atomic_path(path) as temporary:
+    atomic_write_bytes(path, b"old")
+    with pytest.raises(KeyboardInterrupt), atomic_path(path) as temporary:
         temporary.write_bytes(b"half of the n")
         raise KeyboardInterrupt
     assert path.read_bytes() == b"old"
@@ -35,13 +36,13 @@ def test_a_failing_write_leaves_the_previous_file_and_no_litter(tmp_path):
 def test_a_disk_that_fills_up_mid_write_leaves_the_previous_artefact(tmp_path):
     """The limit on file size makes the operating system itself refuse the write half-way."""
     path = tmp_path / "params.bin"
-    artifacts.atomic_write_bytes(path, b"old")
+    atomic_write_bytes(path, b"old")
     code = f"""
         import resource, sys
-        from ddgrasp import artifacts
+        from ddgrasp.files import atomic_write_bytes
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, {resource.getrlimit(resource.RLIMIT_FSIZE)[1]}))
         try:
-            artifacts.atomic_write_bytes({str(path)!r}, bytes(100_000))
+            atomic_write_bytes({str(path)!r}, bytes(100_000))
         except OSError as error:
             sys.exit(error.errno)
     """
@@ -111,7 +112,7 @@ def test_an_attempt_that_left_nothing_binds_nobody(tmp_path):
     assert not artifacts.has_work(tmp_path / "ddg")
     artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/b"})
     assert [file.name for file in (tmp_path / "ddg").iterdir()] == [artifacts.STARTED]
-    assert artifacts.read_json(tmp_path / "ddg" / artifacts.STARTED)["inputs"] == {"data": "/b"}
+    assert read_json(tmp_path / "ddg" / artifacts.STARTED)["inputs"] == {"data": "/b"}
 
 
 def test_empty_folders_bind_nobody_and_a_file_in_them_does(tmp_path):
@@ -151,12 +152,12 @@ def test_an_absent_stage_is_named_with_the_remedy(tmp_path):
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_a_config_survives_its_journey_through_json(name):
-    value = json.loads(json.dumps(artifacts.to_json(PRESETS[name])))
+    value = json.loads(json.dumps(to_json(PRESETS[name])))
     assert artifacts.config_from_json(value) == PRESETS[name]
 
 
 def test_a_config_with_an_unknown_field_is_refused():
-    value = artifacts.to_json(CONFIG)
+    value = to_json(CONFIG)
     value["world"]["gravity"] = 3
     with pytest.raises(UserError, match=r"config\.world has no field 'gravity'"):
         artifacts.config_from_json(value)
@@ -164,7 +165,7 @@ def test_a_config_with_an_unknown_field_is_refused():
 
 def test_json_is_strict_and_plain(tmp_path):
     value = {"nan": float("nan"), "array": np.arange(3), "number": np.float32(0.5), "path": tmp_path, 1: (2,)}
-    artifacts.atomic_write_json(tmp_path / "a.json", value)
-    assert artifacts.read_json(tmp_path / "a.json") == {
+    atomic_write_json(tmp_path / "a.json", value)
+    assert read_json(tmp_path / "a.json") == {
         "nan": None, "array": [0, 1, 2], "number": 0.5, "path": str(tmp_path), "1": [2],
     }  # fmt: skip

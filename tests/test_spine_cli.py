@@ -114,12 +114,13 @@ def test_a_full_disk_gets_one_line(tmp_path):
     code = f"""
 import resource, sys
 from ddgrasp import artifacts
+from ddgrasp.files import atomic_write_bytes
 from app import cli
 from app import commands
 resource.setrlimit(resource.RLIMIT_FSIZE, (512, resource.RLIM_INFINITY))
 class Fill:
     def run(self):
-        artifacts.atomic_write_bytes({str(tmp_path / "x")!r}, bytes(9999))
+        atomic_write_bytes({str(tmp_path / "x")!r}, bytes(9999))
 commands.parse = lambda name, args: Fill()
 sys.exit(cli.main(["export"]))
 """

@@ -108,4 +108,4 @@ def test_wrong_frames_and_channels_are_refused_by_name():
     with pytest.raises(UserError, match=r"\(1, 3, 90, 160\); expected \(B, 3, 180, 320\)"):
         preprocess.prepare_depth(jnp.zeros((1, 3, 90, 160)), None, PROFILE, CONFIG)
     with pytest.raises(UserError, match="Did you mean 'relief'"):
-        preprocess.check_channels(replace(CONFIG, picture=replace(CONFIG.picture, channels=("releif",))))
+        replace(CONFIG.picture, channels=("releif",))

@@ -89,7 +89,8 @@ def test_another_encoder_is_refused_and_none_is_said(weights):
             {},
             replace(
                 RESNET18,
-                encoder=replace(RESNET18.encoder, weights="x"),
+                encoder=replace(RESNET18.encoder, weights="x", pooling="mean"),
+                hand_view=replace(RESNET18.hand_view, size_px=0),
                 picture=replace(RESNET18.picture, channels=("valid",)),
             ),
         )

@@ -1,6 +1,7 @@
 """Frames, labels, losses and the training plan of the student, by value."""
 
 import dataclasses
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +9,20 @@ import numpy as np
 import pytest
 
 from ddgrasp import contract
-from ddgrasp.config import EncoderConfig, HandViewConfig, HeadConfig, StudentConfig, StudentTrainingConfig
+from ddgrasp.config import (
+    Config,
+    EncoderConfig,
+    HandViewConfig,
+    HeadConfig,
+    StudentConfig,
+    StudentTrainingConfig,
+)
 from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
 from student_jax import train
 from student_jax.augment import disparity_noise
-from student_jax.data import aux_targets, check_chunk, make_frames, random_crops, sharpen_gripper
+from student_jax.dagger import CHECKPOINTS, Trainer
+from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gripper
 from student_jax.frames_io import useful_steps
 from student_jax.policy import Aux, init_params, position_to_world
 from student_jax.privileged import noisy_seen
@@ -26,7 +36,8 @@ CONFIG = StudentConfig(
 )
 
 
-def frames_of(lengths=(3, 2)):
+def columns_of(lengths=(3, 2)):
+    """depth_mm, state, action, observation and held of each episode."""
     count = iter(range(100))
     columns = []
     for n in lengths:
@@ -45,7 +56,11 @@ def frames_of(lengths=(3, 2)):
                 numbers > 1,
             )
         )
-    return make_frames(*zip(*columns, strict=True))
+    return columns
+
+
+def frames_of(lengths=(3, 2)):
+    return make_frames(*zip(*columns_of(lengths), strict=True))
 
 
 def test_the_first_frame_is_repeated_and_episodes_do_not_mix():
@@ -128,6 +143,48 @@ def test_a_training_step_is_pure_and_learns(action_weight):
     assert ("action" in last) == bool(action_weight)
 
 
+class _StopsAt(Progress):
+    """Ctrl-C at so many updates of bars and curves."""
+
+    def __init__(self, left):
+        super().__init__(quiet=True)
+        self.left = left
+
+    def _tick(self):
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+
+def test_a_fit_interrupted_and_resumed_ends_as_an_uninterrupted_one(tmp_path):
+    config = Config(
+        "test", student=dataclasses.replace(CONFIG, training=dataclasses.replace(CONFIG.training, steps=5))
+    )
+    assert config.world.profile == PROFILE
+
+    def trainer(name, progress):
+        made = Trainer(config, cast(Any, None), cast(Any, None), tmp_path / name, progress)
+        if made.frame_count == 0:
+            for episode in columns_of((6, 6)):
+                steps = dict(
+                    zip(("depth_mm", "state", "action", "observation", "held"), episode, strict=True)
+                )
+                made._store.append(steps, {"from_demo": np.bool_(True)})
+        made.params = init_params(jax.random.key(0), CONFIG, PROFILE)
+        return made
+
+    whole, again = trainer("whole", Progress(quiet=True)), trainer("halves", Progress(quiet=True))
+    whole._phase("demos", lambda: whole._fit("demos", 5))
+    halves = trainer("halves", _StopsAt(4))  # the start and three steps
+    with pytest.raises(KeyboardInterrupt):
+        halves._fit("demos", 5)
+    folder = tmp_path / "halves" / CHECKPOINTS
+    assert [path.name for path in (folder / "demos").iterdir()] == ["3"]
+    again._phase("demos", lambda: again._fit("demos", 5))
+    jax.tree.map(np.testing.assert_array_equal, again.params, whole.params)
+    assert again.history == whole.history and not folder.exists()
+
+
 def test_the_head_learns_actions_from_poses():
     """Labels that say where the object is: after 300 steps the head's actions follow a new position."""
     rng = np.random.default_rng(0)
@@ -162,7 +219,7 @@ def test_pose_errors_shrink_near_the_object():
 
 def test_executing_more_than_a_chunk_is_refused():
     with pytest.raises(UserError, match=r"execute_steps is 3: expected 1 to student.head.chunk = 2"):
-        check_chunk(dataclasses.replace(CONFIG, head=dataclasses.replace(CONFIG.head, execute_steps=3)))
+        dataclasses.replace(CONFIG.head, execute_steps=3)
 
 
 def test_disparity_noise_grows_with_the_square_of_depth_and_keeps_holes():

@@ -9,6 +9,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
+from config_support import unchecked
 from ddgrasp.config import Config, EvalConfig, RewardConfig, TeacherConfig, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
@@ -37,9 +38,8 @@ def _checkpoints(directory) -> ocp.CheckpointManager:
 
 
 def test_an_absurd_learning_rate_stops_before_the_broken_state_is_saved(tmp_path):
-    teacher = dataclasses.replace(
-        TEACHER, learning_rate=1e30, critic_warmup=2
-    )  # the policy learns from the third
+    # the policy learns from the third iteration on
+    teacher = unchecked(TEACHER, learning_rate=1e30, critic_warmup=2)
     config = dataclasses.replace(CONFIG, teacher=teacher)
     with pytest.raises(UserError, match="iteration 3: (loss|gradient|action)") as error:
         ppo_train.train(config, tmp_path, Progress(quiet=True))
@@ -56,7 +56,7 @@ def test_an_absurd_learning_rate_stops_before_the_broken_state_is_saved(tmp_path
 
 
 def test_a_reward_beyond_all_numbers_is_named_and_nothing_is_saved(tmp_path):
-    world = dataclasses.replace(CONFIG.world, reward=RewardConfig(accel=3e38))
+    world = dataclasses.replace(CONFIG.world, reward=unchecked(RewardConfig(), accel=3e38))
     with pytest.raises(
         UserError, match=r"iteration 1: reward/accel is -inf\. Nothing was saved yet"
     ) as error:

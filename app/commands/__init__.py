@@ -13,7 +13,7 @@ import tyro
 
 from app import pipeline
 from app.commands.base import DEFAULT_PRESET, Command, FromPreset
-from app.commands.checks import check_config_values, check_devices
+from app.commands.checks import check_config_values, check_devices, check_options
 from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
@@ -91,7 +91,9 @@ def parse(name: str, args: Sequence[str]) -> Command:
     read = partial(
         tyro.cli, cls, prog=program, args=list(args), config=(tyro.conf.FlagCreatePairsOff,), **options
     )
-    return parsed(read, program)
+    command = parsed(read, program)
+    check_options(command)
+    return command
 
 
 def describe_commands(group: str = "") -> str:

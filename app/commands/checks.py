@@ -1,30 +1,45 @@
-"""What commands check before they start: names, files, counts, devices."""
+"""What commands check before they write anything: options of their own, names, files, devices.
 
+What a value of the configuration may be, the configuration itself knows (ddgrasp/config/); here is what needs
+files, devices or packages above it.
+"""
+
+import dataclasses
+import types
+import typing
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from ddgrasp import artifacts
-from ddgrasp.config import Config, WorldConfig
-from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.config import Config, ScoreConfig, WorldConfig
+from ddgrasp.config.checks import check_value, kinds
+from ddgrasp.errors import UserError
 
 CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
 """File that `<stage>.init_from` must hold, itself or in a folder named after the stage. Named here too, since
 the stages' own modules import JAX."""
 
 
+def check_options(command: Any) -> None:
+    """UserError for a command's own option beyond the bounds or choices that its type states."""
+    for field, kind in kinds(type(command)).items():
+        value, option = getattr(command, field), f"--{field.replace('_', '-')}"
+        if typing.get_origin(kind) is types.UnionType:
+            kind = typing.get_args(kind)[0]
+        states = typing.get_origin(kind) in (Annotated, Literal, tuple)
+        if states and value is not None and not dataclasses.is_dataclass(typing.get_args(kind)[0]):
+            check_value(option, value, kind)
+
+
 def check_config_values(config: Config) -> Config:
     """`config` if the names and files in it exist; UserError with the remedy otherwise."""
-    from ddg_jax.network_prior import IN_SIMULATION
     from ddg_jax.prior import make_prior
-    from ddgrasp.policy_metadata import check_depth_dtype
     from student_jax.depth_source import check_source
 
     check_objects(config.world)
     for stage, file in CHECKPOINTS.items():
         _check_start(stage, getattr(config, stage).init_from, file)
-    if config.ddg.prior.in_sim not in IN_SIMULATION:
-        raise unknown_name("ddg.prior.in_sim", config.ddg.prior.in_sim, IN_SIMULATION)
     check_source(config, make_prior(config.ddg))
-    check_depth_dtype(config.export.depth_dtype)
     if config.student.encoder.weights:
         from student_jax import pretrained_encoder
 
@@ -33,13 +48,28 @@ def check_config_values(config: Config) -> Config:
 
 
 def check_objects(world: WorldConfig) -> None:
-    """UserError unless `world` has objects, all of them known."""
-    from mjx_envs.objects import OBJECTS, get_object
+    """UserError unless all of the world's objects are known."""
+    from mjx_envs.objects import get_object
 
-    if not world.objects:
-        raise UserError(f"world.objects is empty; expected at least one of {', '.join(OBJECTS)}.")
     for name in world.objects:
         get_object(name)
+
+
+def check_score(score: ScoreConfig) -> None:
+    """UserError unless the networks that the scores name have their weights."""
+    from foundation import catalog, store
+
+    for name in score.features:
+        if name in (catalog.FID_INCEPTION, catalog.RESNET18):
+            store.read_manifest(store.WEIGHTS_DIR / name)
+    if score.monocular_weights:
+        store.read_manifest(Path(score.monocular_weights))
+
+
+def check_data(option: str, path: Path) -> None:
+    """UserError unless there is a recording, or a folder of them, to read."""
+    if not path.exists():
+        raise UserError(f"{option} is {path}, which does not exist: give a recording or a folder of them.")
 
 
 def check_devices(config: Config, run_dir: Path) -> None:
@@ -61,9 +91,3 @@ def _check_start(stage: str, init_from: str, file: str) -> None:
     )
     trouble = f"holds no {file}" if source.exists() else "does not exist"
     raise UserError(f"{stage}.init_from is {init_from!r}, which {trouble}: {remedy}.")
-
-
-def check_count(option: str, value: int) -> None:
-    """UserError unless `value` is at least 1."""
-    if value < 1:
-        raise UserError(f"{option} is {value}; expected at least 1.")

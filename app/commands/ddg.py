@@ -5,8 +5,9 @@ from pathlib import Path
 
 from app import pipeline
 from app.commands.base import OneStage
-from app.commands.checks import check_config_values, check_count
+from app.commands.checks import check_config_values, check_data
 from ddgrasp import artifacts
+from ddgrasp.config.checks import Count, Seed, Steps
 from ddgrasp.stages import get_stage
 
 
@@ -24,6 +25,7 @@ class DDGFit(OneStage):
         if self.data is None:
             super().run()
             return
+        check_data("--data", self.data)
         config, inputs = check_config_values(self.config), {"data": self.data}
         pipeline.make(get_stage(self.stage), config, self.out, resume=self.resume, parents={}, inputs=inputs)
 
@@ -38,17 +40,17 @@ class DDGSample:
     """A recording, or a folder of them."""
     out: Path = Path()
     """Where samples.png goes."""
-    count: int = 4
+    count: Count = 4
     """Frames to draw."""
-    seed: int = 0
-    """Seed of the noise."""
+    seed: Seed = 0
+    """Of the noise."""
 
     def run(self) -> None:
         """Writes samples.png and prints where it is."""
         from ddg_jax.stage import sample_folder
         from ddgrasp.progress import Progress
 
-        check_count("--count", self.count)
+        check_data("--data", self.data)
         progress = Progress(name="ddg sample")
         print(
             sample_folder(
@@ -67,15 +69,15 @@ class DDGDistil:
     """The recordings it was fitted on: a recording, or a folder of them."""
     out: Path
     """Directory of a run; the distilled model goes to its folder ddg."""
-    evaluations: int = 4
+    evaluations: Count = 4
     """Network evaluations per map; those passed on the way (4 and 2 before 1) are kept too."""
-    steps: int | None = None
+    steps: Steps | None = None
     """Optimiser steps per halving; none takes the model's ddg.training.distil_steps."""
     resume: bool = False
     """Continue what is there."""
 
     def run(self) -> None:
-        """Distils, with checkpoints, and leaves a stage `ddg` that samples in few evaluations."""
+        check_data("--data", self.data)
         fitted = artifacts.read_artifact(self.model)
         config = artifacts.config_from_json(fitted.manifest.config)
         training = config.ddg.training
@@ -100,8 +102,8 @@ class DDGGenerate:
     """Stage directory of collected demos, for example runs/demo/demos."""
     out: Path
     """Directory of a run; the depth goes to its folder noisy."""
-    seed: int = 0
-    """Seed of the noise."""
+    seed: Seed = 0
+    """Of the noise."""
     resume: bool = False
     """Continue what is there."""
 
@@ -129,17 +131,17 @@ class DDGThresholds:
     """A recording, or a folder of them; its last frames are used."""
     out: Path = Path()
     """Where thresholds.json and thresholds.png go."""
-    count: int = 180
+    count: Count = 180
     """Frames."""
-    seed: int = 1
-    """Seed of the noise."""
+    seed: Seed = 1
+    """Of the noise."""
 
     def run(self) -> None:
         """Prints the table and writes thresholds.json and thresholds.png."""
         from ddg_jax import thresholds
         from ddgrasp.progress import Progress
 
-        check_count("--count", self.count)
+        check_data("--data", self.data)
         progress = Progress(name="thresholds")
         rows = thresholds.analyse(self.model, self.data, self.out, progress, count=self.count, seed=self.seed)
         print(f"{thresholds.table(rows)}\n{self.out / thresholds.FILE}.png")

@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from app.commands.base import OneStage
-from app.commands.checks import check_count
 from ddgrasp import contract
-from ddgrasp.config import RecordConfig, StereoConfig
+from ddgrasp.config import CameraScale, RecordConfig, StereoConfig
+from ddgrasp.config.checks import Count, Range, Seed, Share
 from ddgrasp.errors import UserError
 
 
@@ -34,13 +35,13 @@ class RecordImport:
     """A .bag or .db3, a folder of them, one with depth/ and color/ (or rgb/), or a folder of such folders."""
     out: Path = Path("recordings")
     """Each source becomes a folder in it."""
-    depth_unit_m: float = 0.0
+    depth_unit_m: Share = 0.0
     """Metres per unit of depth; 0 takes a RealSense file's own, 0.001 for integer pictures, 1 for floats."""
     sensor: str = ""
     """Camera model, for example D455; a RealSense file names its own."""
-    fx_px: float = 0.0
+    fx_px: Annotated[float, Range(0, 100_000)] = 0.0
     """Focal length of the depth pictures in pixels; 0 if unknown."""
-    baseline_m: float = 0.0
+    baseline_m: Annotated[float, Range(0, 10)] = 0.0
     """Distance between the imagers; 0 if unknown."""
     consecutive: bool = False
     """The pictures follow each other in time (a RealSense file's do)."""
@@ -49,8 +50,6 @@ class RecordImport:
         """Imports every source that can be used and says what was left out."""
         from sensors.recordings import importers
 
-        if not 0 <= self.depth_unit_m <= 1:
-            raise UserError(f"--depth-unit-m is {self.depth_unit_m}; expected 0 (known) or up to 1 (metres).")
         known = {"sensor": self.sensor, "fx_px": self.fx_px, "baseline_m": self.baseline_m}
         meta = {name: value for name, value in known.items() if value}
         if self.consecutive:
@@ -102,29 +101,24 @@ class SensorsCompare:
 
     stereo: StereoConfig = field(default_factory=StereoConfig)
     """The rig's camera."""
-    camera_scale: float = 0.25
+    camera_scale: CameraScale = 0.25
     """Size of its picture relative to 1280 x 720."""
     real: Path | None = None
     """A recording of a real camera, or a folder of them; none takes the figures measured before."""
     out: Path = Path()
     """Where sensors.json and sensors.png go."""
-    scenes: int = 1
+    scenes: Count = 1
     """Standing scenes per object."""
-    frames: int = 6
-    """Frames per scene."""
-    seed: int = 0
-    """Seed of the scenes."""
+    frames: Annotated[int, Range(2, 1_000_000)] = 6
+    """Frames per scene, at least 2: noise over time needs them."""
+    seed: Seed = 0
+    """Of the scenes."""
 
     def run(self) -> None:
         """Prints both cameras' figures side by side and writes sensors.json and sensors.png."""
         from ddgrasp.progress import Progress
         from evaluation import camera_comparison as compare
 
-        if not 0.1 <= self.camera_scale <= 1.0:
-            raise UserError(f"--camera-scale is {self.camera_scale}; expected 0.1 to 1.")
-        check_count("--scenes", self.scenes)
-        if self.frames < 2:
-            raise UserError(f"--frames is {self.frames}; expected at least 2, for noise over time.")
         result = compare.compare(
             RecordConfig(stereo=self.stereo),
             contract.D455.scaled(self.camera_scale),

@@ -2,10 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from ddgrasp import artifacts, contract
+from ddgrasp import contract
+from ddgrasp.config.checks import Range
+from ddgrasp.files import atomic_write_bytes
 
 
 @dataclass(frozen=True)
@@ -16,7 +19,7 @@ class WeightsConvert:
     """File as `ddgrasp weights list` names it; what is pickled in it is not run."""
     out: Path = Path("weights")
     """Folder of converted weights; each network gets a folder in it."""
-    max_depth_m: float = 0.0
+    max_depth_m: Annotated[float, Range(0, 1000)] = 0.0
     """Range of a metric depth model in metres (20 indoor, 80 outdoor); 0 for the relative ones."""
 
     def run(self) -> None:
@@ -100,5 +103,5 @@ class ObjectsSheet:
         from mjx_envs.objects import OBJECTS
 
         everything = tuple(dict.fromkeys((*contract.SEEN_OBJECTS, *contract.UNSEEN_OBJECTS, *OBJECTS)))
-        artifacts.atomic_write_bytes(self.out, draw(self.objects or everything))
+        atomic_write_bytes(self.out, draw(self.objects or everything))
         print(self.out)

@@ -9,9 +9,10 @@ import tyro
 
 from app import pipeline
 from app.commands.base import load_config
-from app.commands.checks import check_config_values
+from app.commands.checks import check_config_values, check_data, check_score
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig, DepthFeatureConfig, ScoreConfig
+from ddgrasp.config.checks import Count, Seed
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.stages import get_stage
@@ -29,8 +30,8 @@ class Scoring:
     """Directory of the result, a folder in it; usually the run's."""
     run_dir: Path | None = None
     """Run whose teacher and generator to use; none takes --out."""
-    seed: int = 0
-    """Seed of trajectories, noise and resampling."""
+    seed: Seed = 0
+    """Of trajectories, noise and resampling."""
     resume: bool = False
     """Continue what is there."""
 
@@ -38,6 +39,7 @@ class Scoring:
         """Makes the stage from the run's own parts, and prints its table."""
         from evaluation.depth_score.page import print_result
 
+        check_score(self.score)
         stage, source = get_stage(stage_name), self.run_dir or self.out
         config = replace(load_config(source, "ddg"), score=self.score, seed=self.seed)
         parents = {name: artifacts.read_artifact(source / name) for name in stage.parents}
@@ -54,9 +56,9 @@ class DDGScore(Scoring):
     real: Path | None = None
     """Recordings of a real camera: fits the preset's generator on the first frames and scores it on the last,
     instead of the rig; no run is needed."""
-    fit_frames: int = 80
+    fit_frames: Count = 80
     """Frames that --real is fitted on."""
-    score_frames: int = 40
+    score_frames: Count = 40
     """Frames that --real is scored on, the last ones."""
 
     def run(self) -> None:
@@ -73,6 +75,8 @@ class DDGScore(Scoring):
                 f"--run-dir {self.run_dir} with --real: the generator is fitted on the first frames, none is "
                 "taken from a run; leave one of them out."
             )
+        check_data("--real", self.real)
+        check_score(self.score)
         preset = replace(get_preset(self.preset), ddg=self.ddg, score=self.score, seed=self.seed)
         config = real_config(check_config_values(preset), self.real)
         stage = get_stage("score_real")

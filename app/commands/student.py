@@ -7,9 +7,10 @@ from typing import Annotated
 import tyro
 
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config
-from app.commands.checks import check_count
+from app.commands.checks import check_objects
 from ddgrasp import artifacts
-from ddgrasp.config import Config
+from ddgrasp.config import Camera, Config, Robot
+from ddgrasp.config.checks import Count, Seed
 from ddgrasp.presets import get_preset
 
 
@@ -26,10 +27,10 @@ class StudentEval:
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run."""
-    trials: int = 200
+    trials: Count = 200
     """Episodes per kind of depth."""
-    seed: int = 1
-    """Seed of the episodes."""
+    seed: Seed = 1
+    """Of the episodes."""
 
     def run(self) -> None:
         """Prints success on clean and on generated depth, with Wilson intervals."""
@@ -41,7 +42,6 @@ class StudentEval:
         from student_jax.evaluate import closed_loop
         from student_jax.policy import PARAMS_FILE
 
-        check_count("--trials", self.trials)
         config = load_config(self.run_dir, "student")
         evaluation = replace(config.evaluation, student_trials=self.trials)
         config = replace(config, seed=self.seed, evaluation=evaluation)
@@ -69,9 +69,9 @@ class Deploy:
     """Without --preset: the configuration of the run that the policy lies in."""
     policy: Path
     """ONNX file that `ddgrasp export` wrote."""
-    robot: str = "sim"
+    robot: Robot = "sim"
     """sim (the pseudo-real rig) or franka."""
-    camera: str = "stereo"
+    camera: Camera = "stereo"
     """stereo (the rig's own), realsense, or replay (a recording)."""
     recording: Path | None = None
     """Recording for camera replay."""
@@ -84,6 +84,7 @@ class Deploy:
         """Runs the loop until the time is over or Ctrl-C, and prints how it kept time."""
         from deploy.session import SessionOptions, deploy, describe
 
+        check_objects(self.config.world)
         options = SessionOptions(self.robot, self.camera, self.recording, self.object_name, self.seconds)
         print(describe(deploy(self.config, self.policy, options)))
 

@@ -7,9 +7,10 @@ import tyro
 
 from app import pipeline
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config
-from app.commands.checks import check_config_values, check_count, check_devices, check_objects
+from app.commands.checks import check_config_values, check_devices, check_objects
 from ddgrasp import artifacts
-from ddgrasp.config import HostsConfig, WorldConfig
+from ddgrasp.config import Backend, HostsConfig, WorldConfig
+from ddgrasp.config.checks import Count, Seed
 from ddgrasp.presets import get_preset
 from ddgrasp.stages import get_stage
 
@@ -42,12 +43,12 @@ class TeacherEval:
     """Directory of the run, or pretrained folder."""
     world: WorldConfig
     """Objects, seen or not, and randomisation; by default those that the teacher was trained on."""
-    trials: int = 200
+    trials: Count = 200
     """Episodes of each object."""
-    watched: int = 8
+    watched: Count = 8
     """How many of them are drawn, to count the object's visible pixels."""
-    seed: int = 0
-    """Seed of the episodes."""
+    seed: Seed = 0
+    """Of the episodes."""
     out: Path | None = None
     """Where trials.json and pictures/episodes.png go; by default beside the teacher, for the report."""
 
@@ -60,8 +61,6 @@ class TeacherEval:
         from ppo.policy import load_policy
         from ppo.visible import MOMENTS
 
-        check_count("--trials", self.trials)
-        check_count("--watched", self.watched)
         check_objects(self.world)
         directory = self.run_dir / "teacher"
         teacher = artifacts.read_artifact(directory).hash
@@ -80,17 +79,14 @@ class TeacherCompare:
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run."""
-    backends: tuple[str, ...] = ("cpu", "jax")
+    backends: tuple[Backend, ...] = ("cpu", "jax")
     """Physics backends: cpu, jax, warp."""
-    trials: int | None = None
+    trials: Count | None = None
     """Episodes per backend; by default 1000, on jax 200 (without a GPU it compiles for minutes)."""
-    seed: int = 0
-    """Seed of the episodes."""
+    seed: Seed = 0
+    """Of the episodes."""
 
     def run(self) -> None:
-        """Prints success per backend and keeps it beside the teacher."""
-        if self.trials is not None:
-            check_count("--trials", self.trials)
         from evaluation import backends as measured
         from evaluation import wilson
         from ppo.backends import evaluate_backends

@@ -42,7 +42,17 @@ from ddgrasp.config.ddg import (
     UNetConfig,
 )
 from ddgrasp.config.demos import DemosConfig
-from ddgrasp.config.deploy import START_NOISES, DeployConfig, FrankaConfig, RealSenseConfig, StartNoise
+from ddgrasp.config.deploy import (
+    CAMERAS,
+    ROBOTS,
+    START_NOISES,
+    Camera,
+    DeployConfig,
+    FrankaConfig,
+    RealSenseConfig,
+    Robot,
+    StartNoise,
+)
 from ddgrasp.config.evaluation import EvalConfig
 from ddgrasp.config.export import DEPTH_DTYPES, DepthDtype, ExportConfig
 from ddgrasp.config.features import DepthFeatureConfig
@@ -114,6 +124,10 @@ class Config(Section):
 
 
 __all__ = [
+    "CAMERAS",
+    "Camera",
+    "ROBOTS",
+    "Robot",
     "BACKENDS",
     "Backend",
     "CHANNELS",

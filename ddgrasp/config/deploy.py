@@ -8,6 +8,10 @@ from ddgrasp.errors import UserError
 
 StartNoise = Literal["zero", "normal"]
 START_NOISES: tuple[StartNoise, ...] = get_args(StartNoise)
+Robot = Literal["sim", "franka"]
+Camera = Literal["stereo", "realsense", "replay"]
+ROBOTS: tuple[Robot, ...] = get_args(Robot)
+CAMERAS: tuple[Camera, ...] = get_args(Camera)
 _Coordinate = Annotated[float, Range(-2, 2)]
 _Corner = tuple[_Coordinate, _Coordinate, _Coordinate]
 

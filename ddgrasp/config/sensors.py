@@ -119,7 +119,7 @@ class KinectConfig(Section, name="sensor.kinect"):
     """Standard deviation of each pixel's shift, independent per pixel (Handa et al. 2014)."""
     axial_per_m: Annotated[float, Range(0, 1)] = 1.425e-3
     """Standard deviation of depth at one metre; it grows with the square (Khoshelham and Elberink 2012)."""
-    steps_per_px: Annotated[float, Range(0, 1000, above=True)] = 8.0
+    steps_per_px: Annotated[float, Range(0, 1_000_000, above=True)] = 8.0
     """Disparity is reported in 1/8 of a pixel."""
 
 

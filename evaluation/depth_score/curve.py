@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
+from ddgrasp.files import atomic_write_bytes, atomic_write_json, read_json, to_json
 from ddgrasp.job import Job
 from ddgrasp.progress import PICTURES, Progress
 from evaluation.depth_score import data as score_data
@@ -63,10 +63,10 @@ def run(job: Job) -> Artifact:
         progress.note(f"{size} trajectories")
         points.append(_point(config, size, frames, common, extractor, loads, directory, progress))
     result = {"features": {extractor.name: extractor.source}, "points": points}
-    artifacts.atomic_write_json(directory / JSON, result)
+    atomic_write_json(directory / JSON, result)
     floor, base = points[0]["floor"], points[0]["sim_gt"]["fid"]["value"]
     picture = score_figures.draw_efficiency(points, floor, base)
-    artifacts.atomic_write_bytes(directory / PICTURES / "curve.png", picture)
+    atomic_write_bytes(directory / PICTURES / "curve.png", picture)
     return job.finish({"points": rows(points)})
 
 
@@ -88,7 +88,7 @@ def _point(
     """One point: read if it was finished, else fitted and scored."""
     folder = directory / f"n{size:03d}"
     if (folder / POINT).exists():
-        return artifacts.read_json(folder / POINT)
+        return read_json(folder / POINT)
     chosen = frames.part(frames.recording < size)
     generator = _fitted(config, chosen, folder, progress)
     methods = Methods(config.score, config.seed, generator)
@@ -101,8 +101,8 @@ def _point(
     for figures in table.values():
         figures.pop("resampled_fid", None)
     point = {"trajectories": size, "frames": len(chosen), "steps": generator.config.training.steps, **table}
-    artifacts.atomic_write_json(folder / POINT, point)
-    return artifacts.to_json(point)
+    atomic_write_json(folder / POINT, point)
+    return to_json(point)
 
 
 def _fitted(config: Config, frames: "Frames", folder: Path, progress: Progress) -> "Generator":

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from ddgrasp import artifacts, contract
+from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_path
 from ddgrasp.progress import Progress
 from sensors.recordings.recording import Recording, find_recordings
 
@@ -145,7 +146,7 @@ def _clean_mm(world: "RigWorld", camera: "RigCamera", T_world_cam: np.ndarray) -
 
 def _save(file: Path, episode: Episode) -> None:
     arrays: dict[str, Any] = {name: value for name, value in vars(episode).items() if value is not None}
-    with artifacts.atomic_path(file) as path:
+    with atomic_path(file) as path:
         np.savez_compressed(path, **arrays)
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ddgrasp import artifacts
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_path
 from ddgrasp.progress import Progress
 from evaluation.depth_score import holes
 from evaluation.depth_score.data import Episode, metres
@@ -54,7 +54,7 @@ def score_episodes(
             arrays: dict[str, Any] = _score(
                 methods, extractors, episode, names, seen[episode.side] <= EXAMPLES
             )
-            with artifacts.atomic_path(file) as path:
+            with atomic_path(file) as path:
                 np.savez(path, **arrays)
             task.advance()
     return files

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE
+from ddgrasp.files import atomic_write_json
 from ddgrasp.job import Job
 from evaluation.depth_score import data as score_data
 from evaluation.depth_score import features as score_features
@@ -65,7 +65,7 @@ def run(job: Job) -> Artifact:
     for row in rows.values():
         row["over_reference"] = row["fid"]["value"] / rows[_name(*REFERENCE)]["fid"]["value"]
     result = {"features": {extractor.name: extractor.source}, "floor": floor, "samplers": rows}
-    artifacts.atomic_write_json(directory / JSON, result)
+    atomic_write_json(directory / JSON, result)
     return job.finish({"samplers": table(rows, floor), "targets": [_target(rows)]})
 
 

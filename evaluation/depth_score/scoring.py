@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
+from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text
 from ddgrasp.job import Job
 from ddgrasp.progress import PICTURES, Progress
 from evaluation.depth_score import features as score_features
@@ -35,10 +35,10 @@ def score_setting(job: Job, text: str, methods: Methods, loads: Sequence[Load]) 
     result = evaluate(scored, config, text, progress)
     result["features"] = {extractor.name: extractor.source for extractor in extractors}
     pictures = _draw(scored, result, config, progress)
-    artifacts.atomic_write_json(directory / JSON, _without_draws(result))
+    atomic_write_json(directory / JSON, _without_draws(result))
     for name, png in pictures.items():
-        artifacts.atomic_write_bytes(directory / PICTURES / f"{name}.png", png)
-    artifacts.atomic_write_text(directory / HTML, render(result, pictures))
+        atomic_write_bytes(directory / PICTURES / f"{name}.png", png)
+    atomic_write_text(directory / HTML, render(result, pictures))
     return job.finish(summary(result))
 
 

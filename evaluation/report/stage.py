@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts
+from ddgrasp.files import atomic_write_json, atomic_write_text
 from evaluation.report.html import REPORT_HTML, render_html
 from evaluation.report.summary import REPORT, build_report
 
@@ -11,6 +11,6 @@ from evaluation.report.summary import REPORT, build_report
 def write_report(run_dir: Path) -> dict[str, Any]:
     """Writes `run_dir/report.json` and `run_dir/report.html` from the finished stages; returns the report."""
     report = build_report(run_dir)
-    artifacts.atomic_write_json(run_dir / REPORT, report)
-    artifacts.atomic_write_text(run_dir / REPORT_HTML, render_html(report, run_dir))
+    atomic_write_json(run_dir / REPORT, report)
+    atomic_write_text(run_dir / REPORT_HTML, render_html(report, run_dir))
     return report

@@ -1,11 +1,10 @@
 """Physics backends by name. Each is imported when it is asked for: Warp alone takes seconds."""
 
 from ddgrasp import contract
+from ddgrasp.config import BACKENDS
 from ddgrasp.errors import unknown_name
 from mjx_envs.object_spec import DEFAULT_SLOTS, SlotLayout
 from mjx_envs.physics.interface import Physics
-
-BACKENDS = ("cpu", "jax", "warp")
 
 
 def make_physics(backend: str, sim_dt_s: float, layout: SlotLayout = DEFAULT_SLOTS) -> Physics:

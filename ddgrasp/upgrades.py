@@ -1,0 +1,143 @@
+"""Configurations as earlier versions of this project wrote them, made readable: fields renamed or dropped.
+
+Manifests, and the notes of unfinished stages (started.json), carry the whole configuration as JSON and the
+version of its fields. Whoever changes a field raises VERSION and adds what moved to the tables below.
+"""
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+VERSION = 2
+"""Of the fields that this code writes. 1: flat sections ddg, student, deploy; written without a number."""
+
+VERSION_FIELD = "manifest_version"
+
+
+def _same(*names: str) -> dict[str, str]:
+    return {name: name for name in names}
+
+
+_GROUPS_OF_2: dict[str, dict[str, dict[str, str]]] = {
+    "ddg": {
+        "depth": _same("representation", "height_px", "width_px", "near_m", "far_m", "surface"),
+        "graft": _same("noise_threshold", "deviation_threshold"),
+        "prior": _same("decoy_holes") | {
+            "source": "prior", "weights": "prior_weights", "in_sim": "prior_in_sim",
+            "input_px": "prior_input_px", "dtype": "prior_dtype", "blur_px": "prior_blur_px",
+            "noise": "prior_noise", "jitter": "prior_jitter",
+        },
+        "unet": _same("space_to_depth", "widths", "blocks", "attention_heads"),
+        "diffusion": _same("schedule", "log_snr_shift") | {"steps": "diffusion_steps"},
+        "training": _same(
+            "batch_size", "learning_rate", "weight_decay", "hole_loss", "loss_weight", "snr_limits",
+            "ema_decay", "checkpoint_every", "holdout_fraction", "distil_from", "distil_steps",
+        ) | {"steps": "train_steps"},
+        "sampling": _same("sampler", "eta", "frame_correlation", "deviation_correlation") | {
+            "steps": "sample_steps", "spacing": "sample_spacing", "batch_size": "sample_batch",
+        },
+    },
+    "student": {
+        "picture": _same("channels", "min_depth_m", "max_depth_m") | {
+            "height_px": "input_height_px", "width_px": "input_width_px",
+        },
+        "encoder": _same(
+            "stem", "width", "stage_blocks", "max_channels", "output_stride", "norm", "pooling", "keypoints",
+        ) | {"features": "feature_size", "weights": "encoder_weights"},
+        "hand_view": {
+            "size_px": "hand_view_px", "pitch_m": "hand_view_pitch_m", "width": "hand_view_width",
+            "blocks": "hand_view_blocks", "channels": "hand_view_channels", "features": "hand_view_features",
+        },
+        "head": _same(
+            "features_to_head", "aux_to_head", "chunk", "execute_steps", "state_features", "conditioning",
+            "time_features", "diffusion_steps", "ddim_steps",
+        ) | {
+            "width": "denoiser_width", "blocks": "denoiser_blocks", "train_steps": "head_steps",
+            "batch_size": "head_batch_size",
+        },
+        "training": _same(
+            "batch_size", "noise_draws", "learning_rate", "weight_decay", "ema_decay", "aux_weight",
+            "action_weight", "held_weight", "demo_held_steps", "clean_share", "crop_shift_px",
+            "disparity_noise_px",
+        ) | {"steps": "train_steps"},
+        "poses": {"rounds": "pose_rounds", "episodes": "pose_episodes", "steps": "pose_steps"},
+        "dagger": {
+            "rounds": "dagger_rounds", "episodes": "dagger_episodes", "steps": "dagger_steps",
+            "teacher_share": "dagger_teacher_share",
+        },
+    },
+    "deploy": {
+        "franka": {
+            "host": "franka_host", "dynamics": "franka_dynamics", "grip_force_n": "franka_grip_force_n",
+        },
+        "realsense": {"serial": "realsense_serial"},
+    },
+}  # fmt: skip
+"""Section -> group -> field -> the field's name in version 1, in the section itself."""
+
+_DROPPED_AFTER_1 = {"world.random.crop_px": 24}
+"""Fields of version 1 that version 2 lacks, with the value that they had."""
+
+_ADDED_AFTER_1 = {"student.depth_source": "learned"}
+"""Fields that version 1 lacked, with what it did."""
+
+
+def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
+    """The JSON of a configuration of an earlier version with the fields of this one.
+
+    Other fields that it lacks stay away, and fields that no version knows stay where they are.
+    """
+    made = copy.deepcopy(dict(config))
+    if version < 2:
+        for name in _DROPPED_AFTER_1:
+            section, field = _section_of(made, name)
+            section.pop(field, None)
+        for name, value in _ADDED_AFTER_1.items():
+            section, field = _section_of(made, name)
+            section.setdefault(field, value)
+        for section, groups in _GROUPS_OF_2.items():
+            if section in made:
+                made[section] = _grouped(made[section], groups)
+        _trim_picture(made.get("student", {}).get("picture", {}))
+    return made
+
+
+def as_version_1(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The JSON of a configuration of this version with the fields of version 1: what its hashes were over."""
+    made = copy.deepcopy(dict(config))
+    for name, value in _DROPPED_AFTER_1.items():
+        section, field = _section_of(made, name)
+        section[field] = value
+    for name in _ADDED_AFTER_1:
+        section, field = _section_of(made, name)
+        section.pop(field, None)
+    for section, groups in _GROUPS_OF_2.items():
+        taken = {group: made[section].pop(group) for group in groups}
+        for group, fields in groups.items():
+            made[section] |= {old: taken[group][new] for new, old in fields.items()}
+    return made
+
+
+def _grouped(flat: Mapping[str, Any], groups: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
+    """A flat section with its fields in groups."""
+    moved = {old for fields in groups.values() for old in fields.values()}
+    kept = {name: value for name, value in flat.items() if name not in moved}
+    made = {
+        group: {new: flat[old] for new, old in fields.items() if old in flat}
+        for group, fields in groups.items()
+    }
+    return kept | {group: fields for group, fields in made.items() if fields}
+
+
+def _trim_picture(picture: dict[str, Any]) -> None:
+    """Version 1 took any size and then refused to build the student's encoder, which needs multiples of 4."""
+    for name in picture.keys() & {"height_px", "width_px"}:
+        picture[name] -= picture[name] % 4
+
+
+def _section_of(config: dict[str, Any], name: str) -> tuple[dict[str, Any], str]:
+    """The section that holds the dotted field `name`, empty if there is none, and the field's own name."""
+    *sections, field = name.split(".")
+    for section in sections:
+        config = config.get(section, {})
+    return config, field

@@ -1,0 +1,128 @@
+"""Manifests, started stages and trial logs of earlier versions are read, accepted and continued."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from ddgrasp import artifacts, contract, upgrades
+from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json, read_json, to_json
+from ddgrasp.presets import PRESETS
+from ddgrasp.stages import ON_REQUEST, STAGES
+from deploy.stage import STAGE, TrialLog
+
+ROOT = Path(__file__).parents[1]
+CONFIG = PRESETS["camera"]
+FLAT = upgrades.as_version_1(to_json(CONFIG))
+ALL_STAGES = [stage.name for stage in (*STAGES, *ON_REQUEST)]
+
+
+def write_version_1(directory: Path, stage: str, config=FLAT) -> None:
+    """A finished stage as version 1 left it: flat names, no version."""
+    artifacts.finish(directory, stage, CONFIG, seconds=1.0, metrics={"x": 1})
+    path = directory / artifacts.MANIFEST
+    value = read_json(path)
+    del value["manifest_version"]
+    path.write_text(json.dumps(value | {"config": config}))
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_version_1_and_back_loses_nothing(name):
+    value = json.loads(json.dumps(to_json(PRESETS[name])))
+    flat = json.loads(json.dumps(upgrades.as_version_1(value)))
+    assert {"train_steps", "widths", "prior", "sample_batch"} <= flat["ddg"].keys()
+    assert {"input_height_px", "head_batch_size", "dagger_teacher_share"} <= flat["student"].keys()
+    assert flat["deploy"]["franka_host"] == "172.16.0.2" and flat["world"]["random"]["crop_px"] == 24
+    assert not any(isinstance(field, dict) for field in (*flat["ddg"].values(), *flat["student"].values()))
+    assert upgrades.upgraded(flat, 1) == value
+    assert upgrades.upgraded(value, upgrades.VERSION) == value
+
+
+def test_fields_named_by_hand_arrive_where_they_belong():
+    flat = {
+        "preset": "mine",
+        "ddg": {"prior": "metric_inverse_depth", "sample_steps": 3, "train_steps": 7, "init_from": "a"},
+        "student": {"width": 24, "denoiser_width": 40, "hand_view_width": 48, "train_steps": 9},
+        "deploy": {"workers": 5, "realsense_serial": "123"},
+        "world": {"random": {"crop_px": 24, "size": 0.1}},
+    }
+    config = artifacts.config_from_json(upgrades.upgraded(flat, 1))
+    assert (config.ddg.prior.source, config.ddg.init_from) == ("metric_inverse_depth", "a")
+    assert (config.ddg.sampling.steps, config.ddg.training.steps) == (3, 7)
+    assert (config.student.encoder.width, config.student.head.width) == (24, 40)
+    assert (config.student.hand_view.width, config.student.training.steps) == (48, 9)
+    assert (config.deploy.workers, config.deploy.realsense.serial) == (5, "123")
+    assert config.world.random.size == 0.1
+
+
+def test_the_paper_presets_picture_of_version_1_becomes_one_that_an_encoder_takes():
+    flat = upgrades.as_version_1(to_json(PRESETS["paper"]))
+    flat["student"] |= {"input_height_px": 225, "input_width_px": 290}
+    assert artifacts.config_from_json(upgrades.upgraded(flat, 1)) == PRESETS["paper"]
+
+
+@pytest.mark.parametrize("stage", ALL_STAGES)
+def test_a_stage_of_version_1_is_finished_for_the_same_configuration(stage, tmp_path):
+    write_version_1(tmp_path / stage, stage)
+    artifact = artifacts.require(tmp_path, stage, CONFIG)
+    assert artifacts.config_from_json(artifact.manifest.config) == CONFIG
+    assert artifact.manifest.manifest_version == upgrades.VERSION
+
+
+def test_another_configuration_is_told_by_its_present_name(tmp_path):
+    flat = json.loads(json.dumps(FLAT))
+    flat["ddg"]["sample_steps"] = 3
+    write_version_1(tmp_path / "ddg", "ddg", flat)
+    with pytest.raises(UserError, match=r"ddg\.sampling\.steps is 3 there, 2 here"):
+        artifacts.require(tmp_path, "ddg", CONFIG)
+
+
+def test_a_stage_begun_by_version_1_goes_on(tmp_path):
+    directory = tmp_path / "student"
+    directory.mkdir()
+    (directory / "checkpoint").touch()
+    started = {"contract_version": contract.CONTRACT_VERSION, "inputs": {}, "config": FLAT}
+    atomic_write_json(directory / artifacts.STARTED, started)
+    artifacts.begin(directory, "student", CONFIG)
+    other = dataclasses.replace(CONFIG.student.training, steps=5)
+    other = dataclasses.replace(CONFIG, student=dataclasses.replace(CONFIG.student, training=other))
+    with pytest.raises(UserError, match=r"student\.training\.steps is 1500 there, 5 here"):
+        artifacts.begin(directory, "student", other)
+
+
+def test_a_trial_log_of_version_1_goes_on(tmp_path):
+    policy = {"policy_sha256": "a"}
+    old = policy | {"config_hash": artifacts.config_hash_of_version_1(CONFIG, STAGE)}
+    new = policy | {"config_hash": artifacts.config_hash(CONFIG, STAGE)}
+    path = tmp_path / "trials.jsonl"
+    TrialLog(path, old)
+    TrialLog(path, new, [old])
+    assert json.loads(path.read_text().splitlines()[0]) == new
+    TrialLog(path, new)
+
+
+def test_the_hash_of_version_1_is_the_one_that_version_recorded():
+    """The pretrained teacher's manifest holds it; nothing of what a teacher depends on was added since."""
+    manifest = read_json(ROOT / "pretrained" / "teacher" / artifacts.MANIFEST)
+    config = artifacts.config_from_json(upgrades.upgraded(manifest["config"], 1))
+    assert artifacts.config_hash_of_version_1(config, "teacher") == manifest["config_hash"]
+
+
+@pytest.mark.parametrize("stage", ["teacher", "student"])
+def test_the_pretrained_folder_is_read_and_accepted(stage):
+    artifact = artifacts.read_artifact(ROOT / "pretrained" / stage)
+    config = artifacts.config_from_json(artifact.manifest.config)
+    assert (config.preset, artifact.manifest.stage) == ("laptop", stage)
+    if stage == "teacher":
+        artifacts.check_config(artifact, config)
+        artifacts.check_config(artifact, PRESETS["laptop"])
+
+
+def test_a_manifest_of_a_later_version_is_refused_by_its_number(tmp_path):
+    artifacts.finish(tmp_path / "export", "export", CONFIG, seconds=1.0, metrics={})
+    path = tmp_path / "export" / artifacts.MANIFEST
+    path.write_text(json.dumps(read_json(path) | {"manifest_version": 99}))
+    with pytest.raises(UserError, match="is of version 99, this code reads up to 2"):
+        artifacts.read_manifest(tmp_path / "export")
