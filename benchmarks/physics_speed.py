@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from brax.training import acting
@@ -19,7 +19,8 @@ from benchmarks import playground_pick
 from benchmarks.compare import Contender, Row, compare, measure
 from ddgrasp import contract
 from ddgrasp.config import Config
-from mjx_envs import grasp_math, scene
+from ddgrasp.layout import QPOS
+from mjx_envs import grasp_math
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState
 from ppo import learner
@@ -57,7 +58,7 @@ def playground_rows(config: Config, rounds: int) -> list[Row]:
     first = jax.jit(pick.reset)(jax.random.key(0))
     peers = [f"PandaPickCube, batch {batch}" for batch in PLAYGROUND_BATCHES]
     for peer, batch in zip(peers, PLAYGROUND_BATCHES, strict=True):
-        start = jax.tree.map(lambda x, n=batch: jp.broadcast_to(x, (n, *x.shape)), first)
+        start = jax.tree.map(lambda x, n=batch: jnp.broadcast_to(x, (n, *x.shape)), first)
         contenders[peer] = stepping(pick, start, pick.n_substeps, calls=max(1, 16 // batch))
     rates = measure(contenders, rounds)
     peer = max(peers, key=lambda name: float(np.median(rates[name])))
@@ -108,7 +109,7 @@ def rollout_rows(config: Config, rounds: int) -> list[Row]:
     params = jax.tree.map(np.asarray, state.info["episode"].params)
     start = jax.tree.map(np.asarray, state.data)
     action, _ = jax.jit(policy)(state.obs, jax.random.key(1))
-    ctrl = grasp_math.controls(start.qpos[:, : scene.N_ARM], np.asarray(action))
+    ctrl = grasp_math.controls(start.qpos[:, QPOS.arm], np.asarray(action))
     bare = bare_contenders(env.env.mj_model, params, start, ctrl, substeps)
     rates = measure(contenders | bare, rounds)
     return [compare(rates, "PPO rollout", "physics steps/s", ours, peer, target=BARE_TARGET) for peer in bare]

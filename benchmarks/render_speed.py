@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.compare import Contender, Row, compare, measure
 from ddgrasp import contract
 from ddgrasp.config import Config
+from ddgrasp.layout import QPOS
 from mjx_envs import randomize, scene
 from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.render import raycast, raycast_numpy
@@ -62,8 +63,8 @@ def random_scenes(config: Config) -> tuple[mujoco.MjModel, list[mujoco.MjData]]:
     half = np.array(contract.WORKSPACE_SIZE_M) / 2
     for _ in range(SCENES):
         data = mujoco.MjData(model)
-        data.qpos[: scene.N_ARM] = np.array(scene.HOME_RAD) + 0.3 * rng.uniform(-1, 1, scene.N_ARM)
-        data.qpos[9:11] = np.array(contract.WORKSPACE_CENTER_M) + half * rng.uniform(-1, 1, 2)
+        data.qpos[QPOS.arm] = np.array(scene.HOME_RAD) + 0.3 * rng.uniform(-1, 1, scene.N_ARM)
+        data.qpos[QPOS.object_pos][:2] = np.array(contract.WORKSPACE_CENTER_M) + half * rng.uniform(-1, 1, 2)
         mujoco.mj_forward(model, data)
         scenes.append(data)
     return model, scenes

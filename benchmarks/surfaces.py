@@ -18,8 +18,9 @@ import numpy as np
 from ddg_jax.data import surfaces
 from ddg_jax.inverse_depth import invert
 from ddgrasp.config import SURFACES
+from ddgrasp.depth import to_metres, to_millimetres
 from evaluation.depth_score import features as score_features
-from evaluation.depth_score.data import REAL, SIM, Episode, load_episode, metres, millimetres
+from evaluation.depth_score.data import REAL, SIM, Episode, load_episode
 from evaluation.depth_score.distances import fid
 from evaluation.depth_score.domains import inpainted
 
@@ -30,7 +31,7 @@ INPAINT_RADIUS_PX = 3.0
 
 def telea(depth_m: np.ndarray) -> np.ndarray:
     """Inpainted."""
-    return metres(inpainted(millimetres(depth_m), INPAINT_RADIUS_PX))
+    return to_metres(inpainted(to_millimetres(depth_m), INPAINT_RADIUS_PX))
 
 
 WAYS: dict[str, Make] = {
@@ -44,11 +45,11 @@ def measure(real: Sequence[Episode], sim: Sequence[Episode]) -> None:
     features = score_features.load("depthfeat-v1")
 
     def of(maps_m: Sequence[np.ndarray]) -> np.ndarray:
-        return np.concatenate([features(metres(millimetres(depth_m))) for depth_m in maps_m])
+        return np.concatenate([features(to_metres(to_millimetres(depth_m))) for depth_m in maps_m])
 
-    sensed, truth_m = [metres(e.sensed_mm) for e in sim], [metres(e.clean_mm) for e in sim]
-    recorded, truth = of([metres(e.sensed_mm) for e in real]), of(truth_m)
-    whole = of([telea(metres(e.sensed_mm)) for e in real])
+    sensed, truth_m = [to_metres(e.sensed_mm) for e in sim], [to_metres(e.clean_mm) for e in sim]
+    recorded, truth = of([to_metres(e.sensed_mm) for e in real]), of(truth_m)
+    whole = of([telea(to_metres(e.sensed_mm)) for e in real])
     unit = fid(recorded, truth)
     print(f"{'':24}{'to truth':>10}{'Sim GT':>10}{'Inpaint':>10}{'error':>10}")
     print(f"{'truth':24}{0:10.4f}{1:10.3f}{fid(whole, truth) / unit:10.4f}{0:10.5f}")

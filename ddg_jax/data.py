@@ -13,6 +13,7 @@ from ddg_jax.prior import Prior
 from ddg_jax.representation import encode
 from ddgrasp import artifacts
 from ddgrasp.config import PIECEWISE, DDGConfig
+from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from sensors.recordings.recording import Recording, find_recordings, is_recording
@@ -143,7 +144,7 @@ def _read(
         progress.note(recording.skipped_summary())
     size = (config.depth.height_px, config.depth.width_px)
     count = min(limit, len(recording))
-    frames = np.stack([resize_nearest(recording.depth_m(i), size) for i in range(count)])
+    frames = np.stack([crop_nearest(recording.depth_m(i), size) for i in range(count)])
     usable = np.flatnonzero((frames > 0).any(axis=(1, 2)))
     blind = len(frames) - len(usable)
     if len(usable) == 0:
@@ -170,18 +171,6 @@ def _tell_of_crop(recording: Recording, config: DDGConfig, progress: Progress) -
             f"window of {columns}:{rows}, the simulated camera's shape; --ddg.depth.height-px "
             f"{round(columns * height / width)} takes all of it"
         )
-
-
-def resize_nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) -> `size` by nearest neighbours after a centred crop to the target's aspect ratio.
-
-    Nothing is interpolated: a hole stays a hole, a depth stays a measured depth.
-    """
-    height, width = image.shape[:2]
-    scale = min(height / size[0], width / size[1])
-    rows = (np.arange(size[0]) + 0.5) * scale + (height - size[0] * scale) / 2
-    columns = (np.arange(size[1]) + 0.5) * scale + (width - size[1] * scale) / 2
-    return image[np.ix_(rows.astype(int), columns.astype(int))]
 
 
 @dataclass(frozen=True)

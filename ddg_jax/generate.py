@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from ddg_jax.sample import Generator, batch_size, condition, grafted, predict
-from ddgrasp import contract
+from ddgrasp import depth
 from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
 from ddgrasp.job import Job
@@ -64,7 +64,7 @@ def noisy_episodes(
         for i in range(int(np.searchsorted(starts, begin, side="right")) - 1, len(lengths)):
             clip = read(i)
             waiting.append((i, clip))
-            c = condition(generator, _metres(clip.depth_mm), clip.rgb, one_episode=True)
+            c = condition(generator, depth.to_metres(clip.depth_mm), clip.rgb, one_episode=True)
             yield from ((c[t], clip.number, t) for t in range(max(0, begin - starts[i]), lengths[i]))
 
     frames = stream()
@@ -76,8 +76,8 @@ def noisy_episodes(
             x = np.stack([made.popleft() for _ in range(starts[i + 1] - used)])
             used = starts[i + 1]
             if i >= first:
-                depth_m = grafted(generator.config, _metres(clip.depth_mm), x).depth_m
-                yield np.round(depth_m / contract.DEPTH_UNIT_M).astype(np.uint16)
+                made_m = grafted(generator.config, depth.to_metres(clip.depth_mm), x).depth_m
+                yield depth.to_millimetres(made_m)
 
 
 def run(job: Job) -> Artifact:
@@ -112,7 +112,3 @@ def run(job: Job) -> Artifact:
 
 def _fields(generator: Generator) -> tuple[str, ...]:
     return ("depth_mm", "rgb") if generator.prior.needs_sim_rgb else ("depth_mm",)
-
-
-def _metres(depth_mm: np.ndarray) -> np.ndarray:
-    return depth_mm.astype(np.float32) * np.float32(contract.DEPTH_UNIT_M)

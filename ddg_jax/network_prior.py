@@ -91,7 +91,7 @@ class DepthNetworkPrior:
 
 def at_size(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(H, W) -> `size`, averaged after a centred crop to its aspect ratio: the part of the scene that depth
-    resized by `ddg_jax.data.resize_nearest` shows.
+    resized by `ddgrasp.depth.crop_nearest` shows.
     """
     height, width = image.shape
     scale = min(height / size[0], width / size[1])

@@ -5,7 +5,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from ddg_jax.representation import channels, correlations, decode
 from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
 from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
+from ddgrasp.depth import resize_nearest
 from ddgrasp.errors import UserError
 from learning import diffusion
 from learning.params import Params, load_params, save_params
@@ -52,7 +52,7 @@ class Generator:
         directory = Path(directory)
         manifest = artifacts.read_manifest(directory)
         if manifest.stage != "ddg":
-            raise UserError(f"{directory} holds a {manifest.stage!r} artefact; expected one of stage 'ddg'.")
+            raise UserError(f"{directory} holds a {manifest.stage!r} artifact; expected one of stage 'ddg'.")
         config = artifacts.config_from_json(manifest.config).ddg
         sampler, steps = sampler or config.sampling.sampler, steps or config.sampling.steps
         file = directory / (params_file(steps) if sampler == PROGRESSIVE else PARAMS_FILE)
@@ -206,7 +206,7 @@ def condition(
     """
     config, prior = generator.config, generator.prior
     _check_depth(depth_m, config)
-    clean = _at_size(depth_m, (config.depth.height_px, config.depth.width_px))
+    clean = resize_nearest(depth_m, (config.depth.height_px, config.depth.width_px))
     if one_episode:
         return prior.from_sim(clean, rgb)
     pictures = [None] * len(clean) if rgb is None else [picture[None] for picture in rgb]
@@ -215,8 +215,7 @@ def condition(
 
 def grafted(config: DDGConfig, depth_m: np.ndarray, x: np.ndarray) -> Generated:
     """Maps x (B, h, w, C) of `predict` on clean depth_m (B, H, W)."""
-    planes = np.moveaxis(x, -1, 0)
-    sized = np.stack([_at_size(plane, depth_m.shape[1:]) for plane in planes], axis=-1)
+    sized = np.moveaxis(resize_nearest(np.moveaxis(x, -1, 1), depth_m.shape[1:]), 1, -1)
     return Generated(*map(np.asarray, _graft(config, np.asarray(depth_m, np.float32), sized)))
 
 
@@ -292,11 +291,3 @@ def _check_depth(depth_m: np.ndarray, config: DDGConfig) -> None:
             "(divide millimetres by 1000)."
         )
     check_aspect(depth_m.shape[1:], config)
-
-
-def _at_size(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(T, H, W) -> (T, *size) by nearest neighbours; unchanged if it has that size."""
-    if frames.shape[1:] == size:
-        return frames
-    flat = [cv2.resize(f.astype(np.float32), size[::-1], interpolation=cv2.INTER_NEAREST) for f in frames]
-    return np.stack(flat).astype(frames.dtype)

@@ -12,6 +12,7 @@ from ddg_jax.representation import decode
 from ddg_jax.sample import Generator, check_aspect, sample
 from ddgrasp.config import Sensor, SensorConfig
 from ddgrasp.contract import CameraProfile
+from ddgrasp.depth import resize_nearest
 from ddgrasp.errors import UserError
 from sensors.models import procedural
 from sensors.models.sense import Sense, batched, ideal
@@ -62,12 +63,12 @@ def learned(generator: Generator) -> Sense:
 
     def sense_frame(key: Array, depth_m: Array, rgb: Array | None) -> Array:
         check_aspect(depth_m.shape, config)
-        clean = jax.image.resize(depth_m, size, "nearest")
+        clean = resize_nearest(depth_m, size)
         shape = jax.ShapeDtypeStruct(size, jnp.float32)
         c = jax.pure_callback(prior_on_host, shape, clean, vmap_method="broadcast_all")[None]
         first = jnp.zeros(1, jnp.int32)
         x = sample(config, key, generator.params, c, first[0], first, steps=config.sampling.steps)[0]
-        sized = jax.image.resize(x, (*depth_m.shape, x.shape[-1]), "nearest")
+        sized = jnp.moveaxis(resize_nearest(jnp.moveaxis(x, -1, 0), depth_m.shape), 0, -1)
         predicted = decode(config, sized, depth_m)
         return graft(depth_m, predicted.depth_m, predicted.mask)
 

@@ -30,7 +30,7 @@ _LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxrunti
 
 @dataclasses.dataclass(frozen=True)
 class Manifest:
-    """Where an artefact came from and what was measured on it."""
+    """Where an artifact came from and what was measured on it."""
 
     stage: str
     """A name of ddgrasp/stages.py."""
@@ -43,7 +43,7 @@ class Manifest:
     """Python, this project and the libraries."""
     seed: int
     parents: dict[str, str]
-    """Stage name -> hash of the manifest this artefact was made from."""
+    """Stage name -> hash of the manifest this artifact was made from."""
     seconds: float
     """Wall time spent, interrupted attempts included."""
     origin: str
@@ -67,11 +67,11 @@ class Artifact:
     directory: Path
     manifest: Manifest
     hash: str
-    """Identifies this very artefact: children name it among their parents."""
+    """Identifies this very artifact: children name it among their parents."""
 
 
 def write_manifest(directory: Path | str, manifest: Manifest) -> Artifact:
-    """Finishes a stage: writes manifest.json, the last file of its directory, and returns the artefact."""
+    """Finishes a stage: writes manifest.json, the last file of its directory, and returns the artifact."""
     atomic_write_json(Path(directory) / MANIFEST, manifest)
     return read_artifact(directory)
 
@@ -81,7 +81,7 @@ def read_manifest(directory: Path | str) -> Manifest:
     path = Path(directory) / MANIFEST
     if not path.exists():
         raise UserError(
-            f"{directory} holds no finished artefact ({MANIFEST} is absent): run that stage first."
+            f"{directory} holds no finished artifact ({MANIFEST} is absent): run that stage first."
         )
     value = read_json(path)
     names = {field.name for field in dataclasses.fields(Manifest)}
@@ -134,7 +134,7 @@ def finish(
     Args:
       seconds: wall time; `progress.seconds` counts interrupted attempts too.
       metrics: what was measured; a success rate as {"successes": k, "n": n}.
-      parents: the artefacts this one was made from.
+      parents: the artifacts this one was made from.
       origin: "trained", or "loaded" if its main content came from a checkpoint of another run.
     """
     return write_manifest(

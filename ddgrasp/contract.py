@@ -1,11 +1,14 @@
 """What every stage agrees on: joint order, shapes, units, rates, camera profile.
 
-This module imports the standard library alone, so that the robot side can use it.
-Change a value here and `CONTRACT_VERSION` with it: artefacts of another version are refused.
+This module imports the standard library alone, so that the robot side can use it. Which number of a vector
+is what: `ddgrasp.layout`.
+Change a value here and `CONTRACT_VERSION` with it: artifacts of another version are refused.
 """
 
 import math
 from dataclasses import dataclass, replace
+
+from ddgrasp.layout import ACTION, OBSERVATION, STATE
 
 CONTRACT_VERSION = 1
 
@@ -28,11 +31,11 @@ OBSERVATION_PARTS = {
 }  # fmt: skip
 """Teacher's observation, in order. Poses are position (m) + unit quaternion (w, x, y, z) in the world frame
 (robot base); the category is the logarithm of its id."""
-OBSERVATION_SIZE = sum(OBSERVATION_PARTS.values())
+OBSERVATION_SIZE = OBSERVATION.size
 """40."""
-STATE_SIZE = 8
+STATE_SIZE = STATE.size
 """Student: seven arm joint positions (rad) and the gripper's opening width (m)."""
-ACTION_SIZE = 8
+ACTION_SIZE = ACTION.size
 """a[:7] in [-1, 1] scaled joint deltas, a[7] gripper: > 0 closes, <= 0 opens."""
 ACTION_SCALE_RAD = 0.1
 """s in q_target = q + s * a[:7]: radians per control step."""

@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from functools import partial
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import Config
+from ddgrasp.layout import ACTION, QPOS
 from mjx_envs import randomize
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.render.visual import Viewer
@@ -23,44 +25,34 @@ Actor = Callable[["Scene"], np.ndarray]
 class Scene:
     """One control step of B environments, before the action is taken."""
 
-    depth_mm: np.ndarray
-    """(B, H, W) uint16, clean."""
-    state: np.ndarray
-    """(B, 8) joint positions and gripper width."""
-    expert: np.ndarray
-    """(B, 8) the teacher's action here: the label."""
-    observation: np.ndarray
-    """(B, 40)."""
-    held: np.ndarray
-    """(B,) bool, object in the hand."""
+    depth_mm: UInt16[np.ndarray, "B H W"]
+    """Clean."""
+    state: Float[np.ndarray, "B 8"]
+    """Joint positions and gripper width."""
+    expert: Float[np.ndarray, "B 8"]
+    """The teacher's action here: the label."""
+    observation: Float[np.ndarray, "B 40"]
+    held: Bool[np.ndarray, " B"]
+    """Object in the hand."""
     step: int
-    rgb: np.ndarray | None = None
-    """(B, H, W, 3) uint8."""
+    rgb: UInt8[np.ndarray, "B H W 3"] | None = None
 
 
 @dataclass
 class Episodes:
     """B episodes of equal allotted length T; `length` says how many steps of each count."""
 
-    depth_mm: np.ndarray
-    """(B, T, H, W) uint16."""
-    state: np.ndarray
-    """(B, T, 8)."""
-    action: np.ndarray
-    """(B, T, 8) the teacher's labels."""
-    observation: np.ndarray
-    """(B, T, 40)."""
-    held: np.ndarray
-    """(B, T) bool."""
-    length: np.ndarray
-    """(B,)."""
-    success: np.ndarray
-    """(B,) bool."""
-    object_index: np.ndarray
-    """(B,)."""
-    T_world_cam: np.ndarray
-    """(B, 4, 4)."""
-    rgb: np.ndarray | None = None
+    depth_mm: UInt16[np.ndarray, "B T H W"]
+    state: Float[np.ndarray, "B T 8"]
+    action: Float[np.ndarray, "B T 8"]
+    """The teacher's labels."""
+    observation: Float[np.ndarray, "B T 40"]
+    held: Bool[np.ndarray, "B T"]
+    length: Int[np.ndarray, " B"]
+    success: Bool[np.ndarray, " B"]
+    object_index: Int[np.ndarray, " B"]
+    T_world_cam: Float[np.ndarray, "B 4 4"]
+    rgb: UInt8[np.ndarray, "B T H W 3"] | None = None
 
 
 class Roller:
@@ -105,7 +97,7 @@ class Roller:
             scene = self._scene(state, cameras, t)
             scenes.append(scene)
             length += alive
-            state = self._advance(state, jp.asarray(actor(scene), jp.float32))
+            state = self._advance(state, jnp.asarray(actor(scene), jnp.float32))
             success |= alive & (np.asarray(state.metrics["success"]) > 0)
             alive &= np.asarray(state.done) == 0
             on_step(t)
@@ -139,20 +131,20 @@ class Roller:
     def _look_batch(self, state):
         return {
             "state": student_state(state.data.qpos),
-            "expert": self._teacher(state.obs, jp),
+            "expert": self._teacher(state.obs, jnp),
             "observation": state.obs,
             "held": state.info["episode"].grasped,
         }
 
     def _pose_batch(self, state):
         episode = state.info["episode"]
-        colours = jp.asarray(self.env.table.rgb, jp.float32)[episode.object_index]
+        colours = jnp.asarray(self.env.table.rgb, jnp.float32)[episode.object_index]
         return jax.vmap(self.viewer.geoms)(state.data.qpos, episode.params, colours)
 
 
-def student_state(qpos):
+def student_state(qpos: Float[jax.Array, "*batch 16"]) -> Float[jax.Array, "*batch 8"]:
     """(..., 8) what the student knows of the joints: seven positions and the gripper's width."""
-    return jp.concatenate([qpos[..., :7], qpos[..., 7:8] + qpos[..., 8:9]], axis=-1)
+    return jnp.concatenate([qpos[..., QPOS.arm], qpos[..., QPOS.fingers].sum(-1, keepdims=True)], axis=-1)
 
 
 def noisy_teacher(rng: np.random.Generator, count: int, noise: float, share: float) -> Actor:
@@ -170,7 +162,7 @@ def noisy_teacher(rng: np.random.Generator, count: int, noise: float, share: flo
     def actor(scene: Scene) -> np.ndarray:
         start = (left == 0) & (rng.random(count) < share)
         left[start] = 4
-        push[start, :7] = noise * rng.standard_normal((int(start.sum()), 7))
+        push[start, ACTION.arm] = noise * rng.standard_normal(push[start, ACTION.arm].shape)
         active = left > 0
         left[active] -= 1
         return np.clip(scene.expert + push * active[:, None], -1.0, 1.0)

@@ -11,6 +11,7 @@ from ddgrasp.progress import Progress
 from demos.rollout import Roller, noisy_teacher, successful
 from demos.store import EpisodeStore
 from ppo import policy as teacher_policy
+from ppo.policy import TeacherPolicy
 
 STORE = "episodes.zarr"
 _SEED = 30_000
@@ -28,7 +29,7 @@ def run(job: Job) -> Artifact:
     return job.finish(metrics)
 
 
-def collect(config: Config, teacher, store: EpisodeStore, progress: Progress) -> int:
+def collect(config: Config, teacher: TeacherPolicy, store: EpisodeStore, progress: Progress) -> int:
     """Fills `store` up to the configured number; returns how many episodes were tried."""
     demos = config.demos
     tried = 0

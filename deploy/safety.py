@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ddgrasp import contract
+from ddgrasp.layout import ACTION, closes
 from deploy import kinematics
 
 _BISECTIONS = 12
@@ -58,11 +59,11 @@ class SafetyFilter:
         self.limits = limits
         self.action_scale_rad = action_scale_rad
         self.counts = SafetyCounts()
-        self._last_step_rad = np.zeros(7)
+        self._last_step_rad = np.zeros(len(contract.ARM_JOINTS))
 
     def stopped(self) -> None:
         """The arm was told to hold: the next step accelerates from rest."""
-        self._last_step_rad = np.zeros(7)
+        self._last_step_rad = np.zeros(len(contract.ARM_JOINTS))
 
     def target(self, q_rad: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool, list[str]]:
         """Joint target for a measured position and an action.
@@ -81,14 +82,14 @@ class SafetyFilter:
         if action.shape != (contract.ACTION_SIZE,) or not np.isfinite(action).all():
             raise NonFiniteAction(f"action {np.array2string(action, precision=3)}")
         causes: list[str] = []
-        unit = self._noted(np.clip(action[:7], -1.0, 1.0), action[:7], "action", causes)
+        unit = self._noted(np.clip(action[ACTION.arm], -1.0, 1.0), action[ACTION.arm], "action", causes)
         step = unit.astype(float) * self.action_scale_rad
         step = self._limit_step(q_rad, step, causes)
         step = self._limit_workspace(q_rad, step, causes)
         self._last_step_rad = step
         self.counts.commands += 1
         self.counts.by_cause.update(causes)
-        return q_rad + step, bool(action[7] > 0), causes
+        return q_rad + step, bool(closes(action)), causes
 
     def _limit_step(self, q_rad: np.ndarray, step: np.ndarray, causes: list[str]) -> np.ndarray:
         """(7,) `step` within acceleration, velocity and position limits; the later one wins."""

@@ -9,6 +9,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from ddgrasp import contract
+from ddgrasp.layout import QPOS
 from evaluation.report import figures
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import Buffers, Camera, look_at
@@ -30,9 +31,9 @@ def look(spec: ObjectSpec) -> Buffers:
     model = scene.build_model(layout=layout)
     scene.fill_slots(model, spec, layout)
     data = mujoco.MjData(model)
-    data.qpos[:7] = scene.HOME_RAD
-    data.qpos[9:12] = (*contract.WORKSPACE_CENTER_M, spec.rest_height_m)
-    data.qpos[12:16] = kinematics.quat_about_z(np.asarray(YAW_RAD))
+    data.qpos[QPOS.arm] = scene.HOME_RAD
+    data.qpos[QPOS.object_pos] = (*contract.WORKSPACE_CENTER_M, spec.rest_height_m)
+    data.qpos[QPOS.object_quat] = kinematics.quat_about_z(np.asarray(YAW_RAD))
     mujoco.mj_kinematics(model, data)
     return raycast_numpy.render(model, data, close_camera(spec.rest_height_m))
 

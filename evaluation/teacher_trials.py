@@ -22,7 +22,7 @@ def summarise(result: Mapping[str, Any], teacher: str, world: WorldConfig, seed:
 
     Args:
       result: see there.
-      teacher: hash of the teacher's artefact.
+      teacher: hash of the teacher's artifact.
       world: where it was measured.
       seed: of the episodes.
 

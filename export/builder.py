@@ -9,6 +9,8 @@ from onnx import TensorProto, helper, numpy_helper
 OPSET = 18
 IR_VERSION = 10
 """Understood by every onnxruntime that understands OPSET; newer onnx would write a newer one."""
+Part = slice
+"""Named anew, since a method of the builder is called slice."""
 
 
 class GraphBuilder:
@@ -67,9 +69,13 @@ class GraphBuilder:
         """x[start:end] along each of the axes."""
         return self.op("Slice", x, self.integers(starts), self.integers(ends), self.integers(axes))
 
-    def columns(self, x: str, first: int, last: int) -> str:
-        """Columns first..last - 1 of (B, n)."""
-        return self.slice(x, [first], [last], [1])
+    def columns(self, x: str, part: Part) -> str:
+        """The columns of (B, n) in `part`, one of a `ddgrasp.layout`."""
+        return self.slice(x, [part.start], [part.stop], [1])
+
+    def column(self, x: str, index: int) -> str:
+        """(B, 1), one of (B, n)."""
+        return self.columns(x, slice(index, index + 1))
 
     def dense(self, x: str, params: dict) -> str:
         """Flax Dense on (B, n): x @ kernel + bias."""

@@ -6,6 +6,7 @@ from export.builder import GraphBuilder
 from export.hand_view_graph import write_grip, write_hand_view
 from export.layers import Params
 from student_jax import denoiser, encoder, policy
+from student_jax.policy import AUX, AUX_BESIDE
 
 
 def write_condition(
@@ -38,13 +39,13 @@ def write_condition(
     if student.head.aux_to_head:
         hidden = g.relu(g.dense(g.concat([features, *known], axis=1), params["aux_hidden"]))
         raw = g.dense(hidden, params["aux_output"])
-        position = g.columns(raw, 0, 3)
+        position = g.columns(raw, AUX.position)
         if student.hand_view.size_px:
-            offset = g.mul(g.columns(raw, 6, 9), g.constant(policy.BESIDE_SCALE))
-            near = g.op("Sigmoid", g.columns(raw, 9, 10))
+            offset = g.mul(g.columns(raw, AUX_BESIDE.beside), g.constant(policy.BESIDE_SCALE))
+            near = g.op("Sigmoid", g.columns(raw, AUX_BESIDE.near))
             far = g.op("Sub", g.constant(1.0), near)
             position = g.add(g.mul(near, g.add(grip, offset)), g.mul(far, position))
         beside = g.op("Div", g.op("Sub", position, grip), g.constant(policy.BESIDE_SCALE))
-        held = g.op("Sigmoid", g.columns(raw, 5, 6))
-        parts += [position, g.columns(raw, 3, 5), held, beside]
+        held = g.op("Sigmoid", g.columns(raw, AUX.held))
+        parts += [position, g.columns(raw, AUX.yaw), held, beside]
     return g.concat(parts, axis=1)

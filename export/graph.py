@@ -102,7 +102,7 @@ def write_picture(
     first = np.array(profile.crop_origin_px) + [window.rows.start, window.columns.start]
     last = first + [window.rows.length, window.columns.length]
     depth = g.slice(raw, first.tolist(), last.tolist(), [2, 3])
-    if export.depth_dtype == "uint16_mm":
+    if export.depth_dtype == "uint16_mm":  # as `ddgrasp.depth.to_metres`
         depth = g.mul(g.op("Cast", depth, to=TensorProto.FLOAT), g.constant(contract.DEPTH_UNIT_M))
     near = g.op("GreaterOrEqual", depth, g.constant(student.picture.min_depth_m))
     usable = g.op("And", near, g.op("LessOrEqual", depth, g.constant(student.picture.max_depth_m)))

@@ -13,11 +13,13 @@ from student_jax import hand_view
 
 def write_grip(g: GraphBuilder, state: str) -> str:
     """(B, 3) the point between the finger pads (m) from the raw state (B, 8): `policy.grip_position`."""
-    point = g.op("Expand", g.constant(hand_view.grip_tip()[None]), g.op("Shape", g.columns(state, 0, 3)))
+    point = g.op(
+        "Expand", g.constant(hand_view.grip_tip()[None]), g.op("Shape", g.columns(state, slice(0, 3)))
+    )
     for joint, (rotation, offset) in reversed(list(enumerate(hand_view.grip_chain()))):
-        angle = g.columns(state, joint, joint + 1)
+        angle = g.column(state, joint)
         cosine, sine = g.op("Cos", angle), g.op("Sin", angle)
-        x, y, z = (g.columns(point, i, i + 1) for i in range(3))
+        x, y, z = (g.column(point, i) for i in range(3))
         turned_x = g.op("Sub", g.mul(cosine, x), g.mul(sine, y))
         turned_y = g.add(g.mul(sine, x), g.mul(cosine, y))
         point = g.affine(g.concat([turned_x, turned_y, z], axis=1), rotation.T, offset)
@@ -44,12 +46,12 @@ def _write_cut(
     """(B, C, n, n) part of the picture around the hand, as `hand_view.place` and `hand_view.cut`."""
     view = hand_view.projection(profile, student)
     point = g.affine(grip, view.rotation.T, view.offset_m)
-    depth = g.op("Max", g.columns(point, 2, 3), g.constant(hand_view.MIN_CAMERA_DEPTH_M))
+    depth = g.op("Max", g.column(point, 2), g.constant(hand_view.MIN_CAMERA_DEPTH_M))
     origin = np.array(profile.crop_origin_px) * view.shrink
     samples = []
     for axis, (column, length) in enumerate(((1, student.picture.height_px), (0, student.picture.width_px))):
         per_metre = g.op("Div", g.constant(view.focal_px[axis]), depth)  # (B, 1)
-        centre = g.mul(g.columns(point, column, column + 1), per_metre)
+        centre = g.mul(g.column(point, column), per_metre)
         centre = g.add(centre, g.constant(view.centre_px[axis] - origin[axis]))
         samples.append(_write_sampling(g, centre, per_metre, length, student))
     rows, columns = samples

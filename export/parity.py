@@ -11,6 +11,7 @@ import onnxruntime as ort
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
+from ddgrasp.depth import to_metres, to_millimetres
 from student_jax import denoiser, preprocess
 
 HOLE_SHARE = 0.1
@@ -55,17 +56,12 @@ def run_onnx(session: ort.InferenceSession, inputs: Inputs) -> np.ndarray:
 
 def depth_in_metres(depth: np.ndarray) -> np.ndarray:
     """Raw depth of either type as float32 metres."""
-    if depth.dtype == np.uint16:
-        return depth.astype(np.float32) * np.float32(contract.DEPTH_UNIT_M)
-    return depth.astype(np.float32)
+    return to_metres(depth) if depth.dtype == np.uint16 else depth.astype(np.float32)
 
 
 def raw_depth(depth_m: np.ndarray, depth_dtype: str) -> np.ndarray:
     """Metres, 0 = invalid, as a camera of that type would give them."""
-    if depth_dtype == "float32_m":
-        return depth_m.astype(np.float32)
-    millimetres = np.nan_to_num(depth_m / contract.DEPTH_UNIT_M, posinf=0.0, neginf=0.0)
-    return np.clip(np.round(millimetres), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    return depth_m.astype(np.float32) if depth_dtype == "float32_m" else to_millimetres(depth_m)
 
 
 def random_frames(rng: np.random.Generator, batch: int, profile: CameraProfile) -> np.ndarray:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from ddgrasp.contract import D455
+from ddgrasp.depth import to_metres
 from foundation.depth_feature_noise import ProceduralConfig, corrupt
 from sensors.statistics import stats
 
@@ -46,12 +47,12 @@ Treatment = Callable[[Pool, int, np.random.Generator], np.ndarray]
 
 def _clean(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
     del rng
-    return _metres(pool.clean_mm[at])
+    return to_metres(pool.clean_mm[at])
 
 
 def _stereo(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
     del rng
-    return _metres(pool.stereo_mm[at])
+    return to_metres(pool.stereo_mm[at])
 
 
 def _procedural(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
@@ -67,12 +68,12 @@ def _procedural(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
         sticks=int(rng.integers(0, 9)),
     )
     profile = D455.scaled(pool.clean_mm.shape[2] / D455.width_px)
-    return corrupt(_metres(pool.clean_mm[at]), rng, profile, config)
+    return corrupt(to_metres(pool.clean_mm[at]), rng, profile, config)
 
 
 def _independent(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
     """Every pixel by itself: deviation that grows with the square of depth, and dropout."""
-    depth_m = _metres(pool.clean_mm[at])
+    depth_m = to_metres(pool.clean_mm[at])
     noise = 10 ** rng.uniform(-3.5, -2) * rng.standard_normal(depth_m.shape)
     keep = rng.random(depth_m.shape) >= 10 ** rng.uniform(-2.5, -0.5)
     return np.where(keep & (depth_m > 0), np.maximum(depth_m + noise * depth_m**2, 0.05), 0)
@@ -81,26 +82,26 @@ def _independent(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
 def _foreign_holes(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
     """Clean depth under the holes of another picture: right kind, wrong places."""
     other = int(rng.integers(len(pool)))
-    return np.where(pool.stereo_mm[other] > 0, _metres(pool.clean_mm[at]), 0)
+    return np.where(pool.stereo_mm[other] > 0, to_metres(pool.clean_mm[at]), 0)
 
 
 def _holes_alone(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
     """Clean depth under its own holes: no noise on surfaces."""
     del rng
-    return np.where(pool.stereo_mm[at] > 0, _metres(pool.clean_mm[at]), 0)
+    return np.where(pool.stereo_mm[at] > 0, to_metres(pool.clean_mm[at]), 0)
 
 
 def _filled(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
     """Holes replaced by what lies there: noise without holes."""
     del rng
-    return _metres(np.where(pool.stereo_mm[at] > 0, pool.stereo_mm[at], pool.clean_mm[at]))
+    return to_metres(np.where(pool.stereo_mm[at] > 0, pool.stereo_mm[at], pool.clean_mm[at]))
 
 
 def _smoothed(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
     """A sensor's picture as a blurry network would draw it: surfaces and hole outlines softened."""
     valid = (pool.stereo_mm[at] > 0).astype(np.float32)
     sigma = float(rng.uniform(0.7, 3.0))
-    total = cv2.GaussianBlur(_metres(pool.stereo_mm[at]), (0, 0), sigma)
+    total = cv2.GaussianBlur(to_metres(pool.stereo_mm[at]), (0, 0), sigma)
     weight = cv2.GaussianBlur(valid, (0, 0), sigma)
     return np.where(weight > 0.5, total / np.maximum(weight, 1e-3), 0)
 
@@ -145,7 +146,7 @@ def make_batch(pool: Pool, rows: np.ndarray, rng: np.random.Generator) -> Batch:
 
 def measure(pool: Pool, at: int, depth_m: np.ndarray) -> np.ndarray:
     """The regression targets of picture `at` after a treatment, in the order of MEASURED."""
-    clean_m = _metres(pool.clean_mm[at])
+    clean_m = to_metres(pool.clean_mm[at])
     inverse = _inverse(clean_m)
     edges = depth_edges(clean_m)
     layout = cv2.resize(inverse, GRID[::-1], interpolation=cv2.INTER_AREA)
@@ -169,10 +170,6 @@ def depth_edges(depth_m: np.ndarray) -> np.ndarray:
     inverse = _inverse(depth_m)
     span = cv2.morphologyEx(inverse, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     return span > EDGE_STEP * np.maximum(cv2.dilate(inverse, np.ones((3, 3), np.uint8)), 1e-6)
-
-
-def _metres(depth_mm: np.ndarray) -> np.ndarray:
-    return depth_mm.astype(np.float32) / 1000
 
 
 def _inverse(depth_m: np.ndarray) -> np.ndarray:

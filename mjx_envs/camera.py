@@ -1,11 +1,15 @@
 """Pinhole cameras: where they stand and what they see. NumPy alone."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Float64
 
 from ddgrasp import contract
+
+Point = Sequence[float | int] | Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Buffers(NamedTuple):
     """(H, W, 3) float32 outward unit normal in the world frame, zero where nothing is hit."""
 
 
-def look_at(position_m, target_m) -> np.ndarray:
+def look_at(position_m: Point, target_m: Point) -> Float64[np.ndarray, "4 4"]:
     """(4, 4) T_world_cam of a camera at `position_m` that faces `target_m`, image x axis level."""
     position = np.asarray(position_m, float)
     forward = np.asarray(target_m, float) - position

@@ -7,7 +7,7 @@ callbacks or foreign kernels included; what learns from all of them is left to X
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
@@ -42,4 +42,4 @@ def each(mesh: Mesh, function: Callable) -> Callable:
 def shard_index() -> jax.Array:
     """() int32 which share the traced code works on; -1 outside of `each`, where it works on the whole."""
     axes = jax.sharding.get_abstract_mesh().manual_axes
-    return jax.lax.axis_index(axes) if axes else jp.int32(-1)
+    return jax.lax.axis_index(axes) if axes else jnp.int32(-1)

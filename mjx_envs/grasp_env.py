@@ -7,15 +7,18 @@ them, or use `AutoReset`, which also draws a new episode where one ended.
 from dataclasses import replace
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 from flax import struct
 from jax.sharding import Mesh
+from jaxtyping import Float, Int
 from ml_collections import config_dict
 from mujoco import mjx
 from mujoco_playground._src import mjx_env
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import WorldConfig
+from ddgrasp.layout import ACTION, QPOS, QVEL, closes
 from mjx_envs import devices, grasp_math, kinematics, randomize, rewards, scene
 from mjx_envs.physics import interface as physics
 from mjx_envs.physics.backends import make_physics
@@ -72,15 +75,15 @@ class GraspEnv(mjx_env.MjxEnv):
         self.physics = make_physics(config.backend, config.sim_dt_s, self.table.layout)
         self._mj_model = scene.build_model(config.sim_dt_s, self.table.layout)
 
-    def reset(self, rng: jax.Array) -> mjx_env.State:
+    def reset(self, rng: randomize.Key) -> mjx_env.State:
         """A new episode: object, pose, dynamics and joints drawn from `rng`."""
         _, k_variant, k_params, k_qpos, k_start, k_next = jax.random.split(rng, 6)
         index = self.object_drawn(rng)
         variant = randomize.sample_variant(k_variant, self.config.random, self.table, index)
         params, size = randomize.sample_params(k_params, self.config.random, self.table, variant)
-        rest = jp.asarray(self.table.rest_height, jp.float32)[variant] * size
+        rest = jnp.asarray(self.table.rest_height, jnp.float32)[variant] * size
         qpos = randomize.sample_qpos(k_qpos, self.config.random, rest)
-        branch = grasp_math.yaw_branch(qpos[12:16], self._symmetry(variant), jp)
+        branch = grasp_math.yaw_branch(qpos[QPOS.object_quat], self._symmetry(variant), jnp)
         if self.config.random.pregrasp_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
             qpos = randomize.maybe_pregrasp(k_start, self.config.random, qpos, *grasp)
@@ -92,48 +95,50 @@ class GraspEnv(mjx_env.MjxEnv):
             rest_height=rest,
             branch=branch,
             distances=self._distances(state.qpos, variant, branch),
-            action=jp.zeros(contract.ACTION_SIZE).at[7].set(-1.0),
-            steps=jp.zeros((), jp.int32),
-            hold_count=jp.zeros((), jp.int32),
-            grasped=jp.zeros((), bool),
+            action=jnp.zeros(contract.ACTION_SIZE).at[ACTION.gripper].set(-1.0),
+            steps=jnp.zeros((), jnp.int32),
+            hold_count=jnp.zeros((), jnp.int32),
+            grasped=jnp.zeros((), bool),
             latency=self._latency(rng, qpos),
         )
         obs = self._get_obs(state, episode)
-        metrics = {f"reward/{name}": jp.zeros(()) for name in rewards.TERMS}
-        metrics |= {"success": jp.zeros(()), "saturated": jp.zeros(())}
-        info = {"episode": episode, "rng": k_next, "truncation": jp.zeros(())}
-        return mjx_env.State(state, obs, jp.zeros(()), jp.zeros(()), metrics, info)
+        metrics = {f"reward/{name}": jnp.zeros(()) for name in rewards.TERMS}
+        metrics |= {"success": jnp.zeros(()), "saturated": jnp.zeros(())}
+        info = {"episode": episode, "rng": k_next, "truncation": jnp.zeros(())}
+        return mjx_env.State(state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
 
-    def object_drawn(self, rng: jax.Array) -> jax.Array:
+    def object_drawn(self, rng: randomize.Key) -> Int[jax.Array, ""]:
         """() index of the object that `reset(rng)` takes."""
         return jax.random.randint(jax.random.split(rng, 6)[0], (), 0, len(self.table.names))
 
-    def step(self, state: mjx_env.State, action: jax.Array) -> mjx_env.State:
+    def step(self, state: mjx_env.State, action: Float[jax.Array, "8"]) -> mjx_env.State:
         """One control step with `action` (8,)."""
         old: physics.PhysicsState = state.data
         episode: Episode = state.info["episode"]
-        controls, latency = self._delayed(episode.latency, grasp_math.controls(old.qpos[:7], action, jp))
+        controls, latency = self._delayed(
+            episode.latency, grasp_math.controls(old.qpos[QPOS.arm], action, jnp)
+        )
         new = self.physics.step(episode.params, old, controls)
-        finite = jp.all(jp.isfinite(new.qpos)) & jp.all(jp.isfinite(new.qvel))
-        new = jax.tree.map(lambda a, b: jp.where(finite, a, b), new, old)
+        finite = jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel))
+        new = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
 
         distances = self._distances(new.qpos, episode.variant, episode.branch)
-        object_pos = new.qpos[9:12]
-        grasped = jp.all(new.touch > TOUCH_N) & (action[7] > 0)
-        held = jp.linalg.norm(object_pos - jp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
-        hold_count = jp.where(held & grasped, episode.hold_count + 1, 0)
+        object_pos = new.qpos[QPOS.object_pos]
+        grasped = jnp.all(new.touch > TOUCH_N) & closes(action)
+        held = jnp.linalg.norm(object_pos - jnp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
+        hold_count = jnp.where(held & grasped, episode.hold_count + 1, 0)
         terms = rewards.terms(
             self.config.reward,
             rewards.Transition(
                 before=episode.distances, after=distances, action=action, last_action=episode.action,
-                acceleration=(new.qvel[:7] - old.qvel[:7]) / contract.CONTROL_DT_S,
+                acceleration=(new.qvel[QVEL.arm] - old.qvel[QVEL.arm]) / contract.CONTROL_DT_S,
                 grasped=grasped, lifted=grasped & (object_pos[2] > episode.rest_height + LIFTED_M),
                 hold_count=hold_count,
             ),
         )  # fmt: skip
         steps = episode.steps + 1
-        center = jp.asarray(contract.WORKSPACE_CENTER_M)
-        lost = jp.linalg.norm(object_pos[:2] - center) > OUT_OF_REACH_M
+        center = jnp.asarray(contract.WORKSPACE_CENTER_M)
+        lost = jnp.linalg.norm(object_pos[:2] - center) > OUT_OF_REACH_M
         lost = (lost & ~grasped) | ~finite
         over = steps >= self.config.episode_steps
         episode = replace(
@@ -141,29 +146,29 @@ class GraspEnv(mjx_env.MjxEnv):
             latency=latency,
         )  # fmt: skip
         metrics = {f"reward/{name}": value for name, value in terms.items()}
-        metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jp.float32)
-        metrics["saturated"] = jp.mean(jp.abs(action[:7]) > 0.95)
-        info = state.info | {"episode": episode, "truncation": (over & ~lost).astype(jp.float32)}
+        metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jnp.float32)
+        metrics["saturated"] = jnp.mean(jnp.abs(action[ACTION.arm]) > 0.95)
+        info = state.info | {"episode": episode, "truncation": (over & ~lost).astype(jnp.float32)}
         return replace(
             state,
             data=new,
             obs=self._get_obs(new, episode),
-            reward=jp.sum(jp.stack(list(terms.values()))),
-            done=(over | lost).astype(jp.float32),
+            reward=jnp.sum(jnp.stack(list(terms.values()))),
+            done=(over | lost).astype(jnp.float32),
             metrics=metrics,
             info=info,
         )
 
     def _get_obs(self, state: physics.PhysicsState, episode: Episode) -> jax.Array:
-        log_category = jp.asarray(self.table.log_category, jp.float32)[episode.variant]
+        log_category = jnp.asarray(self.table.log_category, jnp.float32)[episode.variant]
         symmetry, offset = self._symmetry(episode.variant), self._grasp_offset(episode.variant)
         return grasp_math.observation(
-            state.qpos, state.qvel, symmetry, episode.branch, log_category, jp, offset
+            state.qpos, state.qvel, symmetry, episode.branch, log_category, jnp, offset
         )
 
     def _distances(self, qpos, variant, branch) -> rewards.Distances:
         grasp_pos, grasp_quat = self._grasp_pose(qpos, variant, branch)
-        return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[:7], jp))
+        return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[QPOS.arm], jnp))
 
     def _latency(self, rng, qpos) -> Latency | None:
         """At the start: the robot holds its pose, gripper open."""
@@ -171,24 +176,25 @@ class GraspEnv(mjx_env.MjxEnv):
         if share == 0:
             return None
         late = jax.random.uniform(jax.random.fold_in(rng, 1)) < share
-        return Latency(late, grasp_math.controls(qpos[:7], jp.zeros(contract.ACTION_SIZE), jp))
+        return Latency(late, grasp_math.controls(qpos[QPOS.arm], jnp.zeros(contract.ACTION_SIZE), jnp))
 
     def _delayed(self, latency: Latency | None, controls) -> tuple[jax.Array, Latency | None]:
         """The controls in force now, and what is on its way then."""
         if latency is None:
             return controls, None
-        now = jp.where(latency.late, latency.controls, controls)
+        now = jnp.where(latency.late, latency.controls, controls)
         return now, replace(latency, controls=controls)
 
     def _grasp_pose(self, qpos, variant, branch) -> tuple[jax.Array, jax.Array]:
         symmetry, offset = self._symmetry(variant), self._grasp_offset(variant)
-        return grasp_math.grasp_pose(qpos[9:12], qpos[12:16], symmetry, branch, jp, offset)
+        pose = qpos[QPOS.object_pos], qpos[QPOS.object_quat]
+        return grasp_math.grasp_pose(*pose, symmetry, branch, jnp, offset)
 
     def _symmetry(self, variant) -> jax.Array:
-        return jp.asarray(self.table.symmetry)[variant]
+        return jnp.asarray(self.table.symmetry)[variant]
 
     def _grasp_offset(self, variant) -> jax.Array:
-        return jp.asarray(self.table.grasp_offset, jp.float32)[variant]
+        return jnp.asarray(self.table.grasp_offset, jnp.float32)[variant]
 
     @property
     def xml_path(self) -> str:
@@ -227,8 +233,8 @@ class AutoReset:
         """Batch of new episodes from keys (B, 2), at staggered times so that they do not end together."""
         state = devices.each(self.mesh, self.env.reset)(rng)
         episode = state.info["episode"]
-        stagger = jp.arange(rng.shape[0]) % self.env.config.episode_steps
-        info = state.info | {"episode": replace(episode, steps=stagger.astype(jp.int32))}
+        stagger = jnp.arange(rng.shape[0]) % self.env.config.episode_steps
+        info = state.info | {"episode": replace(episode, steps=stagger.astype(jnp.int32))}
         return self.refresh(replace(state, info=info))
 
     def refresh(self, state: mjx_env.State) -> mjx_env.State:
@@ -237,14 +243,14 @@ class AutoReset:
         waiting = (fresh.data, fresh.obs, fresh.info["episode"])
         return replace(state, info=state.info | {"next": waiting, "rng": fresh.info["rng"]})
 
-    def step(self, state: mjx_env.State, action: jax.Array) -> mjx_env.State:
+    def step(self, state: mjx_env.State, action: Float[AnyArray, "b 8"]) -> mjx_env.State:
         """One control step of the batch with `action` (B, 8)."""
         waiting = state.info["next"]
         bare = {k: v for k, v in state.info.items() if k != "next"}
         state = devices.each(self.mesh, self.env.step)(replace(state, info=bare), action)
 
         def pick(new, old):
-            return jp.where(state.done.reshape((-1,) + (1,) * (old.ndim - 1)) > 0, new, old)
+            return jnp.where(state.done.reshape((-1,) + (1,) * (old.ndim - 1)) > 0, new, old)
 
         ended = (state.data, state.obs, state.info["episode"])
         data, obs, episode = jax.tree.map(pick, waiting, ended)

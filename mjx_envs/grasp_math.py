@@ -3,9 +3,13 @@
 from types import ModuleType
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
+from ddgrasp.layout import ACTION, QPOS, closes
 from mjx_envs import kinematics as kin
+from mjx_envs import scene
 
 HAND_DOWN = (0.0, 1.0, 0.0, 0.0)
 """Hand orientation with the fingers down and opening along world y."""
@@ -14,8 +18,15 @@ MIN_GRIP_HEIGHT_M = 0.02
 
 NO_OFFSET_M = (0.0, 0.0, 0.0)
 
+Symmetry = Int[AnyArray, "*batch"] | int
+"""Equivalent yaws per turn, 0 = any."""
+Branch = Float[AnyArray, "*batch"] | float
+Offset = Float[AnyArray, "*batch 3"] | tuple[float, float, float]
 
-def yaw_branch(object_quat, symmetry, xp: ModuleType = np):
+
+def yaw_branch(
+    object_quat: Float[AnyArray, "*batch 4"], symmetry: Symmetry, xp: ModuleType = np
+) -> Float[AnyArray, "*batch"]:
     """() multiple of 2 pi / symmetry to add to the object's yaw so that the hand turns least.
 
     Chosen once per episode, so that the target does not jump while the object moves.
@@ -24,7 +35,14 @@ def yaw_branch(object_quat, symmetry, xp: ModuleType = np):
     return -xp.round(kin.yaw_of(object_quat, xp) / turn)
 
 
-def grasp_pose(object_pos, object_quat, symmetry, branch, xp: ModuleType = np, offset_m=NO_OFFSET_M):
+def grasp_pose(
+    object_pos: Float[AnyArray, "*batch 3"],
+    object_quat: Float[AnyArray, "*batch 4"],
+    symmetry: Symmetry,
+    branch: Branch,
+    xp: ModuleType = np,
+    offset_m: Offset = NO_OFFSET_M,
+) -> tuple[Float[AnyArray, "*batch 3"], Float[AnyArray, "*batch 4"]]:
     """((3,), (4,)) top-down grasp: pads close along the object's local y axis.
 
     Args:
@@ -42,19 +60,29 @@ def grasp_pose(object_pos, object_quat, symmetry, branch, xp: ModuleType = np, o
     return xp.concatenate([pos[..., :2], height[..., None]], axis=-1), canonical(quat, 1, xp)
 
 
-def canonical(quat, axis: int, xp: ModuleType = np):
+def canonical(
+    quat: Float[AnyArray, "*batch 4"], axis: int, xp: ModuleType = np
+) -> Float[AnyArray, "*batch 4"]:
     """The one of +-quat whose component `axis` is not negative: the same rotation, one number."""
     return xp.where(quat[..., axis : axis + 1] < 0, -quat, quat)
 
 
-def observation(qpos, qvel, symmetry, branch, log_category, xp: ModuleType = np, offset_m=NO_OFFSET_M):
-    """(40,) teacher observation (ddgrasp.contract.OBSERVATION_SIZE lists its parts)."""
-    grip_pos, grip_quat = kin.grip_pose(qpos[..., :7], xp)
-    object_pos, object_quat = qpos[..., 9:12], qpos[..., 12:16]
+def observation(
+    qpos: Float[AnyArray, "*batch 16"],
+    qvel: Float[AnyArray, "*batch 15"],
+    symmetry: Symmetry,
+    branch: Branch,
+    log_category: Float[AnyArray, "*batch"] | float,
+    xp: ModuleType = np,
+    offset_m: Offset = NO_OFFSET_M,
+) -> Float[AnyArray, "*batch 40"]:
+    """(40,) teacher observation (`ddgrasp.layout.OBSERVATION` lists its parts)."""
+    grip_pos, grip_quat = kin.grip_pose(qpos[..., QPOS.arm], xp)
+    object_pos, object_quat = qpos[..., QPOS.object_pos], qpos[..., QPOS.object_quat]
     grasp_pos, grasp_quat = grasp_pose(object_pos, object_quat, symmetry, branch, xp, offset_m)
     return xp.concatenate(
         [
-            qpos[..., :9], qvel[..., :9],
+            qpos[..., : scene.N_ROBOT], qvel[..., : scene.N_ROBOT],
             grip_pos, canonical(grip_quat, 1, xp),
             object_pos, canonical(object_quat, 0, xp),
             grasp_pos, grasp_quat,
@@ -64,9 +92,11 @@ def observation(qpos, qvel, symmetry, branch, log_category, xp: ModuleType = np,
     )  # fmt: skip
 
 
-def controls(q_arm, action, xp: ModuleType = np):
+def controls(
+    q_arm: Float[AnyArray, "*batch 7"], action: Float[AnyArray, "*batch 8"], xp: ModuleType = np
+) -> Float[AnyArray, "*batch 9"]:
     """(9,) actuator targets of an action (8,): clipped joint targets and the fingers' opening."""
-    target = q_arm + contract.ACTION_SCALE_RAD * xp.clip(action[..., :7], -1.0, 1.0)
+    target = q_arm + contract.ACTION_SCALE_RAD * xp.clip(action[..., ACTION.arm], -1.0, 1.0)
     target = xp.clip(target, xp.asarray(contract.JOINT_LOWER_RAD), xp.asarray(contract.JOINT_UPPER_RAD))
-    finger = xp.where(action[..., 7:8] > 0, 0.0, contract.GRIPPER_MAX_WIDTH_M / 2)
+    finger = xp.where(closes(action)[..., None], 0.0, contract.GRIPPER_MAX_WIDTH_M / 2)
     return xp.concatenate([target, finger, finger], axis=-1)

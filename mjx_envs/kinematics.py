@@ -7,11 +7,22 @@ leading batch dimensions. This module imports NumPy alone.
 from types import ModuleType
 
 import numpy as np
+from jaxtyping import Float
 
+from ddgrasp.arrays import AnyArray
+from ddgrasp.layout import QPOS
 from mjx_envs import scene
 
+Quats = Float[AnyArray, "*#batch 4"]
+Vectors = Float[AnyArray, "*#batch 3"]
+"""Batches that NumPy's rules make alike."""
+Pose = tuple[Float[AnyArray, "*batch 3"], Float[AnyArray, "*batch 4"]]
+"""Position (m) and unit quaternion in the world."""
+_FINGER_TURNS = {"left_finger": (1.0, 0, 0, 0), "right_finger": (0.0, 0, 0, 1)}
+"""Quaternions in the hand's frame; a finger moves along its own y axis."""
 
-def quat_mul(a, b, xp: ModuleType = np):
+
+def quat_mul(a: Quats, b: Quats, xp: ModuleType = np) -> Quats:
     """(..., 4) Hamilton product a * b."""
     aw, ax, ay, az = (a[..., i] for i in range(4))
     bw, bx, by, bz = (b[..., i] for i in range(4))
@@ -26,49 +37,51 @@ def quat_mul(a, b, xp: ModuleType = np):
     )
 
 
-def quat_conj(q, xp: ModuleType = np):
+def quat_conj(q: Float[AnyArray, "*batch 4"], xp: ModuleType = np) -> Float[AnyArray, "*batch 4"]:
     """(..., 4) conjugate = inverse of a unit quaternion."""
     return xp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
-def rotate(q, v, xp: ModuleType = np):
+def rotate(q: Quats, v: Vectors, xp: ModuleType = np) -> Vectors:
     """(..., 3) vector v turned by the unit quaternion q."""
     u = q[..., 1:]
     t = 2.0 * xp.cross(u, v)
     return v + q[..., :1] * t + xp.cross(u, t)
 
 
-def quat_to_mat(q, xp: ModuleType = np):
+def quat_to_mat(q: Float[AnyArray, "*batch 4"], xp: ModuleType = np) -> Float[AnyArray, "*batch 3 3"]:
     """(..., 3, 3) rotation matrix of a unit quaternion."""
     columns = [rotate(q, xp.broadcast_to(xp.eye(3)[i], q.shape[:-1] + (3,)), xp) for i in range(3)]
     return xp.stack(columns, axis=-1)
 
 
-def quat_about_z(angle_rad, xp: ModuleType = np):
+def quat_about_z(angle_rad: Float[AnyArray, "*batch"], xp: ModuleType = np) -> Float[AnyArray, "*batch 4"]:
     """(..., 4) rotation about the z axis."""
     zero = xp.zeros_like(angle_rad)
     return xp.stack([xp.cos(angle_rad / 2), zero, zero, xp.sin(angle_rad / 2)], axis=-1)
 
 
-def quat_from_rotation_vector(vector_rad, xp: ModuleType = np):
+def quat_from_rotation_vector(
+    vector_rad: Float[AnyArray, "*batch 3"], xp: ModuleType = np
+) -> Float[AnyArray, "*batch 4"]:
     """(..., 4) rotation by |vector| about the vector (..., 3)."""
     half = xp.linalg.norm(vector_rad, axis=-1, keepdims=True) / 2
     return xp.concatenate([xp.cos(half), vector_rad / 2 * xp.sinc(half / np.pi)], axis=-1)
 
 
-def yaw_of(q, xp: ModuleType = np):
+def yaw_of(q: Float[AnyArray, "*batch 4"], xp: ModuleType = np) -> Float[AnyArray, "*batch"]:
     """(...,) angle about world z of the horizontal projection of the turned x axis."""
     w, x, y, z = (q[..., i] for i in range(4))
     return xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def angle_between(a, b, xp: ModuleType = np):
+def angle_between(a: Quats, b: Quats, xp: ModuleType = np) -> Float[AnyArray, "*#batch"]:
     """(...,) angle (rad, 0..pi) of the rotation from unit quaternion a to b."""
     dot = xp.abs(xp.sum(a * b, axis=-1))
     return 2.0 * xp.arccos(xp.clip(dot, 0.0, 1.0 - 1e-7))
 
 
-def body_poses(qpos, xp: ModuleType = np) -> dict:
+def body_poses(qpos: Float[AnyArray, "*batch joints"], xp: ModuleType = np) -> dict[str, Pose]:
     """World pose of every moving body: name -> ((..., 3) position m, (..., 4) quaternion).
 
     Args:
@@ -76,17 +89,18 @@ def body_poses(qpos, xp: ModuleType = np) -> dict:
     """
     batch = qpos.shape[:-1]
     zero = xp.zeros(batch + (3,)), xp.broadcast_to(xp.asarray([1.0, 0.0, 0.0, 0.0]), batch + (4,))
-    positions, quats = _arm_chain(zero, xp.moveaxis(qpos[..., : scene.N_ARM], -1, 0), xp)
+    positions, quats = _arm_chain(zero, xp.moveaxis(qpos[..., QPOS.arm], -1, 0), xp)
     poses = {"link0": zero}
     poses |= {link.name: (positions[i], quats[i]) for i, link in enumerate(scene.ARM_LINKS)}
     hand_pos, hand_quat = _child(positions[-1], quats[-1], scene.HAND_POS_M, scene.HAND_QUAT, xp)
     poses["hand"] = hand_pos, hand_quat
-    for name, turn, index in (("left_finger", (1.0, 0, 0, 0), 7), ("right_finger", (0.0, 0, 0, 1), 8)):
+    fingers = zip(_FINGER_TURNS.items(), range(QPOS.fingers.start, QPOS.fingers.stop), strict=True)
+    for (name, turn), index in fingers:
         pos, quat = _child(hand_pos, hand_quat, scene.FINGER_POS_M, turn, xp)
         slide = qpos[..., index, None] * xp.asarray([0.0, 1.0, 0.0])
         poses[name] = (pos + rotate(quat, slide, xp), quat)
     if qpos.shape[-1] > scene.N_ROBOT:
-        poses["object"] = (qpos[..., 9:12], qpos[..., 12:16])
+        poses["object"] = (qpos[..., QPOS.object_pos], qpos[..., QPOS.object_quat])
     return poses
 
 
@@ -119,7 +133,9 @@ def _arm_chain(base, joints, xp):
     return np.stack([p for p, _ in poses]), np.stack([q for _, q in poses])
 
 
-def grip_pose(q_arm, xp: ModuleType = np):
+def grip_pose(
+    q_arm: Float[AnyArray, "*batch 7"], xp: ModuleType = np
+) -> tuple[Float[AnyArray, "*batch 3"], Float[AnyArray, "*batch 4"]]:
     """((..., 3) position m, (..., 4) quaternion) of the site between the finger pads.
 
     Args:

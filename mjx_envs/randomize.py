@@ -1,16 +1,23 @@
 """What differs from episode to episode: object, its pose and size, dynamics, joints, camera."""
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float, Int, PRNGKeyArray, UInt32
 
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import RandomConfig
+from ddgrasp.layout import QPOS
 from mjx_envs import draws, inverse_kinematics, scene
 from mjx_envs.object_spec import ObjectModel, slot_layout
 from mjx_envs.objects import get_object
 from mjx_envs.physics.interface import ModelParams
 
 PREGRASP_HEIGHT_M = 0.15
+
+Key = PRNGKeyArray | UInt32[Array, "2"]
+Index = Int[AnyArray, ""] | int
 
 
 class ObjectTable:
@@ -34,15 +41,15 @@ class ObjectTable:
         self.grasp_offset = np.array([s.grasp_offset_m for s in specs])
 
 
-def sample_variant(key: jax.Array, config: RandomConfig, table: ObjectTable, index) -> jax.Array:
+def sample_variant(key: Key, config: RandomConfig, table: ObjectTable, index: Index) -> Int[Array, ""]:
     """() index into the table's arrays of object `index`, in one of its rest poses."""
     other = jax.random.uniform(key) < config.other_pose_share
-    return jp.where(other, jp.asarray(table.other_variant)[index], index)
+    return jnp.where(other, jnp.asarray(table.other_variant)[index], index)
 
 
 def sample_params(
-    key: jax.Array, config: RandomConfig, table: ObjectTable, variant
-) -> tuple[ModelParams, jax.Array]:
+    key: Key, config: RandomConfig, table: ObjectTable, variant: Index
+) -> tuple[ModelParams, Float[Array, ""]]:
     """Model parameters of one episode with `variant` of the table; also the object's size factor ()."""
     keys = jax.random.split(key, 7)
     arm = (scene.N_ARM,)
@@ -58,7 +65,7 @@ def sample_params(
             stiffness=_unit(keys[6], arm),
         ),
     )
-    nominal = jax.tree.map(lambda a: jp.asarray(a, jp.float32)[variant], table.model)
+    nominal = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32)[variant], table.model)
     made = nominal.scaled(drawn.size, drawn.object_mass, drawn.object_friction)
     params = ModelParams(
         slot_size=made.slot_size,
@@ -75,34 +82,37 @@ def sample_params(
     return params, drawn.size
 
 
-def sample_qpos(key: jax.Array, config: RandomConfig, rest_height_m) -> jax.Array:
+def sample_qpos(key: Key, config: RandomConfig, rest_height_m: Float[Array, ""]) -> Float[Array, "16"]:
     """(16,) initial joints around home, gripper open, object on the table with any yaw."""
     k_joint, k_xy, k_yaw = jax.random.split(key, 3)
     joints, xy = _unit(k_joint, (scene.N_ARM,)), _unit(k_xy, (2,))
-    yaw = jax.random.uniform(k_yaw, (), minval=-jp.pi, maxval=jp.pi)
-    return draws.start_qpos(config, joints, xy, yaw, rest_height_m, jp)
+    yaw = jax.random.uniform(k_yaw, (), minval=-jnp.pi, maxval=jnp.pi)
+    return draws.start_qpos(config, joints, xy, yaw, rest_height_m, jnp)
 
 
-def maybe_pregrasp(key: jax.Array, config: RandomConfig, qpos: jax.Array, grasp_pos, grasp_quat) -> jax.Array:
+def maybe_pregrasp(
+    key: Key, config: RandomConfig, qpos: Float[Array, "16"], grasp_pos: Float[Array, "3"],
+    grasp_quat: Float[Array, "4"],
+) -> Float[Array, "16"]:  # fmt: skip
     """qpos (16,) with the hand, in a share of the episodes, up to PREGRASP_HEIGHT_M above the grasp pose."""
     k_choice, k_offset = jax.random.split(key)
     offset = _unit(k_offset, (3,))
     height = PREGRASP_HEIGHT_M * (0.5 + 0.5 * offset[2])
-    target = grasp_pos + jp.stack([0.005 * offset[0], 0.005 * offset[1], height])
-    joints = inverse_kinematics.solve(qpos[:7], target, grasp_quat)
+    target = grasp_pos + jnp.stack([0.005 * offset[0], 0.005 * offset[1], height])
+    joints = inverse_kinematics.solve(qpos[QPOS.arm], target, grasp_quat)
     chosen = jax.random.uniform(k_choice) < config.pregrasp_share
-    return qpos.at[:7].set(jp.where(chosen, joints, qpos[:7]))
+    return qpos.at[QPOS.arm].set(jnp.where(chosen, joints, qpos[QPOS.arm]))
 
 
-def sample_camera(key: jax.Array, config: RandomConfig, T_world_cam) -> jax.Array:
+def sample_camera(key: Key, config: RandomConfig, T_world_cam: Float[AnyArray, "4 4"]) -> Float[Array, "4 4"]:
     """(4, 4) the nominal camera pose, moved and turned within the configured range."""
     k_pos, k_rot = jax.random.split(key)
     rx, ry, rz = config.camera_angle_rad * _unit(k_rot, (3,))
     # First-order rotation, made orthonormal: the angles are a few hundredths of a radian.
-    turn = jp.array([1.0, rx / 2, ry / 2, rz / 2])
-    turn = turn / jp.linalg.norm(turn)
-    T = jp.asarray(T_world_cam, jp.float32)
-    return draws.displaced(T, config.camera_position_m * _unit(k_pos, (3,)), turn, jp)
+    turn = jnp.array([1.0, rx / 2, ry / 2, rz / 2])
+    turn = turn / jnp.linalg.norm(turn)
+    T = jnp.asarray(T_world_cam, jnp.float32)
+    return draws.displaced(T, config.camera_position_m * _unit(k_pos, (3,)), turn, jnp)
 
 
 def _unit(key: jax.Array, shape: tuple[int, ...] = ()) -> jax.Array:

@@ -1,11 +1,14 @@
 """The teacher's reward: raw terms times weights, each a pure function of arrays (paper III-A3)."""
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 from flax import struct
+from jax import Array
+from jaxtyping import Float
 
 from ddgrasp import contract
 from ddgrasp.config import RewardConfig
+from ddgrasp.layout import ACTION, QPOS, closes
 from mjx_envs import grasp_math, kinematics
 
 TERMS = ("reach", "lift", "orient", "bonus", "accel", "align", "grasp", "saturation", "toggle")
@@ -47,43 +50,50 @@ class Transition:
     hold_count: jax.Array
 
 
-def distances(qpos, grasp_pos, grasp_quat, grip_pose) -> Distances:
+def distances(
+    qpos: Float[Array, "16"],
+    grasp_pos: Float[Array, "3"],
+    grasp_quat: Float[Array, "4"],
+    grip_pose: tuple[Float[Array, "3"], Float[Array, "4"]],
+) -> Distances:
     """`Distances` in the configuration qpos (16,)."""
     grip_pos, grip_quat = grip_pose
     return Distances(
-        hand=jp.minimum(approach_distance(grip_pos, grasp_pos), MAX_DISTANCE_M),
-        object=jp.minimum(jp.linalg.norm(qpos[9:12] - jp.asarray(contract.LIFT_TARGET_M)), MAX_DISTANCE_M),
-        grasp_angle=kinematics.angle_between(grip_quat, grasp_quat, jp),
-        upright_angle=kinematics.angle_between(grip_quat, jp.asarray(grasp_math.HAND_DOWN), jp),
+        hand=jnp.minimum(approach_distance(grip_pos, grasp_pos), MAX_DISTANCE_M),
+        object=jnp.minimum(
+            jnp.linalg.norm(qpos[QPOS.object_pos] - jnp.asarray(contract.LIFT_TARGET_M)), MAX_DISTANCE_M
+        ),
+        grasp_angle=kinematics.angle_between(grip_quat, grasp_quat, jnp),
+        upright_angle=kinematics.angle_between(grip_quat, jnp.asarray(grasp_math.HAND_DOWN), jnp),
     )
 
 
-def approach_distance(grip_pos, grasp_pos) -> jax.Array:
+def approach_distance(grip_pos: Float[Array, "3"], grasp_pos: Float[Array, "3"]) -> Float[Array, ""]:
     """() m to the grasp; to a point above it while the hand is off to the side.
 
     The paper's d_hand is the plain distance. Its gradient drives the fingers through the object
     from the side; this funnel makes the teacher come from above, which a camera can watch.
     """
-    lateral = jp.linalg.norm(grip_pos[:2] - grasp_pos[:2] + 1e-6)
-    above = jp.minimum(FUNNEL_HEIGHT_M, FUNNEL_SLOPE * jp.maximum(lateral - FUNNEL_FREE_M, 0.0))
+    lateral = jnp.linalg.norm(grip_pos[:2] - grasp_pos[:2] + 1e-6)
+    above = jnp.minimum(FUNNEL_HEIGHT_M, FUNNEL_SLOPE * jnp.maximum(lateral - FUNNEL_FREE_M, 0.0))
     height = grip_pos[2] - (grasp_pos[2] + above)
-    return lateral + jp.abs(height)
+    return lateral + jnp.abs(height)
 
 
-def terms(weights: RewardConfig, t: Transition) -> dict[str, jax.Array]:
+def terms(weights: RewardConfig, t: Transition) -> dict[str, Float[Array, ""]]:
     """Weighted reward terms, by name; their sum is the reward (paper Eq. 2)."""
-    grasped, lifted = t.grasped.astype(jp.float32), t.lifted.astype(jp.float32)
-    count = jp.minimum(t.hold_count, weights.bonus_max_count)
-    excess = jp.maximum(jp.abs(t.action[:7]) - 0.8, 0.0)
-    toggled = (t.action[7] > 0) != (t.last_action[7] > 0)
+    grasped, lifted = t.grasped.astype(jnp.float32), t.lifted.astype(jnp.float32)
+    count = jnp.minimum(t.hold_count, weights.bonus_max_count)
+    excess = jnp.maximum(jnp.abs(t.action[ACTION.arm]) - 0.8, 0.0)
+    toggled = closes(t.action) != closes(t.last_action)
     return {
         "reach": weights.reach * (t.before.hand - t.after.hand) * (1 - grasped),
         "lift": weights.lift * grasped * (t.before.object - t.after.object),
         "orient": weights.orient * lifted * (t.before.upright_angle - t.after.upright_angle),
         "bonus": (t.hold_count > 0) * weights.bonus_base * weights.bonus_growth**count,
-        "accel": -weights.accel * jp.sum(t.acceleration**2),
+        "accel": -weights.accel * jnp.sum(t.acceleration**2),
         "align": weights.align * (t.before.grasp_angle - t.after.grasp_angle) * (1 - lifted),
         "grasp": weights.grasp * grasped,
-        "saturation": -weights.saturation * jp.sum((excess / 0.2) ** 2),
+        "saturation": -weights.saturation * jnp.sum((excess / 0.2) ** 2),
         "toggle": -weights.toggle * toggled,
     }

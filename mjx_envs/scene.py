@@ -6,11 +6,15 @@ Identification of the Franka Emika Panda Robot", RA-L 2019. Geometry is our own:
 """
 
 from dataclasses import dataclass
+from types import ModuleType
 
 import mujoco
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
+from ddgrasp.layout import CONTROLS, QPOS, QVEL
 from mjx_envs.object_spec import DEFAULT_SLOTS, ObjectSpec, SlotLayout
 from mjx_envs.objects import OBJECTS
 
@@ -82,7 +86,8 @@ FINGER_ARMATURE_KG = 1.0
 PAD_FRICTION = 1.0
 JOINT_DAMPING_NMS_RAD = 1.0
 
-N_ARM, N_ROBOT, NQ, NV, NU = 7, 9, 16, 15, 9
+N_ARM, N_ROBOT = QPOS.arm.stop, QPOS.fingers.stop
+NQ, NV, NU = QPOS.size, QVEL.size, CONTROLS.size
 
 
 def _arm_xml(depth: int = 0) -> str:
@@ -244,7 +249,9 @@ def fill_slots(
     model.body_inertia[body] = made.inertia_kg_m2
 
 
-def slot_bounding_radii(size, is_capsule, xp=np):
+def slot_bounding_radii(
+    size: Float[AnyArray, "*batch slots 3"], is_capsule: Bool[np.ndarray, " slots"], xp: ModuleType = np
+) -> Float[AnyArray, "*batch slots"]:
     """(..., S) radii of spheres that hold slots of `size` (..., S, 3); `is_capsule` (S,) bool."""
     return xp.sqrt(xp.sum(size**2, axis=-1)) + size[..., 1] * is_capsule
 

@@ -3,6 +3,7 @@
 import jax
 from mujoco_playground import State
 
+from ddgrasp.layout import QVEL
 from mjx_envs.grasp_env import GraspEnv
 from ppo.motion import motion_metrics
 from ppo.policy import TeacherPolicy
@@ -11,7 +12,7 @@ from ppo.rollout import roll_out
 
 def motion_of(before: State, action: jax.Array, after: State) -> dict[str, jax.Array]:
     """What `motion_metrics` needs of a step (`ppo.rollout.Keep`): velocities (N, 7), actions (N, 8)."""
-    return {"velocity_rad_s": after.data.qvel[:, :7], "action": action}
+    return {"velocity_rad_s": after.data.qvel[:, QVEL.arm], "action": action}
 
 
 def evaluate(env: GraspEnv, policy: TeacherPolicy, trials: int, seed: int) -> dict:

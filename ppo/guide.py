@@ -6,9 +6,11 @@ and its motions are what a student can copy: from above, unhurried, the object i
 """
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
+from jaxtyping import Float
 
 from ddgrasp import contract
+from ddgrasp.layout import OBSERVATION
 from mjx_envs import inverse_kinematics, kinematics
 
 REACH_STEP_M, LIFT_STEP_M = 0.04, 0.045
@@ -22,28 +24,29 @@ NEAR_M = 0.03
 CLEARANCE_M = 0.10
 
 
-def guide(observation: jax.Array) -> jax.Array:
+def guide(observation: Float[jax.Array, "40"]) -> Float[jax.Array, "8"]:
     """(8,) action for one observation (40,)."""
-    q, fingers, finger_speed = observation[:7], observation[7:9].sum(), observation[16:18].sum()
-    grip, grip_quat, object_pos = observation[18:21], observation[21:25], observation[25:28]
-    grasp, grasp_quat = observation[32:35], observation[35:39]
+    part = {name: observation[where] for name, where in OBSERVATION.items()}
+    q, fingers, finger_speed = part["arm"], part["fingers"].sum(), part["finger_velocity"].sum()
+    grip, grip_quat, object_pos = part["grip_pos"], part["grip_quat"], part["object_pos"]
+    grasp, grasp_quat = part["grasp_pos"], part["grasp_quat"]
 
-    lateral = jp.linalg.norm(grip[:2] - grasp[:2])
-    angle = kinematics.angle_between(grip_quat, grasp_quat, jp)
-    aligned = (lateral < ALIGNED_M) & (jp.abs(grip[2] - grasp[2]) < ALIGNED_M) & (angle < ALIGNED_RAD)
-    closing = (jp.linalg.norm(grip - object_pos) < NEAR_M) & (fingers < 0.078)
-    held = closing & (jp.abs(finger_speed) < 0.02) & (fingers > 0.004)
+    lateral = jnp.linalg.norm(grip[:2] - grasp[:2])
+    angle = kinematics.angle_between(grip_quat, grasp_quat, jnp)
+    aligned = (lateral < ALIGNED_M) & (jnp.abs(grip[2] - grasp[2]) < ALIGNED_M) & (angle < ALIGNED_RAD)
+    closing = (jnp.linalg.norm(grip - object_pos) < NEAR_M) & (fingers < 0.078)
+    held = closing & (jnp.abs(finger_speed) < 0.02) & (fingers > 0.004)
 
-    misaligned = jp.maximum(lateral - 0.008, 0.0) + 0.06 * jp.maximum(angle - 0.12, 0.0)
-    above = jp.clip(2.0 * misaligned, 0.0, CLEARANCE_M)
+    misaligned = jnp.maximum(lateral - 0.008, 0.0) + 0.06 * jnp.maximum(angle - 0.12, 0.0)
+    above = jnp.clip(2.0 * misaligned, 0.0, CLEARANCE_M)
     reach = grasp.at[2].add(above)
-    lift = grip + jp.asarray(contract.LIFT_TARGET_M) - object_pos
-    way = jp.where(held, lift, reach) - grip
-    stride = jp.where(held, LIFT_STEP_M, REACH_STEP_M)
-    waypoint = grip + way * jp.minimum(1.0, stride / jp.maximum(jp.linalg.norm(way), 1e-6))
-    target = inverse_kinematics.solve(q, waypoint, jp.where(held, grip_quat, grasp_quat))
+    lift = grip + jnp.asarray(contract.LIFT_TARGET_M) - object_pos
+    way = jnp.where(held, lift, reach) - grip
+    stride = jnp.where(held, LIFT_STEP_M, REACH_STEP_M)
+    waypoint = grip + way * jnp.minimum(1.0, stride / jnp.maximum(jnp.linalg.norm(way), 1e-6))
+    target = inverse_kinematics.solve(q, waypoint, jnp.where(held, grip_quat, grasp_quat))
 
     move = GAIN * (target - q) / contract.ACTION_SCALE_RAD
-    move = move * jp.minimum(1.0, MAX_ACTION / jp.maximum(jp.max(jp.abs(move)), 1e-6))
+    move = move * jnp.minimum(1.0, MAX_ACTION / jnp.maximum(jnp.max(jnp.abs(move)), 1e-6))
     close = aligned | held | (closing & (finger_speed < 0))
-    return jp.append(move, jp.where(close, MAX_ACTION, -MAX_ACTION))
+    return jnp.append(move, jnp.where(close, MAX_ACTION, -MAX_ACTION))

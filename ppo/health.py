@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 
 from ddgrasp import contract
@@ -31,7 +31,7 @@ def watch(observation: jax.Array, action: jax.Array, metrics: Mapping[str, jax.A
       state: the learner's new state, a dataclass.
     """
     ends = np.cumsum(list(contract.OBSERVATION_PARTS.values()))[:-1]
-    parts = zip(contract.OBSERVATION_PARTS, jp.split(observation, ends, axis=-1), strict=True)
+    parts = zip(contract.OBSERVATION_PARTS, jnp.split(observation, ends, axis=-1), strict=True)
     watched = {f"observation/{name}": _worst(part) for name, part in parts} | {"action": _worst(action)}
     watched |= {name: x for name, x in metrics.items() if _kind(name) in ORDER and name != SUM}
     return watched | {f"state/{name}": _worst(part) for name, part in vars(state).items()}
@@ -63,5 +63,5 @@ def _kind(name: str) -> str:
 
 def _worst(tree: Any) -> jax.Array:
     """() the largest magnitude in a tree of arrays; NaN if there is one."""
-    leaves = [x for x in jax.tree.leaves(tree) if jp.issubdtype(x.dtype, jp.floating)]
-    return jp.max(jp.stack([jp.max(jp.abs(x)) for x in leaves])) if leaves else jp.zeros(())
+    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(x)) for x in leaves])) if leaves else jnp.zeros(())

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, cast
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 import optax
 from brax.training import acting, distribution
@@ -125,22 +125,24 @@ def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
     k_policy, k_value, k_env, k_next = jax.random.split(key, 4)
     networks = make_networks(config)
     params = network_params(networks.policy_network.init(k_policy), networks.value_network.init(k_value))
-    normalizer = running_statistics.init_state(specs.Array((contract.OBSERVATION_SIZE,), jp.dtype("float32")))
+    normalizer = running_statistics.init_state(
+        specs.Array((contract.OBSERVATION_SIZE,), jnp.dtype("float32"))
+    )
     return LearnerState(
         params=params,
         normalizer=normalizer,
         opt_state=make_optimizer(config).init(params),  # pyright: ignore[reportArgumentType]
         env_state=env.reset(jax.random.split(k_env, config.num_envs)),
         key=k_next,
-        iteration=jp.zeros((), jp.int32),
-        good_evaluations=jp.zeros((), jp.int32),
+        iteration=jnp.zeros((), jnp.int32),
+        good_evaluations=jnp.zeros((), jnp.int32),
     )
 
 
 def warm_start(state: LearnerState, saved: dict) -> LearnerState:
     """`state` with the policy and normaliser of `ppo.policy.load_state`; the value network stays fresh."""
     policy = {"params": saved["layers"]}
-    if jax.tree.map(jp.shape, policy) != jax.tree.map(jp.shape, state.params.policy):
+    if jax.tree.map(jnp.shape, policy) != jax.tree.map(jnp.shape, state.params.policy):
         raise UserError(
             "The teacher of teacher.init_from has other layers than teacher.hidden asks for: use the same."
         )
@@ -202,10 +204,10 @@ def _unroll(env, env_state, policy, key, length):
         return (env_state, key), (transition, env_state.done, env_state.metrics)
 
     (env_state, _), (data, done, metrics) = jax.lax.scan(step, (env_state, key), None, length)
-    episodes = jp.maximum(done.sum(), 1.0)
+    episodes = jnp.maximum(done.sum(), 1.0)
     outcome = {"success": metrics["success"].sum() / episodes, "saturated": metrics["saturated"].mean()}
     outcome |= {k: v.mean() for k, v in metrics.items() if k.startswith("reward/")}
-    return env_state, jax.tree.map(lambda x: jp.swapaxes(x, 0, 1), data), outcome
+    return env_state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data), outcome
 
 
 def _improve(config, networks, normalizer, data, key, state, mesh):
@@ -227,7 +229,7 @@ def _improve(config, networks, normalizer, data, key, state, mesh):
         (_, terms), grads = jax.value_and_grad(loss_fn, has_aux=True)(params, normalizer, batch, k_loss)
         terms |= {f"gradient/{name}": optax.global_norm(getattr(grads, name)) for name in ("policy", "value")}
         learns = state.iteration >= config.critic_warmup
-        policy_grads = jax.tree.map(lambda g: jp.where(learns, g, 0.0), grads.policy)
+        policy_grads = jax.tree.map(lambda g: jnp.where(learns, g, 0.0), grads.policy)
         grads = network_params(policy_grads, grads.value)
         updates, opt_state = optimizer.update(grads, opt_state, params)
         params = cast(ppo_losses.PPONetworkParams, optax.apply_updates(params, updates))
@@ -244,4 +246,4 @@ def _improve(config, networks, normalizer, data, key, state, mesh):
     carry, terms = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
     names = {name: f"loss/{name}" for name in ("policy_loss", "v_loss", "entropy_loss", "total_loss")}
     names |= {name: name for name in ("gradient/policy", "gradient/value")}
-    return carry, {shown: jp.mean(terms[name]) for name, shown in names.items()}
+    return carry, {shown: jnp.mean(terms[name]) for name, shown in names.items()}

@@ -5,8 +5,10 @@ jitter from step to step, not what happens within one.
 """
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ddgrasp import contract
+from ddgrasp.layout import ACTION, closes
 
 JERK_LIMIT_RAD_S3 = (7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0)
 """Joint jerk limits: Franka's interface specification."""
@@ -14,7 +16,11 @@ SATURATED = 0.95
 """An action component beyond this share of its range counts as saturated."""
 
 
-def motion_metrics(velocity_rad_s: np.ndarray, action: np.ndarray, running: np.ndarray) -> dict[str, float]:
+def motion_metrics(
+    velocity_rad_s: Float[np.ndarray, "steps n 7"],
+    action: Float[np.ndarray, "steps n 8"],
+    running: Bool[np.ndarray, "steps n"],
+) -> dict[str, float]:
     """Metrics over N episodes of T control steps that start at rest with the gripper open.
 
     Args:
@@ -30,7 +36,7 @@ def motion_metrics(velocity_rad_s: np.ndarray, action: np.ndarray, running: np.n
     """
     acceleration = _rate(velocity_rad_s)
     jerk = _rate(acceleration)
-    metrics = {"saturated_actions": float(np.mean(np.abs(action[..., :7])[running] > SATURATED))}
+    metrics = {"saturated_actions": float(np.mean(np.abs(action[..., ACTION.arm])[running] > SATURATED))}
     for name, value, limit in (
         ("acceleration", acceleration, contract.JOINT_ACCELERATION_LIMIT_RAD_S2),
         ("jerk", jerk, JERK_LIMIT_RAD_S3),
@@ -38,7 +44,7 @@ def motion_metrics(velocity_rad_s: np.ndarray, action: np.ndarray, running: np.n
         worst = (np.abs(value) / np.array(limit)).max(axis=-1)[running]
         metrics[f"{name}_p99"] = float(np.percentile(worst, 99))
         metrics[f"{name}_max"] = float(worst.max())
-    closed = action[..., 7] > 0
+    closed = closes(action)
     toggled = closed != np.concatenate([np.zeros_like(closed[:1]), closed[:-1]])
     metrics["gripper_toggles"] = float((toggled & running).sum() / running.shape[1])
     return metrics

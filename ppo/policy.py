@@ -1,11 +1,15 @@
 """The trained teacher as a function from observation to action: in NumPy for the rig, in JAX for batches."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.errors import UserError
 from learning.params import load_params, save_params
 
@@ -14,13 +18,28 @@ ACTIVATION = "elu"
 _STD_MIN = 1e-6
 
 
+@runtime_checkable
+class Normalizer(Protocol):
+    """Statistics of observations (40,), as far as a policy needs them: Brax's `RunningStatisticsState`."""
+
+    @property
+    def mean(self) -> Any:
+        """(40,)."""
+
+    @property
+    def std(self) -> Any:
+        """(40,)."""
+
+
 class TeacherPolicy:
     """Deterministic action (the mode) of the PPO policy: an MLP on the normalised observation."""
 
-    def __init__(self, mean: np.ndarray, std: np.ndarray, layers: list[tuple[np.ndarray, np.ndarray]]):
+    def __init__(self, mean: AnyArray, std: AnyArray, layers: list[tuple[AnyArray, AnyArray]]):
         self.mean, self.std, self.layers = mean, std, layers
 
-    def __call__(self, observation, xp=np):
+    def __call__(
+        self, observation: Float[AnyArray, "*batch 40"], xp: ModuleType = np
+    ) -> Float[AnyArray, "*batch 8"]:
         """(..., 8) action in [-1, 1] for observation (..., 40). `xp`: numpy or jax.numpy."""
         x = (observation - self.mean) / self.std
         for kernel, bias in self.layers[:-1]:
@@ -30,7 +49,7 @@ class TeacherPolicy:
         return xp.tanh((x @ kernel + bias)[..., : contract.ACTION_SIZE])
 
 
-def save(path: Path, normalizer, policy_params) -> None:
+def save(path: Path, normalizer: Normalizer, policy_params: Mapping[str, Any]) -> None:
     """Writes what `load` reads. `policy_params`: Brax's policy network parameters."""
     layers = policy_params["params"]
     save_params(
@@ -43,7 +62,7 @@ def save(path: Path, normalizer, policy_params) -> None:
     )
 
 
-def from_learner(normalizer, policy_params) -> TeacherPolicy:
+def from_learner(normalizer: Normalizer, policy_params: Mapping[str, Any]) -> TeacherPolicy:
     """The policy of a learner's current parameters; works on traced arrays."""
     layers = policy_params["params"]
     ordered = [layers[f"hidden_{i}"] for i in range(len(layers))]

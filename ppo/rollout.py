@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.sharding import Mesh
@@ -59,12 +59,12 @@ def _roll_out(env: GraspEnv, mesh: Mesh, keep: Keep, layers, mean, std, keys) ->
 
     def step(carry, _):
         state, alive, success = carry
-        action = policy(state.obs, jp)
+        action = policy(state.obs, jnp)
         new = devices.each(mesh, env.step)(state, action)
-        success = jp.where(alive, new.metrics["success"] > 0, success)
+        success = jnp.where(alive, new.metrics["success"] > 0, success)
         return (new, alive & (new.done == 0), success), (alive, keep(state, action, new))
 
-    start = (state, jp.ones(len(keys), bool), jp.zeros(len(keys), bool))
+    start = (state, jnp.ones(len(keys), bool), jnp.zeros(len(keys), bool))
     (*_, success), per_step = jax.lax.scan(step, start, None, env.config.episode_steps)
     outcome = (episode.params, episode.object_index, success), per_step
     return jax.lax.with_sharding_constraint(outcome, devices.replicated(mesh))

@@ -115,6 +115,7 @@ class _Best:
             self._rate = float(read_json(directory / BEST_RATE))
 
     def offer(self, rate: float, state: learner.LearnerState) -> None:
+        """Keeps the policy of `state` if its success rate is no worse than the best one's."""
         if rate >= self._rate and hosts.leads():
             self._rate = rate
             save(self._directory / PARAMS_FILE, state.normalizer, state.params.policy)

@@ -5,9 +5,10 @@ much of the object the camera sees.
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, UInt32
 from mujoco_playground import State
 
 from ddgrasp.progress import Progress
@@ -26,21 +27,18 @@ class Trials:
 
     params: ModelParams
     """Of each environment, (N, ...)."""
-    qpos: np.ndarray
-    """(T, N, 16)."""
-    touched: np.ndarray
-    """(T, N) bool, whether a finger pad touches the object or has touched it."""
-    running: np.ndarray
-    """(T, N) bool, whether the episode was still going on."""
-    action: np.ndarray
-    """(T, N, 8)."""
-    velocity_rad_s: np.ndarray
-    """(T, N, 7) of the joints at the end of each step."""
-    success: np.ndarray
-    """(N,) bool."""
+    qpos: Float[np.ndarray, "T N 16"]
+    touched: Bool[np.ndarray, "T N"]
+    """Whether a finger pad touches the object or has touched it."""
+    running: Bool[np.ndarray, "T N"]
+    """Whether the episode was still going on."""
+    action: Float[np.ndarray, "T N 8"]
+    velocity_rad_s: Float[np.ndarray, "T N 7"]
+    """Of the joints at the end of each step."""
+    success: Bool[np.ndarray, " N"]
 
 
-def episode_keys(env: GraspEnv, per_object: int, seed: int) -> np.ndarray:
+def episode_keys(env: GraspEnv, per_object: int, seed: int) -> UInt32[np.ndarray, "objects per_object 2"]:
     """(objects, per_object, 2) keys whose resets take each object equally often."""
     drawn = jax.jit(jax.vmap(env.object_drawn))
     found: list[np.ndarray] = [np.empty((0, 2), np.uint32) for _ in env.table.names]
@@ -52,7 +50,7 @@ def episode_keys(env: GraspEnv, per_object: int, seed: int) -> np.ndarray:
     return np.stack([have[:per_object] for have in found])
 
 
-def record(env: GraspEnv, policy: TeacherPolicy, keys: np.ndarray) -> Trials:
+def record(env: GraspEnv, policy: TeacherPolicy, keys: UInt32[np.ndarray, "N 2"]) -> Trials:
     """The deterministic `policy` in the episodes of `keys` (N, 2)."""
     seen = roll_out(env, policy, keys, _scene_and_motion)
     kept = seen.kept
@@ -68,7 +66,7 @@ def record(env: GraspEnv, policy: TeacherPolicy, keys: np.ndarray) -> Trials:
 
 
 def _scene_and_motion(before: State, action: jax.Array, after: State) -> dict[str, jax.Array]:
-    touching = jp.any(before.data.touch > TOUCH_N, axis=-1)
+    touching = jnp.any(before.data.touch > TOUCH_N, axis=-1)
     return {"qpos": before.data.qpos, "touching": touching} | motion_of(before, action, after)
 
 

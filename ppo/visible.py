@@ -5,8 +5,10 @@ from functools import partial
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
 
 from ddgrasp import contract
+from ddgrasp.layout import QPOS
 from mjx_envs import kinematics, randomize
 from mjx_envs.camera import look_at
 from mjx_envs.grasp_env import GraspEnv
@@ -39,8 +41,9 @@ class Watcher:
         self._rgb = jax.jit(self._large.rgb)
 
     def visible_pixels(
-        self, qpos: np.ndarray, params: ModelParams, index: int, counted: np.ndarray, seed: int
-    ) -> np.ndarray:
+        self, qpos: Float[np.ndarray, "steps n 16"], params: ModelParams, index: int,
+        counted: Bool[np.ndarray, "steps n"], seed: int,
+    ) -> Int[np.ndarray, " counted"]:  # fmt: skip
         """Pixels of the object in the student's crop, camera poses drawn per episode as for the student.
 
         Args:
@@ -61,7 +64,9 @@ class Watcher:
         params = jax.tree.map(lambda leaf: leaf[episodes], params)
         return self._draw(self._pixels, qpos[steps, episodes], params, index, cameras[episodes])
 
-    def pictures(self, qpos: np.ndarray, params: ModelParams, index: int) -> np.ndarray:
+    def pictures(
+        self, qpos: Float[np.ndarray, "m 16"], params: ModelParams, index: int
+    ) -> UInt8[np.ndarray, "m 300 300 3"]:
         """(M, 300, 300, 3) uint8 of the states qpos (M, 16) of one environment: workspace and lift target."""
         params = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(qpos), *leaf.shape)), params)
         cameras = np.broadcast_to(_picture_pose(), (len(qpos), 4, 4)).astype(np.float32)
@@ -92,7 +97,11 @@ def _picture_pose() -> np.ndarray:
     return look_at(position + _BACK * (position - target), target + [0.0, 0.0, _UP_M])
 
 
-def moments(qpos: np.ndarray, touched: np.ndarray, running: np.ndarray) -> np.ndarray:
+def moments(
+    qpos: Float[np.ndarray, "steps 16"],
+    touched: Bool[np.ndarray, " steps"],
+    running: Bool[np.ndarray, " steps"],
+) -> Int[np.ndarray, "5"]:
     """(5,) the steps of one episode that show MOMENTS; where one never came, the one before it.
 
     Args:
@@ -101,11 +110,12 @@ def moments(qpos: np.ndarray, touched: np.ndarray, running: np.ndarray) -> np.nd
       running: (T,) bool.
     """
     last = int(np.flatnonzero(running)[-1])
-    grip_pos, _ = kinematics.grip_pose(qpos[:, :7], np)
+    grip_pos, _ = kinematics.grip_pose(qpos[:, QPOS.arm], np)
     contact = _first(touched & running, 0)
-    high = np.flatnonzero(grip_pos[:contact, 2] - qpos[:contact, 11] > ABOVE_M)
+    height = qpos[:, QPOS.object_pos][:, 2]
+    high = np.flatnonzero((grip_pos[:, 2] - height)[:contact] > ABOVE_M)
     above = int(high[-1]) if len(high) else 0
-    lifted = _first((qpos[:, 11] > qpos[0, 11] + LIFTED_M) & running, contact)
+    lifted = _first((height > height[0] + LIFTED_M) & running, contact)
     return np.array([0, above, contact, lifted, last])
 
 

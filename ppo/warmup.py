@@ -4,13 +4,14 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 import optax
 from brax.training.acme import running_statistics
 
 from ddgrasp.config import TeacherConfig
 from ddgrasp.errors import UserError
+from ddgrasp.layout import ACTION
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import GraspEnv
 from ppo import learner
@@ -32,7 +33,7 @@ def clone_guide(
     On one device of this process: the batches are small.
     """
     policy, normalizer = jax.tree.map(
-        lambda x: jp.asarray(np.asarray(x)), (state.params.policy, state.normalizer)
+        lambda x: jnp.asarray(np.asarray(x)), (state.params.policy, state.normalizer)
     )
     optimizer = optax.adam(
         optax.cosine_decay_schedule(LEARNING_RATE, config.clone_rounds * config.clone_steps)
@@ -50,7 +51,7 @@ def clone_guide(
             observations.append(seen)
             labels.append(label)
             normalizer = running_statistics.update(
-                normalizer, jp.asarray(seen), std_min_value=learner.OBSERVATION_STD_MIN
+                normalizer, jnp.asarray(seen), std_min_value=learner.OBSERVATION_STD_MIN
             )
             everything, wanted = np.concatenate(observations), np.concatenate(labels)
             index = rng.integers(0, len(everything), (config.clone_steps, BATCH))
@@ -89,7 +90,7 @@ class _Collector:
             noise = (
                 ACTION_NOISE * rng.standard_normal(label.shape) * (rng.random((self._count, 1)) < NOISE_SHARE)
             )
-            noise[:, 7] = 0.0
+            noise[:, ACTION.gripper] = 0.0
             action = np.clip(np.where(guided, label, policy(seen)) + noise, -1, 1)
             state = self._step(state, action.astype(np.float32))
             alive &= np.asarray(state.done) == 0
@@ -101,7 +102,7 @@ def _fit(optimizer, normalizer, policy_params, opt_state, observations, labels):
 
     def loss_fn(params, batch):
         observation, label = batch
-        return jp.mean((from_learner(normalizer, params)(observation, jp) - label) ** 2)
+        return jnp.mean((from_learner(normalizer, params)(observation, jnp) - label) ** 2)
 
     def step(carry, batch):
         params, opt_state = carry

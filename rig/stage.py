@@ -14,6 +14,7 @@ from ddgrasp import contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.job import Job
+from ddgrasp.layout import ACTION, closes
 from ddgrasp.progress import Progress
 from mjx_envs.camera import nominal_camera
 from rig.camera import RigCamera, jittered_pose, make_camera
@@ -68,9 +69,9 @@ def record_trajectory(
 def act(world: RigWorld, action: np.ndarray) -> None:
     """Execute one (8,) action for one control period."""
     q, _ = world.state()
-    target = q + contract.ACTION_SCALE_RAD * np.clip(action[:7], -1.0, 1.0)
+    target = q + contract.ACTION_SCALE_RAD * np.clip(action[ACTION.arm], -1.0, 1.0)
     target = np.clip(target, contract.JOINT_LOWER_RAD, contract.JOINT_UPPER_RAD)
-    world.command(target, bool(action[7] > 0))
+    world.command(target, bool(closes(action)))
     world.step(contract.CONTROL_DT_S)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig, WorldConfig
 from ddgrasp.errors import unknown_name
+from ddgrasp.layout import CONTROLS, QPOS
 from mjx_envs import draws, grasp_math, scene
 from mjx_envs.object_spec import ObjectSpec, slot_layout
 from mjx_envs.objects import get_object
@@ -51,17 +52,21 @@ class RigWorld:
         mujoco.mj_resetData(self.model, self.data)
         self._set_pose(rng, self._spec.rest_height_m * size)
         mujoco.mj_forward(self.model, self.data)
-        self._branch = float(grasp_math.yaw_branch(self.data.qpos[12:16], self._spec.grasp_symmetry))
+        self._branch = float(
+            grasp_math.yaw_branch(self.data.qpos[QPOS.object_quat], self._spec.grasp_symmetry)
+        )
         self._hold_steps = 0
 
     def state(self) -> tuple[np.ndarray, float]:
         """Arm joint positions (7,) rad and the gripper's opening (m)."""
-        return self.data.qpos[:7].copy(), float(self.data.qpos[7] + self.data.qpos[8])
+        return self.data.qpos[QPOS.arm].copy(), float(self.data.qpos[QPOS.fingers].sum())
 
     def command(self, q_target_rad: np.ndarray, close: bool) -> None:
         """Joint targets (7,) rad and whether to close the gripper; in force from the next `step`."""
-        self.data.ctrl[:7] = np.clip(q_target_rad, contract.JOINT_LOWER_RAD, contract.JOINT_UPPER_RAD)
-        self.data.ctrl[7:] = 0.0 if close else contract.GRIPPER_MAX_WIDTH_M / 2
+        self.data.ctrl[CONTROLS.arm] = np.clip(
+            q_target_rad, contract.JOINT_LOWER_RAD, contract.JOINT_UPPER_RAD
+        )
+        self.data.ctrl[CONTROLS.fingers] = 0.0 if close else contract.GRIPPER_MAX_WIDTH_M / 2
 
     def step(self, seconds: float) -> None:
         """Advance the physics; whole control periods count towards success."""
@@ -82,7 +87,7 @@ class RigWorld:
         return self._hold_steps >= contract.HOLD_STEPS
 
     def _held(self) -> bool:
-        away_m = np.linalg.norm(self.data.qpos[9:12] - np.array(contract.LIFT_TARGET_M))
+        away_m = np.linalg.norm(self.data.qpos[QPOS.object_pos] - np.array(contract.LIFT_TARGET_M))
         return bool(away_m < contract.LIFT_TOLERANCE_M)
 
     def _choose_pose(self, rng: np.random.Generator, spec: ObjectSpec) -> ObjectSpec:
@@ -104,7 +109,7 @@ class RigWorld:
         joints, xy = rng.uniform(-1, 1, scene.N_ARM), rng.uniform(-1, 1, 2)
         yaw = np.asarray(rng.uniform(-np.pi, np.pi))
         self.data.qpos[:] = draws.start_qpos(self._random, joints, xy, yaw, rest_height_m)
-        self.command(self.data.qpos[:7], close=False)
+        self.command(self.data.qpos[QPOS.arm], close=False)
 
 
 def make_world(config: WorldConfig, objects: Sequence[str] = ()) -> RigWorld:

@@ -4,12 +4,13 @@ from collections.abc import Callable
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
+from ddgrasp.depth import to_metres
 from demos.rollout import Scene
+from student_jax.data import stack_steps
 from student_jax.depth_source import DepthSource
 from student_jax.policy import sample_actions
 
@@ -64,7 +65,7 @@ class StudentActor:
         self.seen_mm.append(self._corrupt(scene))
         position = scene.step % self._config.head.execute_steps
         if position == 0:
-            frames = [self.seen_mm[max(0, scene.step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)]
+            frames = [self.seen_mm[t] for t in stack_steps(scene.step)]
             shape = (len(scene.state), self._config.head.chunk, contract.ACTION_SIZE)
             noise = self._noise_scale * self._rng.standard_normal(shape)
             self._chunk = np.asarray(
@@ -77,5 +78,4 @@ class StudentActor:
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _act(config, profile, params, depth_mm, state, noise):
-    depth_m = depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
-    return sample_actions(params, depth_m, state, noise, config, profile)
+    return sample_actions(params, to_metres(depth_mm), state, noise, config, profile)

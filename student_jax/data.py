@@ -6,12 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddgrasp import contract
+from ddgrasp.layout import ACTION, OBSERVATION, closes
 from student_jax.policy import Aux, position_from_world
 
-GRIP_POS = slice(18, 21)
-OBJECT_POS = slice(25, 28)
-_GRASP_QUAT = slice(35, 39)
-"""Parts of the teacher's observation (ddgrasp/contract.py)."""
 YAW_MULTIPLE = 2
 """The gripper looks the same after half a turn: the auxiliary target is the angle's double."""
 
@@ -55,7 +52,7 @@ class Frames:
 
     def _stack_one(self, episode: int, step: int) -> np.ndarray:
         frames = self.depth_mm[episode]
-        return np.stack([frames[max(0, step - k)] for k in range(contract.DEPTH_FRAMES - 1, -1, -1)])
+        return np.stack([frames[t] for t in stack_steps(step)])
 
     def action_chunks(self, index: np.ndarray, chunk: int) -> np.ndarray:
         """(B, chunk, 8) labels from each index on, the episode's last one repeated at its end."""
@@ -66,11 +63,16 @@ class Frames:
         return self.action[np.where(inside, ahead, last)]
 
 
+def stack_steps(step: int) -> list[int]:
+    """The steps whose frames are the student's stack at `step`, oldest first; at the start, 0 repeated."""
+    return [max(0, step - k) for k in reversed(range(contract.DEPTH_FRAMES))]
+
+
 def aux_targets(observation: np.ndarray, held: np.ndarray) -> Aux:
     """What perception is to report of the teacher's observations (N, 40); `held_logit` is 0 or 1."""
-    quat = observation[:, _GRASP_QUAT]
+    quat = observation[:, OBSERVATION.grasp_quat]
     yaw = 2.0 * np.arctan2(quat[:, 2], quat[:, 1]) * YAW_MULTIPLE
-    position = position_from_world(observation[:, OBJECT_POS])
+    position = position_from_world(observation[:, OBSERVATION.object_pos])
     return Aux(
         position.astype(np.float32),
         np.stack([np.cos(yaw), np.sin(yaw)], axis=1).astype(np.float32),
@@ -104,7 +106,7 @@ def make_frames(
 def sharpen_gripper(action: np.ndarray) -> np.ndarray:
     """Labels with the gripper command at -1 or 1: the robot only looks at its sign."""
     sharp = np.array(action)
-    sharp[..., 7] = np.where(sharp[..., 7] > 0, 1.0, -1.0)
+    sharp[..., ACTION.gripper] = np.where(closes(sharp), 1.0, -1.0)[..., None]
     return sharp
 
 

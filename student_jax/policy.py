@@ -18,6 +18,7 @@ from flax import linen as nn
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
+from ddgrasp.layout import STATE, Layout
 from learning import diffusion
 from mjx_envs import kinematics
 from student_jax.denoiser import Denoiser, StateStream, normalise_state
@@ -27,9 +28,10 @@ from student_jax.preprocess import crop_origin, prepare_depth
 
 Positions = TypeVar("Positions", jax.Array, np.ndarray)
 
-AUX_SIZE = 6
-BESIDE_SIZE = 4
-"""What the hand view adds to the auxiliary output: the object's offset from the hand, and a gate."""
+AUX = Layout(position=3, yaw=2, held=1)
+"""The auxiliary output, see `Aux`."""
+AUX_BESIDE = Layout(position=3, yaw=2, held=1, beside=3, near=1)
+"""The same with the hand view: the object's offset from the hand too, and a gate between the two places."""
 BESIDE_SCALE = 0.25
 """Network units per unit of that offset: 5 cm."""
 TERMINAL_TIME = 0.98
@@ -37,7 +39,7 @@ TERMINAL_TIME = 0.98
 HEAD_PARAMS = ("state_stream", "denoiser")
 """The parameters that act; all others see."""
 PARAMS_FILE = "params.msgpack"
-"""Name of the parameter file in the student's artefact (`learning.params`)."""
+"""Name of the parameter file in the student's artifact (`learning.params`)."""
 Numbers = jax.Array | np.ndarray
 
 
@@ -79,8 +81,9 @@ class StudentPolicy(nn.Module):
     def setup(self) -> None:
         """Flax: builds the parts that the configuration names."""
         self.encoder = DepthEncoder(self.config, self.profile)
+        """Flax: builds the parts that the configuration names."""
         self.aux_hidden = nn.Dense(self.config.encoder.features)
-        self.aux_output = nn.Dense(AUX_SIZE + (BESIDE_SIZE if self.config.hand_view.size_px else 0))
+        self.aux_output = nn.Dense((AUX_BESIDE if self.config.hand_view.size_px else AUX).size)
         self.state_stream = StateStream(self.config)
         self.denoiser = Denoiser(self.config)
         if self.config.hand_view.size_px:
@@ -97,14 +100,15 @@ class StudentPolicy(nn.Module):
         features = self.encoder(picture, origin)
         if not self.config.hand_view.size_px:
             raw = self._aux(features, normalise_state(state))
-            return Seen(features, Aux(raw[:, :3], raw[:, 3:5], raw[:, 5]))
+            return Seen(features, Aux(raw[:, AUX.position], raw[:, AUX.yaw], raw[:, AUX.held][:, 0]))
         grip_m = grip_position(state)
         grip = position_from_world(grip_m)
         features = jnp.concatenate([features, self.hand_view(picture, grip_m, origin)], axis=-1)
         raw = self._aux(features, normalise_state(state), grip)
-        near = nn.sigmoid(raw[:, 9:])
-        position = near * (grip + BESIDE_SCALE * raw[:, 6:9]) + (1.0 - near) * raw[:, :3]
-        return Seen(features, Aux(position, raw[:, 3:5], raw[:, 5]))
+        near = nn.sigmoid(raw[:, AUX_BESIDE.near])
+        beside = grip + BESIDE_SCALE * raw[:, AUX_BESIDE.beside]
+        position = near * beside + (1.0 - near) * raw[:, AUX.position]
+        return Seen(features, Aux(position, raw[:, AUX.yaw], raw[:, AUX.held][:, 0]))
 
     def _aux(self, *parts: jax.Array) -> jax.Array:
         return self.aux_output(nn.relu(self.aux_hidden(jnp.concatenate(parts, axis=-1))))
@@ -139,7 +143,7 @@ class StudentPolicy(nn.Module):
 
 def grip_position(state: jax.Array) -> jax.Array:
     """(B, 3) the point between the finger pads (m, robot base) from the joint state (B, 8)."""
-    return kinematics.grip_pose(state[:, :7], jnp)[0]
+    return kinematics.grip_pose(state[:, STATE.arm], jnp)[0]
 
 
 def feature_count(config: StudentConfig) -> int:

@@ -8,11 +8,12 @@ hand view's does, and an episode keeps its own.
 import numpy as np
 
 from ddgrasp.config import StudentConfig
+from ddgrasp.layout import ACTION, OBSERVATION
 from demos.rollout import Scene
 from student_jax import train
-from student_jax.data import GRIP_POS, OBJECT_POS, aux_targets
+from student_jax.data import aux_targets
 from student_jax.encoder import POSITION_SCALE_M
-from student_jax.policy import Aux, Seen, feature_count
+from student_jax.policy import AUX, Aux, Seen, feature_count
 
 NEAR_ERROR_M = 0.002
 ERROR_PER_DISTANCE = 0.08
@@ -42,14 +43,14 @@ def noisy_seen(
         bias: (B, 5) standard normal: position and yaw errors in units of their size.
     """
     truth = aux_targets(observation, held)
-    way = observation[:, GRIP_POS] - observation[:, OBJECT_POS]
+    way = observation[:, OBSERVATION.grip_pos] - observation[:, OBSERVATION.object_pos]
     distance = np.linalg.norm(way, axis=1, keepdims=True)
     size_m = np.minimum(NEAR_ERROR_M + ERROR_PER_DISTANCE * distance, FAR_ERROR_M)
     wrong = rng.random(len(held)) < HELD_WRONG
     logit = HELD_LOGIT * (2 * (truth.held_logit > 0.5) - 1.0) * np.where(wrong, -1.0, 1.0)
     aux = Aux(
-        (truth.position + size_m / POSITION_SCALE_M * bias[:, :3]).astype(np.float32),
-        (truth.yaw + YAW_ERROR * bias[:, 3:]).astype(np.float32),
+        (truth.position + size_m / POSITION_SCALE_M * bias[:, AUX.position]).astype(np.float32),
+        (truth.yaw + YAW_ERROR * bias[:, AUX.yaw]).astype(np.float32),
         logit.astype(np.float32),
     )
     return Seen(np.zeros((len(held), feature_count(config)), np.float32), aux)
@@ -81,5 +82,5 @@ class PoseActor:
             action = np.where(taught, action, np.asarray(chosen)[:, 0])
         pushed = rng.random((len(action), 1)) < NOISE_SHARE
         push = ACTION_NOISE * rng.standard_normal(action.shape) * pushed
-        push[:, 7] = 0.0
+        push[:, ACTION.gripper] = 0.0
         return np.clip(action + push, -1.0, 1.0)

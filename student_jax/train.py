@@ -10,9 +10,9 @@ import numpy as np
 import optax
 from jax import Array
 
-from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
+from ddgrasp.depth import to_metres
 from learning.diffusion import q_sample
 from learning.optimizers import adamw
 from learning.train_state import TrainState, first_state, step_key, updated
@@ -131,7 +131,7 @@ def train_step(
     """One optimiser step on pictures. Pure: noise comes from `step_key`."""
     policy = StudentPolicy(config, profile)
     key, k_noise = jax.random.split(step_key(state))
-    depth_m = batch.depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
+    depth_m = to_metres(batch.depth_mm)
     if config.training.disparity_noise_px:
         depth_m = disparity_noise(k_noise, depth_m, profile, config)
 
@@ -164,7 +164,7 @@ def encode(
     key: Array | None = None,
 ) -> Any:
     """`policy.Seen` of a batch; with `key`, under the disparity noise of training."""
-    depth_m = depth_mm.astype(jnp.float32) * contract.DEPTH_UNIT_M
+    depth_m = to_metres(depth_mm)
     if key is not None:
         depth_m = disparity_noise(key, depth_m, profile, config)
     return StudentPolicy(config, profile).apply({"params": params}, depth_m, state, crop_rc, method="encode")

@@ -4,6 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from jaxtyping import install_import_hook
+
+TYPED = ("mjx_envs", "ppo", "demos")
+"""Packages whose annotations, shapes among them, are checked in every call that a test makes."""
+install_import_hook(TYPED, "typecheck_support.checked")
 
 _CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 

@@ -234,7 +234,7 @@ def test_wrong_input_is_refused(run, tmp_path, straight):
         CONFIG, ddg=dataclasses.replace(CONFIG.ddg, prior=dataclasses.replace(CONFIG.ddg.prior, in_sim="rgb"))
     )
     assert make_prior(config.ddg).needs_sim_rgb is False  # the built-in prior needs none
-    with pytest.raises(UserError, match="holds no finished artefact"):
+    with pytest.raises(UserError, match="holds no finished artifact"):
         artifacts.read_artifact(tmp_path)
     old = tmp_path / "demos"
     artifacts.finish(old, "demos", CONFIG, seconds=1, metrics={})

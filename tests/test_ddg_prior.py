@@ -9,6 +9,7 @@ import pytest
 from ddg_jax import data, prior
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig, DDGDepthConfig, DDGTrainingConfig, PriorConfig
+from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
@@ -77,10 +78,10 @@ def test_temporal_smoothing_averages_one_surface_and_keeps_moving_edges():
 
 def test_resizing_never_mixes_holes_into_surfaces():
     image = np.where(np.indices((48, 64)).sum(0) % 3 == 0, 0, 1000).astype(np.uint16)
-    small = data.resize_nearest(image, (18, 32))
+    small = crop_nearest(image, (18, 32))
     assert small.shape == (18, 32) and set(np.unique(small)) == {0, 1000}
     ramp = np.tile(np.arange(64), (36, 1))
-    assert data.resize_nearest(ramp, (18, 32))[0].tolist() == list(range(1, 64, 2))
+    assert crop_nearest(ramp, (18, 32))[0].tolist() == list(range(1, 64, 2))
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The export stage: from a student's artefact to a checked file."""
+"""The export stage: from a student's artifact to a checked file."""
 
 from dataclasses import replace
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ddgrasp.config import DepthFeatureConfig
+from ddgrasp.depth import to_metres
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from foundation import depth_feature_data as data
@@ -87,7 +88,7 @@ def test_maps_of_another_size_are_brought_to_the_networks_width_without_new_dept
 
 def test_treatments_do_what_they_say(pool):
     rng = np.random.default_rng(0)
-    clean, stereo = pool.clean_mm[0] / np.float32(1000), pool.stereo_mm[0] / np.float32(1000)
+    clean, stereo = to_metres(pool.clean_mm[0]), to_metres(pool.stereo_mm[0])
     made = {name: treat(pool, 0, rng) for name, treat in data.TREATMENTS.items()}
     np.testing.assert_allclose(made["clean"], clean)
     np.testing.assert_allclose(made["stereo"], stereo)

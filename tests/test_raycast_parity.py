@@ -161,7 +161,7 @@ def test_vmap_and_crop_give_the_window_of_the_whole_picture() -> None:
         for name, whole in raycast.render(geoms[i], cameras[i])._asdict().items():
             differs = abs(np.asarray(getattr(window, name)[i]) - np.asarray(whole[cut])) > 1e-4
             assert differs.mean() < 1e-3, name
-        cropped = raycast_numpy.render(*scenes[i], cameras[i].cropped(rows[i], cols[i], 40, 50))
+        cropped = raycast_numpy.render(*scenes[i], cameras[i].cropped(int(rows[i]), int(cols[i]), 40, 50))
         np.testing.assert_allclose(
             cropped.depth_m, raycast_numpy.render(*scenes[i], cameras[i]).depth_m[cut], atol=1e-6
         )

@@ -33,7 +33,7 @@ def test_a_failing_write_leaves_the_previous_file_and_no_litter(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["params.bin"]
 
 
-def test_a_disk_that_fills_up_mid_write_leaves_the_previous_artefact(tmp_path):
+def test_a_disk_that_fills_up_mid_write_leaves_the_previous_artifact(tmp_path):
     """The limit on file size makes the operating system itself refuse the write half-way."""
     path = tmp_path / "params.bin"
     atomic_write_bytes(path, b"old")
@@ -79,7 +79,7 @@ def test_the_config_hash_covers_a_stage_and_what_it_is_made_from_only():
     assert artifacts.config_hash(reseeded, "teacher") != artifacts.config_hash(CONFIG, "teacher")
 
 
-def test_an_artefact_of_another_config_is_refused_naming_both_values(tmp_path):
+def test_an_artifact_of_another_config_is_refused_naming_both_values(tmp_path):
     _finish(tmp_path / "export")
     other = dataclasses.replace(CONFIG, export=ExportConfig(latency_runs=7))
     with pytest.raises(UserError, match=r"export\.latency_runs is 200 there, 7 here") as error:
@@ -127,7 +127,7 @@ def test_empty_folders_bind_nobody_and_a_file_in_them_does(tmp_path):
         artifacts.begin(directory, "teacher", CONFIG)
 
 
-def test_an_artefact_of_another_contract_version_is_refused(tmp_path):
+def test_an_artifact_of_another_contract_version_is_refused(tmp_path):
     _finish(tmp_path / "export")
     path = tmp_path / "export" / artifacts.MANIFEST
     value = json.loads(path.read_text())

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.training.agents.ppo import networks as ppo_networks
@@ -72,7 +72,7 @@ def test_saved_policy_acts_as_braxs_deterministic_policy(uninterrupted, tmp_path
     params = (uninterrupted.normalizer, uninterrupted.params.policy)
     theirs = ppo_networks.make_inference_fn(networks)(params, deterministic=True)
     obs = np.random.default_rng(0).normal(size=(5, 40)).astype(np.float32)
-    np.testing.assert_allclose(ours(obs), theirs(jp.asarray(obs), jax.random.PRNGKey(0))[0], atol=1e-5)
+    np.testing.assert_allclose(ours(obs), theirs(jnp.asarray(obs), jax.random.PRNGKey(0))[0], atol=1e-5)
 
 
 def test_warm_start_takes_the_policy_and_refuses_other_sizes(uninterrupted, tmp_path):

@@ -4,7 +4,7 @@ import dataclasses
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
@@ -67,17 +67,17 @@ def test_a_reward_beyond_all_numbers_is_named_and_nothing_is_saved(tmp_path):
 
 
 def test_the_cause_is_named_before_what_it_spoils():
-    spoilt = {name: jp.float32(np.nan) for name in ("state/params", "gradient/policy", "loss/v_loss")}
+    spoilt = {name: jnp.float32(np.nan) for name in ("state/params", "gradient/policy", "loss/v_loss")}
     with pytest.raises(UserError, match="iteration 7: loss/v_loss is nan"):
-        health.check(7, spoilt | {"reward/lift": jp.float32(1.0)}, 5, "runs/x")
+        health.check(7, spoilt | {"reward/lift": jnp.float32(1.0)}, 5, "runs/x")
     with pytest.raises(UserError, match="reward/lift is inf"):
-        health.check(7, spoilt | {"reward/lift": jp.float32(np.inf)}, 5, "runs/x")
+        health.check(7, spoilt | {"reward/lift": jnp.float32(np.inf)}, 5, "runs/x")
 
 
 def test_every_part_of_the_observation_is_watched():
     for index, part in ((0, "joint_position"), (17, "joint_velocity"), (24, "hand_pose"), (39, "category")):
-        observation = jp.zeros((3, 40)).at[1, index].set(jp.nan)
-        watched = health.watch(observation, jp.zeros((3, 8)), {}, SimpleNamespace())
+        observation = jnp.zeros((3, 40)).at[1, index].set(jnp.nan)
+        watched = health.watch(observation, jnp.zeros((3, 8)), {}, SimpleNamespace())
         assert [name for name, x in watched.items() if not np.isfinite(x)] == [f"observation/{part}"]
 
 
@@ -91,13 +91,13 @@ def test_more_environments_than_memory_are_refused_with_the_size():
 
 def test_a_program_larger_than_memory_is_refused_before_it_runs():
     env = AutoReset(GraspEnv(CONFIG.world))
-    small, large = (jax.jit(lambda n=n: jp.zeros((n, 2**20))).lower().compile() for n in (1, 2**25))
+    small, large = (jax.jit(lambda n=n: jnp.zeros((n, 2**20))).lower().compile() for n in (1, 2**25))
     memory.check_compiled(CONFIG, env, small)
     with pytest.raises(UserError, match=r"needs about 1407\d\d\.\d GB"):  # 2^45 floats
         memory.check_compiled(CONFIG, env, large)
 
 
-@pytest.mark.parametrize("library", [np, jp])
+@pytest.mark.parametrize("library", [np, jnp])
 def test_memory_that_ran_out_is_told_in_one_line(library):
     with pytest.raises(UserError, match="num_envs 8 does not fit in memory") as error:
         with memory.explained(CONFIG):

@@ -1,7 +1,7 @@
 """The twelve objects: sizes and masses against their sources, rest, grasp, picture; and a thirteenth."""
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -167,7 +167,7 @@ def test_the_other_pose_comes_up_in_its_share_of_the_episodes_and_stays(share):
     assert other[np.asarray(episode.object_index) == 0].mean() == pytest.approx(share, abs=0.15)
     step = jax.jit(jax.vmap(env.step))
     for _ in range(5):
-        state = step(state, jp.zeros((128, 8)).at[:, 7].set(-1.0))
+        state = step(state, jnp.zeros((128, 8)).at[:, 7].set(-1.0))
     height = np.asarray(state.data.qpos[:, 11])
     np.testing.assert_allclose(height, np.asarray(episode.rest_height), atol=0.002)
     rest = np.where(other, 0.0375, 0.025)
@@ -243,9 +243,9 @@ def test_jax_and_numpy_draw_the_can_alike():
     model, data = place(spec)
     params, _ = sample_params(jax.random.PRNGKey(0), RandomConfig(size=0.0), ObjectTable(("can",)), 0)
     viewer = Viewer(profile, layout)
-    geoms = jax.jit(viewer.geoms)(jp.asarray(data.qpos, jp.float32), params, spec.slot_rgb(layout))
+    geoms = jax.jit(viewer.geoms)(jnp.asarray(data.qpos, jnp.float32), params, spec.slot_rgb(layout))
     batch = jax.tree.map(lambda leaf: leaf[None], geoms)
-    pose = jp.asarray(viewer.nominal_pose, jp.float32)[None]
+    pose = jnp.asarray(viewer.nominal_pose, jnp.float32)[None]
     expected = raycast_numpy.render(model, data, nominal_camera(profile))
     off = np.abs(np.asarray(viewer.depth_mm(batch, pose))[0] - 1000 * expected.depth_m) > 1.0
     assert off.mean() < 1e-3
@@ -301,7 +301,7 @@ def test_a_thirteenth_object_is_one_dataclass(monkeypatch):
         world.reset(seed, "bone")
         assert world.observation()[39] == pytest.approx(np.log(13))
         for _ in range(60):
-            action = np.asarray(act(jp.asarray(world.observation(), jp.float32)))
+            action = np.asarray(act(jnp.asarray(world.observation(), jnp.float32)))
             targets = grasp_math.controls(world.data.qpos[:7], action)
             world.command(targets[:7], close=bool(action[7] > 0))
             world.step(contract.CONTROL_DT_S)

@@ -1,7 +1,7 @@
 """Every backend passes the conformance experiments; the drawn parameters stay in their ranges."""
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -68,11 +68,11 @@ def test_the_experiments_do_what_they_say():
 
 
 def test_inverse_kinematics_reaches_the_pose():
-    position, quat = jp.array([0.42, 0.15, 0.05]), jp.array(HAND_DOWN)
-    q = inverse_kinematics.solve(jp.array(scene.HOME_RAD), position, quat)
-    reached, orientation = kinematics.grip_pose(q, jp)
+    position, quat = jnp.array([0.42, 0.15, 0.05]), jnp.array(HAND_DOWN)
+    q = inverse_kinematics.solve(jnp.array(scene.HOME_RAD), position, quat)
+    reached, orientation = kinematics.grip_pose(q, jnp)
     np.testing.assert_allclose(reached, position, atol=1e-4)
-    assert float(kinematics.angle_between(orientation, quat, jp)) < 5e-3
+    assert float(kinematics.angle_between(orientation, quat, jnp)) < 5e-3
 
 
 def test_randomisation_stays_in_range_and_moves_only_what_it_should(table):

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -59,24 +59,24 @@ def sampler(table):
         def one(key):
             k_params, k_qpos, k_start, k_camera = jax.random.split(key, 4)
             params, size = randomize.sample_params(k_params, config, table, 0)
-            qpos = randomize.sample_qpos(k_qpos, config, jp.asarray(CUBE.rest_height_m))
-            grasp = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], jp.asarray(4), 0.0, jp)
+            qpos = randomize.sample_qpos(k_qpos, config, jnp.asarray(CUBE.rest_height_m))
+            grasp = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], jnp.asarray(4), 0.0, jnp)
             qpos = randomize.maybe_pregrasp(k_start, config, qpos, *grasp)
             turn = CAMERA[:3, :3].T @ randomize.sample_camera(k_camera, config, CAMERA)[:3, :3]
             return {
                 "size": size,
-                "slots": params.slot_size[0] / jp.asarray(CUBE.slot_arrays(table.layout)[0][0]),
+                "slots": params.slot_size[0] / jnp.asarray(CUBE.slot_arrays(table.layout)[0][0]),
                 "object_mass": params.object_mass / CUBE.mass_kg,
-                "object_inertia": params.object_inertia / jp.asarray(CUBE.inertia_kg_m2()),
+                "object_inertia": params.object_inertia / jnp.asarray(CUBE.inertia_kg_m2()),
                 "object_friction": params.object_friction / CUBE.friction,
                 "link_mass_scale": params.link_mass_scale,
                 "joint_damping": params.joint_damping / scene.JOINT_DAMPING_NMS_RAD,
                 "joint_friction": params.joint_friction,
                 "gain_scale": params.gain_scale,
-                "joints": qpos[:7] - jp.asarray(scene.HOME_RAD),
+                "joints": qpos[:7] - jnp.asarray(scene.HOME_RAD),
                 "fingers": qpos[7:9],
                 "camera_position": randomize.sample_camera(k_camera, config, CAMERA)[:3, 3] - CAMERA[:3, 3],
-                "camera_angle": jp.stack([turn[2, 1], turn[0, 2], turn[1, 0]]),
+                "camera_angle": jnp.stack([turn[2, 1], turn[0, 2], turn[1, 0]]),
             }
 
         return jax.vmap(one)(keys)
@@ -130,7 +130,7 @@ def test_ranges_are_drawn_independently(sampler):
 
 
 def test_the_pose_covers_the_workspace_and_all_yaws():
-    qpos = jax.vmap(lambda k: randomize.sample_qpos(k, RandomConfig(), jp.asarray(0.025)))(
+    qpos = jax.vmap(lambda k: randomize.sample_qpos(k, RandomConfig(), jnp.asarray(0.025)))(
         jax.random.split(jax.random.PRNGKey(0), 1000)
     )
     lower = np.subtract(contract.WORKSPACE_CENTER_M, np.array(contract.WORKSPACE_SIZE_M) / 2)
@@ -183,7 +183,7 @@ def test_latency_delays_commands_by_one_step_in_its_share_of_the_episodes():
     state = reset(jax.random.split(jax.random.PRNGKey(0), 64))
     late = np.asarray(state.info["episode"].latency.late)
     assert 16 < late.sum() < 48
-    bend = jp.zeros((64, 8)).at[:, 3].set(0.5).at[:, 7].set(1.0)  # elbow, and close
+    bend = jnp.zeros((64, 8)).at[:, 3].set(0.5).at[:, 7].set(1.0)  # elbow, and close
     path = []
     for action in (bend, -bend, -bend):
         state = step(state, action)

@@ -1,6 +1,6 @@
 """Reward terms against the paper's equations, worked out by hand."""
 
-import jax.numpy as jp
+import jax.numpy as jnp
 import pytest
 
 from ddgrasp.config import RewardConfig
@@ -14,14 +14,14 @@ W = RewardConfig(
 
 def transition(**changes):
     values = {
-        "before": rewards.Distances(jp.array(0.5), jp.array(0.4), jp.array(0.3), jp.array(0.2)),
-        "after": rewards.Distances(jp.array(0.4), jp.array(0.1), jp.array(0.1), jp.array(0.0)),
-        "action": jp.zeros(8).at[7].set(1.0),
-        "last_action": jp.zeros(8).at[7].set(1.0),
-        "acceleration": jp.array([1.0, 2.0, 0, 0, 0, 0, 0]),
-        "grasped": jp.array(False),
-        "lifted": jp.array(False),
-        "hold_count": jp.array(0),
+        "before": rewards.Distances(jnp.array(0.5), jnp.array(0.4), jnp.array(0.3), jnp.array(0.2)),
+        "after": rewards.Distances(jnp.array(0.4), jnp.array(0.1), jnp.array(0.1), jnp.array(0.0)),
+        "action": jnp.zeros(8).at[7].set(1.0),
+        "last_action": jnp.zeros(8).at[7].set(1.0),
+        "acceleration": jnp.array([1.0, 2.0, 0, 0, 0, 0, 0]),
+        "grasped": jnp.array(False),
+        "lifted": jnp.array(False),
+        "hold_count": jnp.array(0),
     }
     return rewards.Transition(**(values | changes))
 
@@ -38,7 +38,7 @@ def test_before_the_grasp():
 
 
 def test_lifting():
-    terms = rewards.terms(W, transition(grasped=jp.array(True), lifted=jp.array(True)))
+    terms = rewards.terms(W, transition(grasped=jnp.array(True), lifted=jnp.array(True)))
     assert float(terms["lift"]) == pytest.approx(3.0 * 0.3)
     assert float(terms["orient"]) == pytest.approx(0.5 * 0.2)
     assert float(terms["reach"]) == 0.0 and float(terms["align"]) == 0.0
@@ -47,26 +47,26 @@ def test_lifting():
 
 @pytest.mark.parametrize(("count", "bonus"), [(0, 0.0), (1, 3.0), (2, 6.0), (3, 12.0), (9, 12.0)])
 def test_bonus_grows_and_stays_bounded(count, bonus):
-    terms = rewards.terms(W, transition(hold_count=jp.array(count)))
+    terms = rewards.terms(W, transition(hold_count=jnp.array(count)))
     assert float(terms["bonus"]) == pytest.approx(bonus)
 
 
 def test_saturation_and_toggle():
-    action = jp.zeros(8).at[0].set(1.0).at[7].set(-1.0)
+    action = jnp.zeros(8).at[0].set(1.0).at[7].set(-1.0)
     terms = rewards.terms(W, transition(action=action))
     assert float(terms["saturation"]) == pytest.approx(-0.01)
     assert float(terms["toggle"]) == pytest.approx(-0.2)
 
 
 def test_every_sideways_step_towards_the_object_shortens_the_way():
-    grasp = jp.array([0.5, 0.0, 0.03])
+    grasp = jnp.array([0.5, 0.0, 0.03])
     way = [
-        float(rewards.approach_distance(jp.array([0.5 + x, 0.0, 0.03 + 0.07]), grasp))
+        float(rewards.approach_distance(jnp.array([0.5 + x, 0.0, 0.03 + 0.07]), grasp))
         for x in (0.2, 0.15, 0.1)
     ]
     assert way == sorted(way, reverse=True)
     near = [
-        float(rewards.approach_distance(jp.array([0.5 + x, 0.0, 0.06]), grasp)) for x in (0.05, 0.03, 0.01)
+        float(rewards.approach_distance(jnp.array([0.5 + x, 0.0, 0.06]), grasp)) for x in (0.05, 0.03, 0.01)
     ]
     assert near == sorted(near, reverse=True)
     assert float(rewards.approach_distance(grasp, grasp)) < 1e-4

@@ -4,7 +4,6 @@ What a value of the configuration may be, the configuration itself knows (ddgras
 files, devices or packages above it.
 """
 
-import dataclasses
 import types
 import typing
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from ddgrasp import artifacts
 from ddgrasp.config import Config, ScoreConfig, WorldConfig
-from ddgrasp.config.checks import check_value, kinds
+from ddgrasp.config.checks import Range, check_value, kinds
 from ddgrasp.errors import UserError
 
 CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
@@ -26,9 +25,16 @@ def check_options(command: Any) -> None:
         value, option = getattr(command, field), f"--{field.replace('_', '-')}"
         if typing.get_origin(kind) is types.UnionType:
             kind = typing.get_args(kind)[0]
-        states = typing.get_origin(kind) in (Annotated, Literal, tuple)
-        if states and value is not None and not dataclasses.is_dataclass(typing.get_args(kind)[0]):
+        if value is not None and _is_stated(kind):
             check_value(option, value, kind)
+
+
+def _is_stated(kind: Any) -> bool:
+    """Whether a type says which values it allows: paths, flags and whole configurations do not."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is tuple:
+        return _is_stated(arguments[0])
+    return origin is Literal or (origin is Annotated and any(isinstance(x, Range) for x in arguments[1:]))
 
 
 def check_config_values(config: Config) -> Config:

@@ -12,7 +12,7 @@ from ddgrasp.errors import UserError, unknown_name
 T = TypeVar("T")
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-_RULE = re.compile(r"^─+$")
+_RULE = re.compile(r"^[─-]{4,}$")
 _CHOICE = re.compile(r"invalid choice '(?P<value>.*)' for argument '-*(?P<option>\S+)'\. Expected one of \(")
 _NUMBER = re.compile(
     r"Error parsing (?P<option>\S+): ((?P<int>invalid literal for int\(\) with base 10)|"
@@ -54,7 +54,10 @@ def refused(box: str, command: str) -> UserError:
 
 
 def _blocks(box: str) -> list[str]:
-    """What stands between the rules of the box, each part on one line, without the title."""
+    """What stands between the rules of the box, each part on one line, without the title.
+
+    On a terminal without UTF-8 the box has no frame, and a rule below its title.
+    """
     lines = [line.strip().strip("│").strip() for line in _COLOUR.sub("", box).splitlines()]
     blocks: list[list[str]] = [[]]
     for line in lines:
@@ -62,4 +65,5 @@ def _blocks(box: str) -> list[str]:
             blocks.append([])
         elif line and line[0] not in "╭╰":
             blocks[-1].append(line)
-    return [" ".join(block) for block in blocks]
+    parts = [" ".join(block) for block in blocks]
+    return parts if "╭" in box else parts[1:]

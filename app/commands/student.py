@@ -90,7 +90,7 @@ class Deploy:
 
 
 def config_of(policy: Path, preset: str | None) -> Config:
-    """The named preset; else what made the artefact beside `policy`; else the default preset."""
+    """The named preset; else what made the artifact beside `policy`; else the default preset."""
     if preset is None and artifacts.is_finished(policy.parent):
         return artifacts.config_from_json(artifacts.read_manifest(policy.parent).config)
     return get_preset(preset or DEFAULT_PRESET)

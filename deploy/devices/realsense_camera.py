@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ddgrasp import contract
+from ddgrasp import contract, depth
 from ddgrasp.errors import UserError
 from deploy.devices.options import Setup
 from deploy.interfaces import CameraError, Clock, Frame, Robot
@@ -92,10 +92,10 @@ class RealSenseCamera:
                 frames = self._pipeline.wait_for_frames(self._timeout_ms)
         except RuntimeError as error:
             raise CameraError(str(error)) from error
-        depth = frames.get_depth_frame() if frames else None
-        if depth and depth.get_frame_number() != self._number:
-            self._number = depth.get_frame_number()
-            self._frame = Frame(self._convert(np.asanyarray(depth.get_data())), self._exposed_s(depth))
+        taken = frames.get_depth_frame() if frames else None
+        if taken and taken.get_frame_number() != self._number:
+            self._number = taken.get_frame_number()
+            self._frame = Frame(self._convert(np.asanyarray(taken.get_data())), self._exposed_s(taken))
         if self._frame is None:
             raise CameraError("the stream has started, but no frame has come yet")
         return self._frame
@@ -106,20 +106,19 @@ class RealSenseCamera:
             self._pipeline = None
 
     def _convert(self, counts: np.ndarray) -> np.ndarray:
-        """(H, W) uint16 millimetres from the full picture in the device's own unit."""
-        middle = self._stride // 2
-        counts = counts[middle :: self._stride, middle :: self._stride]
-        if abs(self._unit_m - contract.DEPTH_UNIT_M) < 1e-9:
-            return counts.copy()  # librealsense reuses its buffer
-        millimetres = counts * (self._unit_m / contract.DEPTH_UNIT_M)
-        return np.rint(np.minimum(millimetres, np.iinfo(np.uint16).max)).astype(np.uint16)
+        """(H, W) uint16 millimetres from the full picture in the device's own unit.
 
-    def _exposed_s(self, depth: Any) -> float:
+        A new array: librealsense reuses its buffer.
+        """
+        size = (self._profile.height_px, self._profile.width_px)
+        return depth.from_counts(depth.resize_nearest(counts, size), self._unit_m)
+
+    def _exposed_s(self, taken: Any) -> float:
         """When the frame was exposed, on the loop's clock: the host's time of day tells its age."""
         now_s = self._clock.now()
-        if depth.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock:
+        if taken.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock:
             return now_s  # the device's own clock cannot be compared: the arrival has to do
-        age_s = time.time() - depth.get_timestamp() * 1e-3
+        age_s = time.time() - taken.get_timestamp() * 1e-3
         return now_s - max(age_s, 0.0)
 
     def _check_focal(self, fx_px: float) -> None:

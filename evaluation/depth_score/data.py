@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from ddgrasp import contract
+from ddgrasp import depth
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path
@@ -58,16 +58,6 @@ class Episode:
         rgb = None if self.rgb is None else np.repeat(self.rgb[:1], count, 0)
         clean = np.repeat(self.clean_mm[:1], count, 0)
         return replace(self, sensed_mm=self.repeats_mm, clean_mm=clean, rgb=rgb)
-
-
-def metres(depth_mm: np.ndarray) -> np.ndarray:
-    """uint16 millimetres -> float32 metres."""
-    return depth_mm.astype(np.float32) * np.float32(contract.DEPTH_UNIT_M)
-
-
-def millimetres(depth_m: np.ndarray) -> np.ndarray:
-    """Metres -> uint16 millimetres, as a camera delivers them."""
-    return np.rint(np.clip(depth_m / contract.DEPTH_UNIT_M, 0, np.iinfo(np.uint16).max)).astype(np.uint16)
 
 
 # --- the rig -------------------------------------------------------------------------------------
@@ -141,7 +131,8 @@ def _clean_mm(world: "RigWorld", camera: "RigCamera", T_world_cam: np.ndarray) -
     from mjx_envs.render.raycast_numpy import render_depth
     from rig.camera import FAR_M
 
-    return millimetres(render_depth(world.model, world.data, camera.stereo.camera(T_world_cam), far_m=FAR_M))
+    depth_m = render_depth(world.model, world.data, camera.stereo.camera(T_world_cam), far_m=FAR_M)
+    return depth.to_millimetres(depth_m)
 
 
 def _save(file: Path, episode: Episode) -> None:
@@ -187,16 +178,14 @@ def load_real(root: Path, width_px: int, last: int) -> RealFrames:
 
     Raises UserError for recordings of different sizes or of unknown optics, or none.
     """
-    from ddg_jax.data import resize_nearest
-
     recordings = _of_one_size(root)
     focal_px, baseline_m = recordings[0].optics()
     size = _size(recordings[0], width_px)
     frames = [(r, i) for r in recordings for i in range(len(r))]
     chosen = frames[-last:]
-    depth = np.stack([resize_nearest(r.depth_mm(i), size) for r, i in chosen])
+    depth_mm = np.stack([depth.crop_nearest(r.depth_mm(i), size) for r, i in chosen])
     rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
-    return RealFrames(len(frames), depth, rgb, focal_px * width_px / recordings[0].width_px, baseline_m)
+    return RealFrames(len(frames), depth_mm, rgb, focal_px * width_px / recordings[0].width_px, baseline_m)
 
 
 def _of_one_size(root: Path) -> list[Recording]:
@@ -218,16 +207,16 @@ def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
     """
     from ddg_jax.data import PIECEWISE, surfaces
 
-    depth, rgb = frames.depth_mm, frames.rgb
-    clean = millimetres(surfaces(metres(depth), PIECEWISE))
+    depth_mm, rgb = frames.depth_mm, frames.rgb
+    clean = depth.to_millimetres(surfaces(depth.to_metres(depth_mm), PIECEWISE))
     episodes = []
     for parity, side in enumerate(SIDES):
-        for block in range(len(depth) // (2 * BLOCK_FRAMES)):
+        for block in range(len(depth_mm) // (2 * BLOCK_FRAMES)):
             rows = np.arange(BLOCK_FRAMES) * 2 + parity + block * 2 * BLOCK_FRAMES
             episodes.append(
                 Episode(
-                    side, len(episodes), block, depth[rows], clean[rows],
-                    np.zeros((0, *depth.shape[1:]), np.uint16), rgb[rows] if with_rgb else None,
+                    side, len(episodes), block, depth_mm[rows], clean[rows],
+                    np.zeros((0, *depth_mm.shape[1:]), np.uint16), rgb[rows] if with_rgb else None,
                     frames.focal_px, frames.baseline_m,
                 )
             )  # fmt: skip

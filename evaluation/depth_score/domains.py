@@ -14,7 +14,8 @@ import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.config import DextrahConfig, ScoreConfig
-from evaluation.depth_score.data import REAL, SIM, Episode, metres, millimetres
+from ddgrasp.depth import to_metres, to_millimetres
+from evaluation.depth_score.data import REAL, SIM, Episode
 
 if TYPE_CHECKING:
     from ddg_jax.prior import Prior
@@ -106,8 +107,8 @@ def _rand_noise(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
     base = contract.D455.scaled(episode.clean_mm.shape[2] / contract.D455.width_px)
     profile = replace(base, fx_px=episode.focal_px, fy_px=episode.focal_px, baseline_m=episode.baseline_m)
     key = jax.random.fold_in(jax.random.key(methods.seed), episode.number)
-    noisy = _dextrah(profile)(key, metres(episode.clean_mm), None)
-    return {"sim_rand_noise": millimetres(np.asarray(noisy))}
+    noisy = _dextrah(profile)(key, to_metres(episode.clean_mm), None)
+    return {"sim_rand_noise": to_millimetres(np.asarray(noisy))}
 
 
 @cache
@@ -133,11 +134,11 @@ def _monocular(name: str) -> Callable[[Methods, Episode], dict[str, np.ndarray]]
         from ddg_jax.network_prior import metric_depth
 
         assert methods.monocular is not None and episode.rgb is not None
-        reference = metres(episode.sensed_mm if episode.side == REAL else episode.clean_mm)
+        reference = to_metres(episode.sensed_mm if episode.side == REAL else episode.clean_mm)
         relative = methods.monocular.from_recording(reference, episode.rgb, np.random.default_rng(0))
         far_m = methods.generator.config.depth.far_m
         fitted = [metric_depth(r, d, far_m) for r, d in zip(relative, reference, strict=True)]
-        return {name: millimetres(np.stack(fitted))}
+        return {name: to_millimetres(np.stack(fitted))}
 
     return make
 
@@ -148,10 +149,10 @@ def _generated(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
     from ddg_jax.sample import generate
 
     made = generate(
-        jax.random.key(methods.seed), methods.generator, metres(episode.clean_mm), episode.rgb,
+        jax.random.key(methods.seed), methods.generator, to_metres(episode.clean_mm), episode.rgb,
         episode=episode.number,
     )  # fmt: skip
-    return {"sim_ddg": millimetres(made.depth_m), "sim_ddg_no_graft": millimetres(made.predicted_m)}
+    return {"sim_ddg": to_millimetres(made.depth_m), "sim_ddg_no_graft": to_millimetres(made.predicted_m)}
 
 
 DOMAINS: dict[str, Domain] = {

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from ddgrasp.depth import to_metres
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path
 from ddgrasp.progress import Progress
 from evaluation.depth_score import holes
-from evaluation.depth_score.data import Episode, metres
+from evaluation.depth_score.data import Episode
 from evaluation.depth_score.domains import Methods, sense, sense_repeats
 from evaluation.depth_score.features import FeatureExtractor
 from evaluation.depth_score.resampling import Sample
@@ -64,18 +65,18 @@ def _score(
     methods: Methods, extractors: Sequence[FeatureExtractor], episode: Episode, names: Sequence[str],
     example: bool,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    clean_m = metres(episode.clean_mm)
+    clean_m = to_metres(episode.clean_mm)
     places = [holes.geometry(frame, episode.focal_px) for frame in clean_m]
     arrays: dict[str, np.ndarray] = {_GROUP: np.array(episode.group)}
     for name, depth_mm in sense(methods, episode, names).items():
-        depth_m = metres(depth_mm)
+        depth_m = to_metres(depth_mm)
         arrays.update({f"{name}|features|{e.name}": e(depth_m) for e in extractors})
         sums = holes.episode_sums(depth_m, clean_m, places)
         arrays.update({f"{name}|sums|{key}": value for key, value in sums.items()})
         if example:
             arrays[f"{name}|example|"] = depth_mm[len(depth_mm) // 2]
     for name, depth_mm in sense_repeats(methods, episode, names).items():
-        sums = holes.repeat_sums(metres(depth_mm))
+        sums = holes.repeat_sums(to_metres(depth_mm))
         arrays.update({f"{name}|sums|{key}": value for key, value in sums.items()})
     return arrays
 

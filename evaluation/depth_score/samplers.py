@@ -16,6 +16,7 @@ import numpy as np
 
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE
+from ddgrasp.depth import to_metres
 from ddgrasp.files import atomic_write_json
 from ddgrasp.job import Job
 from evaluation.depth_score import data as score_data
@@ -96,7 +97,7 @@ def _frames_per_s(generator: "Generator", loads: Sequence[Load]) -> float:
     from ddg_jax.sample import generate
 
     episodes = [load() for load in loads[: TIMED_FRAMES // len(loads[0]().clean_mm) + 1]]
-    depth_m = score_data.metres(np.concatenate([e.clean_mm for e in episodes])[:TIMED_FRAMES])
+    depth_m = to_metres(np.concatenate([e.clean_mm for e in episodes])[:TIMED_FRAMES])
     colours = [e.rgb for e in episodes if e.rgb is not None]
     rgb = np.concatenate(colours)[:TIMED_FRAMES] if colours else None
     generate(jax.random.key(0), generator, depth_m, rgb)

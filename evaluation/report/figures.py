@@ -11,7 +11,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from ddgrasp import contract
+from ddgrasp.depth import to_metres
 
 DEPTH_COLORS = "viridis_r"
 INVALID_RGB = (1.0, 0.0, 1.0)
@@ -22,7 +22,7 @@ MAX_FRAMES = 8
 
 def depth_to_metres(depth: np.ndarray) -> np.ndarray:
     """Depth as float32 metres, 0 = invalid; integer input is millimetres, float input metres."""
-    metres = depth * contract.DEPTH_UNIT_M if np.issubdtype(depth.dtype, np.integer) else depth
+    metres = to_metres(depth) if np.issubdtype(depth.dtype, np.integer) else depth
     return np.where(np.isfinite(metres), metres, 0.0).astype(np.float32)
 
 

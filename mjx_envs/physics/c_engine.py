@@ -3,7 +3,9 @@
 import os
 
 import jax
+import mujoco
 import numpy as np
+from jaxtyping import Float
 from mujoco.batch import Batch
 
 from mjx_envs import devices, scene
@@ -47,7 +49,7 @@ def _threads(shard: int) -> int:
 class _HostBatch:
     """A `mujoco.batch.Batch` of a fixed number of environments."""
 
-    def __init__(self, model, index: ModelIndex, n: int, threads: int):
+    def __init__(self, model: mujoco.MjModel, index: ModelIndex, n: int, threads: int):
         self._model, self._index = model, index
         self._batch = Batch(model, nsim=n, nthread=threads)
         self._params: ModelParams | None = None
@@ -58,7 +60,10 @@ class _HostBatch:
         self._warmstart = self._batch.bind("qacc_warmstart")
         self._sensors = self._batch.bind("sensordata")
 
-    def step(self, params: ModelParams, state: PhysicsState, ctrl, substeps: int) -> PhysicsState:
+    def step(
+        self, params: ModelParams, state: PhysicsState, ctrl: Float[np.ndarray, "n 9"], substeps: int
+    ) -> PhysicsState:
+        """Of all n environments: everything has n rows."""
         self._write_params(params)
         self._qpos[:], self._qvel[:] = state.qpos, state.qvel
         self._warmstart[:], self._ctrl[:] = state.warmstart, ctrl

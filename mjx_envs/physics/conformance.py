@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import numpy as np
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
+from ddgrasp.layout import CONTROLS, QPOS, QVEL
 from mjx_envs import grasp_math, inverse_kinematics, randomize, scene
 from mjx_envs.object_spec import DEFAULT_SLOTS
 from mjx_envs.objects import OBJECTS
@@ -122,7 +123,7 @@ def judge_fall(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict[st
     """Semi-implicit Euler over n steps of h falls g h^2 n (n + 1) / 2."""
     n = _substeps(scenario)
     expected = GRAVITY_M_S2 * SIM_DT_S**2 * n * (n + 1) / 2
-    fallen = seen.qpos[0, :, 11] - seen.qpos[-1, :, 11]
+    fallen = -_travelled(seen)[:, 2]
     return {
         "fall_relative": float(np.max(np.abs(fallen / expected - 1))),
         "fall_from_cpu_m": _object_difference(seen, cpu),
@@ -138,9 +139,9 @@ def sliding() -> Scenario:
     """Cube and block pushed off along x with three friction coefficients each, until they stand still."""
     names = ("cube", "block") * len(SLIDE_FRICTION)
     params, rest = _params(names)
-    friction = jp.repeat(jp.asarray(SLIDE_FRICTION), 2)
+    friction = jnp.repeat(jnp.asarray(SLIDE_FRICTION), 2)
     start = _start([(0.6, 0.2, height) for height in rest])
-    start = replace(start, qvel=start.qvel.at[:, 9].set(SLIDE_SPEED_M_S))
+    start = replace(start, qvel=start.qvel.at[:, QVEL.object_linear.start].set(SLIDE_SPEED_M_S))
     return Scenario(replace(params, object_friction=friction), start, _hold(5))
 
 
@@ -148,7 +149,7 @@ def judge_sliding(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict
     """v^2 / (2 mu g), less the half step by which semi-implicit Euler falls short."""
     mu = contact_friction(np.asarray(scenario.params.object_friction))
     expected = SLIDE_SPEED_M_S**2 / (2 * mu * GRAVITY_M_S2) - SLIDE_SPEED_M_S * SIM_DT_S / 2
-    slid = seen.qpos[-1, :, 9] - seen.qpos[0, :, 9]
+    slid = _travelled(seen)[:, 0]
     return {
         "slide_relative": float(np.max(np.abs(slid / expected - 1))),
         "slide_from_cpu_m": _object_difference(seen, cpu),
@@ -172,14 +173,14 @@ def moving_arm() -> Scenario:
     params, rest = _params()
     start = _start([(0.65, 0.25, height) for height in rest])
     controls = _hold(5)
-    controls[..., :7] += np.array([0.3, -0.2, 0.2, -0.3, 0.3, 0.3, -0.4])
-    controls[..., 7:] = 0.0
+    controls[..., CONTROLS.arm] += np.array([0.3, -0.2, 0.2, -0.3, 0.3, 0.3, -0.4])
+    controls[..., CONTROLS.fingers] = 0.0
     return Scenario(params, start, controls)
 
 
 def judge_arm(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict[str, float]:
     """Joints and fingers at every step against the C engine."""
-    return {"arm_from_cpu_rad": float(np.max(np.abs(seen.qpos[..., :9] - cpu.qpos[..., :9])))}
+    return {"arm_from_cpu_rad": float(np.max(np.abs((seen.qpos - cpu.qpos)[..., : scene.N_ROBOT])))}
 
 
 LIFT_M = 0.12
@@ -191,14 +192,15 @@ def grasp_and_lift() -> Scenario:
     params, rest = _params()
     start = _start([(0.5, 0.0, height) for height in rest])
     specs = [OBJECTS[name] for name in OBJECTS_TRIED]
-    symmetry = jp.array([spec.grasp_symmetry for spec in specs])
-    offset = jp.array([spec.grasp_offset_m for spec in specs])
-    above = jp.array([0.0, 0.0, LIFT_M])
+    symmetry = jnp.array([spec.grasp_symmetry for spec in specs])
+    offset = jnp.array([spec.grasp_offset_m for spec in specs])
+    above = jnp.array([0.0, 0.0, LIFT_M])
 
     def joints(qpos, symmetry, offset):
-        branch = grasp_math.yaw_branch(qpos[12:16], symmetry, jp)
-        pos, quat = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], symmetry, branch, jp, offset)
-        home = jp.asarray(scene.HOME_RAD)
+        branch = grasp_math.yaw_branch(qpos[QPOS.object_quat], symmetry, jnp)
+        pose = qpos[QPOS.object_pos], qpos[QPOS.object_quat]
+        pos, quat = grasp_math.grasp_pose(*pose, symmetry, branch, jnp, offset)
+        home = jnp.asarray(scene.HOME_RAD)
         at = inverse_kinematics.solve(home, pos, quat)
         return at, inverse_kinematics.solve(at, pos + above, quat)
 
@@ -206,13 +208,13 @@ def grasp_and_lift() -> Scenario:
     time = np.arange(_GRASP_STEPS + _LIFT_STEPS + _SETTLE_STEPS)
     share = np.clip((time - _GRASP_STEPS + 1) / _LIFT_STEPS, 0, 1)[:, None, None]
     controls = np.zeros((len(time), len(specs), scene.NU), np.float32)
-    controls[..., :7] = np.asarray(at) + share * np.asarray(lifted - at)
-    return Scenario(params, replace(start, qpos=start.qpos.at[:, :7].set(at)), controls)
+    controls[..., CONTROLS.arm] = np.asarray(at) + share * np.asarray(lifted - at)
+    return Scenario(params, replace(start, qpos=start.qpos.at[:, QPOS.arm].set(at)), controls)
 
 
 def judge_lift(scenario: Scenario, seen: Trajectory, cpu: Trajectory) -> dict[str, float]:
     """Every object risen as commanded; forces on the pads and heights against the C engine."""
-    risen = seen.qpos[-1, :, 11] - seen.qpos[0, :, 11]
+    risen = _travelled(seen)[:, 2]
     held, expected = seen.touch[_GRASP_STEPS - 1 :], cpu.touch[_GRASP_STEPS - 1 :]
     return {
         "lift_error_m": float(np.max(np.abs(risen - LIFT_M))),
@@ -245,7 +247,7 @@ def _params(names: tuple[str, ...] = OBJECTS_TRIED) -> tuple[ModelParams, np.nda
     assert table.layout == DEFAULT_SLOTS
     keys = jax.random.split(jax.random.PRNGKey(0), len(names))
     sample = jax.vmap(lambda key, i: randomize.sample_params(key, RandomConfig(), table, i))
-    params, size = sample(keys, jp.arange(len(names)))
+    params, size = sample(keys, jnp.arange(len(names)))
     return params, table.rest_height[: len(names)] * np.asarray(size)
 
 
@@ -253,7 +255,7 @@ def _start(places) -> PhysicsState:
     """At rest, arm home, gripper open, objects upright at `places` (B, 3)."""
     robot = np.tile([*scene.HOME_RAD, *_OPEN], (len(places), 1))
     qpos = np.concatenate([robot, places, np.tile([1.0, 0, 0, 0], (len(places), 1))], axis=1)
-    return jax.vmap(physics.initial_state)(jp.asarray(qpos, jp.float32))
+    return jax.vmap(physics.initial_state)(jnp.asarray(qpos, jnp.float32))
 
 
 _OPEN = (contract.GRIPPER_MAX_WIDTH_M / 2,) * 2
@@ -270,4 +272,10 @@ def _substeps(scenario: Scenario) -> int:
 
 def _object_difference(seen: Trajectory, cpu: Trajectory) -> float:
     """Largest distance between the objects' positions in the end, m."""
-    return float(np.max(np.linalg.norm(seen.qpos[-1, :, 9:12] - cpu.qpos[-1, :, 9:12], axis=-1)))
+    apart = (seen.qpos[-1] - cpu.qpos[-1])[:, QPOS.object_pos]
+    return float(np.max(np.linalg.norm(apart, axis=-1)))
+
+
+def _travelled(seen: Trajectory) -> np.ndarray:
+    """(B, 3) m, where the objects are in the end less where they began."""
+    return (seen.qpos[-1] - seen.qpos[0])[:, QPOS.object_pos]

@@ -6,15 +6,19 @@ and `mjx_warp` (MJX-Warp), chosen in `backends`; `conformance` says how closely 
 for one environment; use `jax.vmap` for many.
 """
 
-from typing import Protocol
+from types import ModuleType
+from typing import Protocol, runtime_checkable
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
+from jaxtyping import Float
+from mujoco import mjx
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from mjx_envs import scene
 
 
@@ -58,20 +62,25 @@ class PhysicsState:
     """(2,) contact force (N) between the object and the left and right finger pad."""
 
 
+@runtime_checkable
 class Physics(Protocol):
     """One control step of one environment."""
 
-    def step(self, params: ModelParams, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+    def step(self, params: ModelParams, state: PhysicsState, ctrl: Float[jax.Array, "9"]) -> PhysicsState:
         """Advance by one control period with `ctrl` (9,): seven joint and two finger targets."""
         ...
 
 
-def initial_state(qpos: jax.Array) -> PhysicsState:
+def initial_state(qpos: Float[jax.Array, "16"]) -> PhysicsState:
     """At rest in `qpos` (16,), touching nothing."""
-    return PhysicsState(qpos=qpos, qvel=jp.zeros(scene.NV), warmstart=jp.zeros(scene.NV), touch=jp.zeros(2))
+    return PhysicsState(
+        qpos=qpos, qvel=jnp.zeros(scene.NV), warmstart=jnp.zeros(scene.NV), touch=jnp.zeros(2)
+    )
 
 
-def touch_from_sensors(sensordata, xp):
+def touch_from_sensors(
+    sensordata: Float[AnyArray, "*batch forces"], xp: ModuleType
+) -> Float[AnyArray, "*batch 2"]:
     """(..., 2) contact force (N) on the left and right pad from the scene's contact sensors (..., 6 S)."""
     forces = sensordata.reshape(sensordata.shape[:-1] + (2, -1, 3))
     return xp.sqrt(xp.sum(forces**2, axis=-1)).sum(axis=-1)
@@ -89,7 +98,9 @@ class ModelIndex:
         self.arm_actuators = np.arange(scene.N_ARM)
         self._in_subtree = _subtrees(model)
 
-    def fields(self, model, params, xp=np) -> dict:
+    def fields(
+        self, model: mujoco.MjModel | mjx.Model, params: ModelParams, xp: ModuleType = np
+    ) -> dict[str, AnyArray]:
         """Model fields with `params` written in; works batched for NumPy (leading dimensions)."""
         batch = params.object_mass.shape
 
@@ -123,7 +134,7 @@ class ModelIndex:
             "actuator_biasprm": put(bias, (arm, slice(1, 3)), bias[..., arm, 1:3] * gain[..., None]),
         }
 
-    def derived(self, model, fields: dict) -> dict:
+    def derived(self, model: mjx.Model, fields: dict[str, AnyArray]) -> dict[str, jax.Array]:
         """Fields of one environment that MuJoCo precomputes from `fields` and MJX takes as they are (JAX).
 
         Without the first MJX-Warp takes each body's frame of reference for its centre of mass and free
@@ -132,10 +143,10 @@ class ModelIndex:
         """
         obj = self.object_body
         mass, inertia = fields["body_mass"][obj], fields["body_inertia"][obj]
-        inverse = jp.stack([1 / mass, jp.mean(1 / inertia)])
+        inverse = jnp.stack([1 / mass, jnp.mean(1 / inertia)])
         return {
-            "body_subtreemass": jp.asarray(self._in_subtree, jp.float32) @ fields["body_mass"],
-            "body_invweight0": jp.asarray(model.body_invweight0).at[obj].set(inverse),
+            "body_subtreemass": jnp.asarray(self._in_subtree, jnp.float32) @ fields["body_mass"],
+            "body_invweight0": jnp.asarray(model.body_invweight0).at[obj].set(inverse),
         }
 
 

@@ -1,7 +1,7 @@
 """MJX: the same scene on any JAX device."""
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 from mujoco import mjx
 
 from mjx_envs import scene
@@ -20,13 +20,13 @@ class JaxPhysics:
 
     def step(self, params: ModelParams, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         """See `Physics.step`."""
-        fields = self._index.fields(self._mx, params, jp)
+        fields = self._index.fields(self._mx, params, jnp)
         mx = self._mx.replace(**fields, **self._index.derived(self._mx, fields))
         data = mjx.make_data(self._model, impl="jax").replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl
         )
         data, _ = jax.lax.scan(lambda d, _: (_substep(mx, d), None), data, None, self._substeps)
-        touch = touch_from_sensors(data.sensordata, jp)
+        touch = touch_from_sensors(data.sensordata, jnp)
         return PhysicsState(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc_warmstart, touch=touch)
 
 
@@ -39,5 +39,5 @@ def _substep(mx: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.forward(mx, data)
     low, high = mx.actuator_forcerange[:, 0], mx.actuator_forcerange[:, 1]
     free = (data.actuator_force > low) & (data.actuator_force < high)
-    damping = jp.where(free, mx.actuator_biasprm[:, 2], 0.0)
+    damping = jnp.where(free, mx.actuator_biasprm[:, 2], 0.0)
     return mjx.implicit(mx.replace(actuator_biasprm=mx.actuator_biasprm.at[:, 2].set(damping)), data)

@@ -1,7 +1,7 @@
 """MJX-Warp: MuJoCo Warp's kernels on an NVIDIA GPU, called from jitted JAX code."""
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
@@ -70,20 +70,20 @@ class WarpPhysics:
         )
 
         def one(params, state, ctrl):
-            fields = self._index.fields(self._mx, params, jp)
+            fields = self._index.fields(self._mx, params, jnp)
             mx = self._mx.replace(**fields, **self._index.derived(self._mx, fields))
             data = empty.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
             data, _ = jax.lax.scan(lambda d, _: (mjx.step(mx, d), None), data, None, self._substeps)
             return data.qpos, data.qvel, data.qacc_warmstart, data.sensordata
 
         qpos, qvel, warmstart, sensors = jax.vmap(one)(params, state, ctrl)
-        return PhysicsState(qpos=qpos, qvel=qvel, warmstart=warmstart, touch=touch_from_sensors(sensors, jp))
+        return PhysicsState(qpos=qpos, qvel=qvel, warmstart=warmstart, touch=touch_from_sensors(sensors, jnp))
 
     def _advance_nested(self, axis_size, batched, *arguments):
         """`vmap` of `_advance`: one larger batch."""
         leaves, tree = jax.tree.flatten(arguments)
         full = [
-            x if is_batched else jp.broadcast_to(x, (axis_size, *x.shape))
+            x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
             for x, is_batched in zip(leaves, jax.tree.leaves(batched), strict=True)
         ]
         merged = [x.reshape(-1, *x.shape[2:]) for x in full]

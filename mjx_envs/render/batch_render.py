@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
@@ -78,12 +78,12 @@ def warp_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.
     def render(geoms: Geoms, T_world_cam) -> Pictures:
         model, context = _stage(geoms.types, replace(camera, T_world_cam=None), len(geoms.pos_w), depth_only)
         draw = _warp_draw(model, context.pytree(), depth_only)
-        depth, rgb, index = jax.vmap(draw)(geoms, jp.asarray(T_world_cam, jp.float32))
+        depth, rgb, index = jax.vmap(draw)(geoms, jnp.asarray(T_world_cam, jnp.float32))
         depth = depth.reshape(-1, *shape)
-        depth = jp.where(depth <= far_m, depth, 0)
+        depth = jnp.where(depth <= far_m, depth, 0)
         if rgb is None or index is None:
             return Pictures(depth, None, None)
-        ids = jp.array((*(geoms.ids or range(len(geoms.types))), -1), jp.int32)
+        ids = jnp.array((*(geoms.ids or range(len(geoms.types))), -1), jnp.int32)
         colours = mjx.get_rgb(context.pytree(), 0, rgb)
         return Pictures(depth, colours, ids[index].reshape(-1, *shape))
 
@@ -93,11 +93,11 @@ def warp_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.
 def _warp_draw(model: mujoco.MjModel, handle, depth_only: bool):
     """(geoms, T_world_cam) of one scene -> packed (depth, colours, geom indices); to be mapped."""
     mx, empty = mjx.put_model(model, impl="warp"), mjx.make_data(model, impl="warp", naconmax=1, njmax=1)
-    light = jp.asarray([[-c for c in LIGHT_DIRECTION_W]], jp.float32)
-    to_mujoco = jp.array([1.0, -1.0, -1.0])  # its cameras have y up and look along -z
+    light = jnp.asarray([[-c for c in LIGHT_DIRECTION_W]], jnp.float32)
+    to_mujoco = jnp.array([1.0, -1.0, -1.0])  # its cameras have y up and look along -z
 
     def draw(geoms: Geoms, T_world_cam):
-        rgba = jp.concatenate([geoms.rgb, jp.ones_like(geoms.rgb[:, :1])], axis=1)
+        rgba = jnp.concatenate([geoms.rgb, jnp.ones_like(geoms.rgb[:, :1])], axis=1)
         scene = mx.replace(geom_size=geoms.size, geom_rgba=rgba)
         data = empty.replace(
             geom_xpos=geoms.pos_w,

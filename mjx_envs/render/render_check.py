@@ -5,13 +5,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jp
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from scipy import ndimage
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
+from ddgrasp.layout import QPOS
 from mjx_envs import randomize, scene
 from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.objects import OBJECTS
@@ -56,16 +57,18 @@ def random_scenes(count: int, seed: int = 0, camera_scale: float = 0.25) -> Scen
     table = randomize.ObjectTable(tuple(OBJECTS))
     viewer = Viewer(contract.D455.scaled(camera_scale), table.layout)
     config = RandomConfig(joint_rad=0.4, camera_position_m=0.05, camera_angle_rad=0.05)
-    index = jp.arange(count) % len(table.names)
+    index = jnp.arange(count) % len(table.names)
     keys = jax.random.split(jax.random.PRNGKey(seed), (count, 4))
 
     def draw(key, index):
         params, size = randomize.sample_params(key[0], config, table, index)
-        qpos = randomize.sample_qpos(key[1], config, jp.asarray(table.rest_height)[index] * size)
+        qpos = randomize.sample_qpos(key[1], config, jnp.asarray(table.rest_height)[index] * size)
         quat = jax.random.normal(key[2], (4,))
-        qpos = qpos.at[11].add(0.05).at[12:].set(quat / jp.linalg.norm(quat))
+        qpos = (
+            qpos.at[QPOS.object_pos.stop - 1].add(0.05).at[QPOS.object_quat].set(quat / jnp.linalg.norm(quat))
+        )
         T = randomize.sample_camera(key[3], config, viewer.nominal_pose)
-        return params, qpos, T, viewer.geoms(qpos, params, jp.asarray(table.rgb, jp.float32)[index])
+        return params, qpos, T, viewer.geoms(qpos, params, jnp.asarray(table.rgb, jnp.float32)[index])
 
     params, qpos, T, geoms = jax.jit(jax.vmap(draw))(keys, index)
     camera = nominal_camera(viewer.profile)

@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from ddgrasp.config import StereoConfig
-from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
+from ddgrasp.contract import CameraProfile
+from ddgrasp.depth import to_millimetres
 from mjx_envs.camera import Buffers, Camera
 from sensors.models import planes
 from sensors.models.materials import NEAR_INFRARED_RGB, Material
@@ -152,7 +153,7 @@ class ActiveStereo:
         valid = (
             (disparity_px > 0) & (depth_m >= self.config.min_range_m) & (depth_m <= self.config.max_range_m)
         )
-        return np.where(valid, np.rint(depth_m / DEPTH_UNIT_M), 0).astype(np.uint16)
+        return to_millimetres(np.where(valid, depth_m, 0))
 
     def _radiance(
         self,

@@ -11,6 +11,7 @@ import numpy as np
 
 from ddgrasp.config import StereoConfig
 from ddgrasp.contract import D455, CameraProfile
+from ddgrasp.depth import to_millimetres
 from mjx_envs.camera import Buffers, Camera, look_at
 from mjx_envs.render.raycast_numpy import render, render_depth
 from sensors.models.active_stereo import ActiveStereo
@@ -80,7 +81,7 @@ def take_picture(rng: np.random.Generator, device: ActiveStereo) -> Picture:
         return render_depth(model, data, camera, far_m=FAR_M)
 
     stereo_mm = device.sense(draw, T_world_cam, rng, _materials(rng, model), draw_depth)
-    clean_mm = np.rint(draw_depth(device.camera(T_world_cam)) * 1000).astype(np.uint16)
+    clean_mm = to_millimetres(draw_depth(device.camera(T_world_cam)))
     return Picture(clean_mm, stereo_mm, objects, float(T_world_cam[2, 3]), pitch_rad)
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from jax import Array
 
 from ddgrasp.config import StereoConfig
-from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
+from ddgrasp.contract import CameraProfile
+from ddgrasp.depth import to_metres
 from ddgrasp.errors import UserError
 from mjx_envs.camera import nominal_camera
 from sensors.models.active_stereo import ActiveStereo, albedo_texture
@@ -42,7 +43,7 @@ def stereo(config: StereoConfig, profile: CameraProfile) -> Sense:
                 worn = np.clip(rgb[index] * wear, 0, 1)
                 render = from_beside(depth_m[index], worn, profile, T_world_cam)
                 rng = np.random.default_rng(seed[index])
-                out[index] = camera.sense(render, T_world_cam, rng) * np.float32(DEPTH_UNIT_M)
+                out[index] = to_metres(camera.sense(render, T_world_cam, rng))
         return out
 
     def sense_frame(key: Array, depth_m: Array, rgb: Array | None) -> Array:

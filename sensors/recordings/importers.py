@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from ddgrasp.contract import DEPTH_UNIT_M
+from ddgrasp.depth import from_counts
 from ddgrasp.errors import UserError
 from sensors.recordings.recording import FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M, RecordingWriter
 from sensors.recordings.sources import RawFrame, Source
@@ -22,7 +23,6 @@ DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 REALSENSE_SUFFIXES = (".bag", ".db3")
 _ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
-_UINT16_MAX = np.iinfo(np.uint16).max
 
 
 @dataclass(frozen=True)
@@ -105,13 +105,8 @@ def _usable(frame: RawFrame, unit_m: float, size: tuple[int, ...] | None) -> tup
         return None, "colour is missing or cannot be read"
     if size is not None and depth.shape != size:
         return None, f"depth is {depth.shape[1]}x{depth.shape[0]}, the frames before it {size[1]}x{size[0]}"
-    millimetres = np.nan_to_num(depth.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-    millimetres = np.rint(millimetres * (unit_m / DEPTH_UNIT_M))
-    # What does not fit 16 bits is out of a D4xx's range: no reading.
-    millimetres[(millimetres < 0) | (millimetres > _UINT16_MAX)] = 0
-    if not millimetres.any():
-        return None, "no valid depth pixel"
-    return millimetres.astype(np.uint16), ""
+    millimetres = from_counts(depth, unit_m)
+    return (millimetres, "") if millimetres.any() else (None, "no valid depth pixel")
 
 
 def _median_m(frame: RawFrame, unit_m: float) -> list[float]:

@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ddgrasp import depth
 from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
 from sensors.recordings.integrity import inspect_frame
@@ -138,14 +139,11 @@ class Recording:
         raw = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
         if raw is None:
             raise UserError(f"{file}: cannot be decoded as PNG; delete it or copy it again.")
-        scale = self.meta["depth_unit_m"] / DEPTH_UNIT_M
-        if scale == 1.0:
-            return raw
-        return np.rint(np.minimum(raw * scale, np.iinfo(np.uint16).max)).astype(np.uint16)
+        return depth.from_counts(raw, self.meta["depth_unit_m"])
 
     def depth_m(self, index: int) -> np.ndarray:
         """(H, W) float32 planar depth in metres, 0 = invalid."""
-        return self.depth_mm(index).astype(np.float32) * np.float32(DEPTH_UNIT_M)
+        return depth.to_metres(self.depth_mm(index))
 
     def rgb(self, index: int) -> np.ndarray:
         """(h, w, 3) uint8 colour at the colour camera's own size."""

@@ -1,0 +1,90 @@
+"""Depth maps: millimetres on disk and metres in memory, and nearest-neighbour resampling. JAX-free.
+
+Depth is planar. On disk and from cameras: uint16 millimetres. In memory: float32 metres. 0 in both = no
+reading.
+
+Other ways to resize are elsewhere, because they answer other questions: `student_jax.preprocess` (what the
+student's network sees: averaged over valid pixels, exported to ONNX), `ddg_jax.network_prior.at_size` (a
+network's smooth output, averaged) and `foundation.resample` (conventions that published networks were trained
+with).
+"""
+
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ddgrasp.contract import DEPTH_UNIT_M
+
+MAX_MM = 65535
+"""The farthest depth that fits: 65.535 m."""
+
+
+def to_metres(depth_mm: Any) -> Any:
+    """uint16 millimetres to float32 metres, any shape, NumPy or JAX: float32(mm) * float32(0.001).
+
+    The exported graph has the same two operations (export/graph.py), so that all see the same numbers.
+    """
+    return depth_mm.astype(np.float32) * np.float32(DEPTH_UNIT_M)
+
+
+def to_millimetres(depth_m: Any, xp: ModuleType = np) -> Any:
+    """Floating metres to uint16 millimetres, any shape: the nearest, half a millimetre to the even one.
+
+    What is no depth, or does not fit, is no reading: 0 for NaN, infinities, negative values and everything
+    that rounds to more than 65.535 m.
+
+    Args:
+      xp: the array's own namespace, numpy or jax.numpy.
+    """
+    return _whole(xp.round(depth_m / DEPTH_UNIT_M), xp)
+
+
+def from_counts(counts: np.ndarray, unit_m: float) -> np.ndarray:
+    """A device's or a file's numbers, `unit_m` metres each, to uint16 millimetres: a new array of that shape.
+
+    Rounded and refused as by `to_millimetres`, in float64.
+    """
+    if counts.dtype == np.uint16 and unit_m == DEPTH_UNIT_M:
+        return counts.copy()
+    return _whole(np.rint(counts.astype(np.float64) * (unit_m / DEPTH_UNIT_M)), np)
+
+
+def _whole(millimetres: Any, xp: ModuleType) -> Any:
+    fits = (millimetres >= 0) & (millimetres <= MAX_MM)  # False for NaN
+    return xp.where(fits, millimetres, 0).astype(np.uint16)
+
+
+# --- nearest neighbours --------------------------------------------------------------------------
+
+
+def resize_nearest(maps: Any, size: Sequence[int]) -> Any:
+    """(..., H, W) to (..., *size), NumPy or JAX: each pixel is the one that lies under its centre.
+
+    Pixel i of n takes pixel floor((i + 1/2) N / n) of N: centres lie at i + 1/2, as in
+    `contract.CameraProfile`. At a factor of 2 that is pixel 1, 3, 5, ...; OpenCV's INTER_NEAREST takes the
+    one under the left edge, floor(i N / n): 0, 2, 4, ... A centre on the line between two pixels is the
+    right one's.
+
+    Nothing is interpolated: a hole stays a hole, a depth stays a measured depth.
+    """
+    if maps.shape[-2:] == tuple(size):
+        return maps
+    rows, columns = (_under_centres(had, n, had, n) for had, n in zip(maps.shape[-2:], size, strict=True))
+    return maps[..., rows[:, None], columns]
+
+
+def crop_nearest(maps: Any, size: Sequence[int]) -> Any:
+    """The same after a centred crop to the shape of `size`: both axes are scaled alike."""
+    (height, width), (rows, columns) = maps.shape[-2:], size
+    had, n = (height, rows) if height * columns <= width * rows else (width, columns)
+    return maps[..., _under_centres(height, rows, had, n)[:, None], _under_centres(width, columns, had, n)]
+
+
+def _under_centres(length: int, out: int, had: int, n: int) -> np.ndarray:
+    """(out,) pixels of an axis under the centres of `out` pixels that are had / n wide and centred on it.
+
+    floor((i + 1/2) s + (length - out s) / 2), s = had / n, in whole numbers: floats miss ties.
+    """
+    return ((2 * np.arange(out) + 1 - out) * had + length * n) // (2 * n)

@@ -1,0 +1,227 @@
+"""The configuration checks itself: every field has bounds or choices, from Python and the command line."""
+
+import dataclasses
+import math
+import typing
+from typing import Annotated, Literal
+
+import numpy as np
+import pytest
+
+from app.cli import main
+from ddg_jax import prior, sensor
+from ddgrasp.config import (
+    Config,
+    DDGConfig,
+    DDGTrainingConfig,
+    DepthFeatureConfig,
+    DextrahConfig,
+    EncoderConfig,
+    HandViewConfig,
+    HeadConfig,
+    HostsConfig,
+    PriorSource,
+    SamplingConfig,
+    Section,
+    SensorConfig,
+    StudentConfig,
+    TeacherConfig,
+    UNetConfig,
+    WorldConfig,
+)
+from ddgrasp.config.checks import FreeText, Range, kinds
+from ddgrasp.config.score import Monocular
+from ddgrasp.config.sensors import SENSORS
+from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
+from foundation import catalog
+from learning import diffusion
+
+ROOTS = (Config, SensorConfig, HostsConfig, DepthFeatureConfig)
+
+
+def sections(config: type) -> dict[str, type]:
+    """Every dataclass in a configuration, by its full name."""
+    found = {config.__name__: config}
+    for kind in kinds(config).values():
+        if dataclasses.is_dataclass(kind):
+            found |= sections(typing.cast(type, kind))
+    return found
+
+
+ALL = {name: section for root in ROOTS for name, section in sections(root).items()}
+
+
+def leaves(kind) -> list:
+    """The types of single values in a field's type."""
+    if typing.get_origin(kind) is tuple:
+        return [leaf for item in typing.get_args(kind) if item is not Ellipsis for leaf in leaves(item)]
+    return [kind]
+
+
+@pytest.mark.parametrize("name", sorted(ALL))
+def test_every_field_states_what_it_may_hold_and_what_it_is_for(name):
+    assert issubclass(ALL[name], Section)
+    for field, kind in kinds(ALL[name]).items():
+        for leaf in leaves(kind):
+            origin, arguments = typing.get_origin(leaf), typing.get_args(leaf)
+            if origin is Annotated:
+                wanted = FreeText if arguments[0] is str else Range
+                assert any(isinstance(extra, wanted) for extra in arguments[1:]), (name, field)
+            else:
+                assert origin is Literal or leaf is bool or leaf in ALL.values(), (name, field)
+
+
+@pytest.mark.parametrize("name", sorted(ALL))
+def test_every_number_is_held_to_its_bounds(name):
+    default = ALL[name]() if name != "Config" else Config("test")
+    for field, kind in kinds(ALL[name]).items():
+        if typing.get_origin(kind) is not Annotated or typing.get_args(kind)[0] is str:
+            continue
+        number, bounds = typing.get_args(kind)[:2]
+        beyond = [bounds.least - 1, bounds.most + 1, *([bounds.least] if bounds.above else [])]
+        for value in (*beyond, math.nan, math.inf, "1", None, True):
+            value = number(value) if value in beyond else value
+            with pytest.raises(UserError, match=rf"{field} is .*; expected "):
+                dataclasses.replace(default, **{field: value})
+        if number is int:
+            with pytest.raises(UserError, match="expected a whole number"):
+                dataclasses.replace(default, **{field: 1.5})
+
+
+@pytest.mark.parametrize("name", sorted(ALL))
+def test_every_choice_suggests_the_nearest(name):
+    default = ALL[name]() if name != "Config" else Config("test")
+    for field, kind in kinds(ALL[name]).items():
+        if typing.get_origin(kind) is Literal and isinstance(typing.get_args(kind)[0], str):
+            choice = max(typing.get_args(kind), key=len)
+            with pytest.raises(UserError, match=rf"Unknown \S*{field} '{choice}x'\. Did you mean '{choice}'"):
+                dataclasses.replace(default, **{field: choice + "x"})
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert UNetConfig(space_to_depth=np.int64(2)).space_to_depth == 2  # pyright: ignore
+    assert SamplingConfig(eta=np.float32(0.5)).eta == 0.5  # pyright: ignore
+
+
+def test_a_field_without_bounds_is_an_error_of_the_programmer():
+    @dataclasses.dataclass(frozen=True)
+    class Forgetful(Section, name="forgetful"):
+        count: int = 1
+
+    with pytest.raises(TypeError, match="forgetful.count has type .* which states no bounds"):
+        Forgetful()
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda: WorldConfig(sim_dt_s=0.003), "world.sim_dt_s is 0.003; expected a step that divides"),
+        (lambda: TeacherConfig(num_envs=10, minibatches=4), "num_envs 10 is no multiple of"),
+        (lambda: UNetConfig(widths=(8, 8), blocks=(1,)), "expected one number per level"),
+        (lambda: UNetConfig(widths=(8, 10), blocks=(0, 0)), "attention_heads is 4; expected a divisor"),
+        (lambda: UNetConfig(widths=()), "ddg.unet.widths is empty; expected at least one"),
+        (lambda: DDGConfig(sampling=SamplingConfig(steps=2000)), "steps is 2000; expected 1 to 1000"),
+        (lambda: DDGConfig(unet=UNetConfig(space_to_depth=64)), "folds 256 x 256 pixels into one"),
+        (lambda: DDGTrainingConfig(snr_limits=(2.0, math.nan)), "snr_limits is nan; expected a finite"),
+        (lambda: HeadConfig(chunk=2, execute_steps=3), "execute_steps is 3: expected 1 to"),
+        (lambda: HeadConfig(ddim_steps=60), "ddim_steps is 60; expected 1 to 50"),
+        (lambda: HeadConfig(aux_to_head=False), "are both off: turn one on"),
+        (lambda: HeadConfig(time_features=7), "time_features is 7; expected a multiple of 2"),
+        (lambda: EncoderConfig(width=12), "width is 12; expected a multiple of 8, as norm group"),
+        (lambda: HandViewConfig(size_px=6), "size_px is 6; expected a multiple of 4"),
+        (lambda: StudentConfig(hand_view=HandViewConfig(width=12)), "hand_view.width is 12; expected"),
+        (lambda: DextrahConfig(random_near_m=3.0), "random_near_m is 3.0; expected at most random_far_m"),
+    ],
+)
+def test_values_that_do_not_fit_each_other_are_refused(make, expected):
+    with pytest.raises(UserError, match=expected):
+        make()
+
+
+def test_stages_that_do_not_fit_each_other_are_refused():
+    config = PRESETS["demo"]
+    for changes, expected in (
+        ({"world": dataclasses.replace(config.world, camera_scale=0.125)}, "the camera's crop window has 56"),
+        ({"export": dataclasses.replace(config.export, ddim_steps=51)}, "export.ddim_steps is 51; expected"),
+        ({"deploy": dataclasses.replace(config.deploy, execute_steps=3)}, "deploy.execute_steps is 3"),
+    ):
+        with pytest.raises(UserError, match=expected):
+            dataclasses.replace(config, **changes)
+    training = dataclasses.replace(config.student.training, crop_shift_px=40)
+    with pytest.raises(UserError, match="crop_shift_px is 40; expected 0 to 34"):
+        dataclasses.replace(config, student=dataclasses.replace(config.student, training=training))
+
+
+def test_choices_are_those_that_the_code_knows():
+    built_in, networks = set(prior._BUILT_IN), set(prior.NETWORKS)
+    assert set(typing.get_args(PriorSource)) == built_in | networks
+    assert set(typing.get_args(Monocular)) == {catalog.IMAGE_DEPTH, catalog.VIDEO_DEPTH}
+    assert set(SENSORS) == set(sensor.SENSORS)
+    assert {"linear", "cosine"} == set(diffusion._BETAS)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        # the choices and ranges that a person mistypes
+        "run --student.encoder.pooling spatialsoftmax => Did you mean 'spatial_softmax'? Known: mean,",
+        "run --ddg.diffusion.schedule cosin => Did you mean 'cosine'? Known: cosine, linear",
+        "run --world.sim-dt-s 0 => world.sim_dt_s is 0.0; expected 0.0001 to 0.1",
+        "run --teacher.learning-rate -1 => teacher.learning_rate is -1.0; expected above 0, up to 1",
+        "run --student.training.steps -5 => student.training.steps is -5; expected at least 0",
+        "run --world.random.size -3 => world.random.size is -3.0; expected 0 to 0.5",
+        # every command that takes a configuration
+        "teacher train --world.backend cuda => Unknown world.backend 'cuda'",
+        "teacher train --world.sim-dt-s nan => expected a finite number",
+        "teacher train --teacher.hidden => teacher.hidden is empty; expected at least one",
+        "teacher train --hosts.processes 0 => hosts.processes is 0; expected at least 1",
+        "teacher eval --world.camera-scale 7 => world.camera_scale is 7.0; expected 0.1 to 1",
+        "teacher eval --trials 0 => --trials is 0; expected at least 1",
+        "teacher compare runs/x --backends cpu mjx => Unknown backends 'mjx'",
+        "demos collect --demos.noise-share 1.5 => demos.noise_share is 1.5; expected 0 to 1",
+        "demos collect --demos.parallel 1000000 => demos.parallel is 1000000; expected at most 65536",
+        "record --record.stereo.block-px 4 => record.stereo.block_px is 4; expected an odd number",
+        "record --record.frames -1 => record.frames is -1; expected at least 1",
+        "record import x --depth-unit-m 5 => --depth-unit-m is 5.0; expected 0 to 1",
+        "ddg fit --ddg.unet.widths 8 8 => expected one number per level in each",
+        "ddg fit --ddg.training.learning-rate inf => expected a finite number",
+        "ddg fit --ddg.prior.in-sim deph => Unknown ddg.prior.in_sim 'deph'. Did you mean 'depth'?",
+        "ddg fit --data nowhere => --data is nowhere, which does not exist",
+        "ddg sample --model x --data x --seed -1 => --seed is -1; expected at least 0",
+        "ddg distil --model x --data x --evaluations 0 => --evaluations is 0; expected at least 1",
+        "ddg generate --model x --demos x --seed -1 => --seed is -1; expected at least 0",
+        "ddg score --columns sim_gt dgd => Unknown columns 'dgd'. Did you mean 'ddg'?",
+        "ddg score --features resnet => Unknown features 'resnet'. Did you mean 'resnet18'?",
+        "ddg score --features resnet18 => weights",
+        "ddg curve --curve-trajectories 5 0 => score.curve_trajectories is 0; expected at least 1",
+        "ddg samplers --trajectories 1 => score.trajectories is 1; expected at least 2",
+        "ddg features --steps 0 => features.steps is 0; expected at least 1",
+        "student train --student.head.chunk 1 --student.head.execute-steps 2 => execute_steps is 2: expected",
+        "student train --student.picture.height-px 110 => height_px is 110; expected a multiple of 4",
+        "student train --student.picture.height-px 400 => the camera's crop window has 112 x 145",
+        "student train --student.picture.channels depht => Did you mean 'depth'?",
+        "student train --student.encoder.output-stride 5 => expected one of 4, 8, 16, 32",
+        "student train --student.training.batch-size 1.5 => expected a whole number",
+        "student eval runs/x --trials many => --trials is 'many'; expected a whole number",
+        "export --export.max-abs-diff 0 => export.max_abs_diff is 0.0; expected above 0, up to 1",
+        "deploy --deploy.workspace-lower-m 0.9 0 0 => expected the lower corner below the upper one",
+        "deploy --robot ur5 => Unknown robot 'ur5'. Known: franka, sim",
+        "deploy --world.objects cub => Unknown object 'cub'. Did you mean 'cube'?",
+        "sensors compare --frames 1 => --frames is 1; expected at least 2",
+        "objects sheet --objects cub => Unknown object 'cub'. Did you mean 'cube'?",
+        # names that are no options, and values that are missing
+        "run --student.train-steps 5 => Unrecognized options: --student.train-steps",
+        "run --seed => Missing value for argument '--seed'",
+        "weights convert => Missing from ddgrasp weights convert",
+    ],
+)
+def test_a_mistake_gets_one_line_and_leaves_nothing_behind(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments, expected = command.split(" => ")
+    assert main(arguments.split()) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith("ddgrasp: ") and told.err.count("\n") == 1, told.err
+    assert expected in told.err
+    assert told.out == ""
+    assert list(tmp_path.iterdir()) == []
