@@ -94,7 +94,7 @@ def training_depth(settings: Config, source, demos: EpisodeStore, folder: Path, 
     if have:
         begun = EpisodeStore(folder / "begun.zarr", create=True)
         for i in range(have):
-            rows = ([0, *frames.ends][i], frames.ends[i])
+            rows = ([0, *frames.ends.tolist()][i], int(frames.ends[i]))
             begun.append(
                 {name: frames.steps(name, *rows) for name in frames.fields}, {"from_demo": np.bool_(True)}
             )
