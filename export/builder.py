@@ -1,10 +1,15 @@
 """A thin writer of ONNX nodes: every method adds one operator and returns the name of its output."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import onnx
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 from onnx import TensorProto, helper, numpy_helper
+
+from ddgrasp.arrays import AnyArray
 
 OPSET = 18
 IR_VERSION = 10
@@ -21,13 +26,13 @@ class GraphBuilder:
         self.constants: dict[str, onnx.TensorProto] = {}
         self._names_of_constants: dict[tuple, str] = {}
 
-    def op(self, kind: str, *inputs: str, **attributes) -> str:
+    def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
         """One operator with one output."""
         output = f"{kind.lower()}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
         return output
 
-    def constant(self, value, dtype: type = np.float32) -> str:
+    def constant(self, value: ArrayLike, dtype: type = np.float32) -> str:
         """An initializer."""
         array = np.ascontiguousarray(value, dtype)
         key = (array.dtype.str, array.shape, array.tobytes())
@@ -77,17 +82,25 @@ class GraphBuilder:
         """(B, 1), one of (B, n)."""
         return self.columns(x, slice(index, index + 1))
 
-    def dense(self, x: str, params: dict) -> str:
+    def dense(self, x: str, params: Mapping[str, AnyArray]) -> str:
         """Flax Dense on (B, n): x @ kernel + bias."""
         return self.affine(x, params["kernel"], params.get("bias"))
 
-    def affine(self, x: str, kernel: np.ndarray, bias: np.ndarray | None = None) -> str:
+    def affine(
+        self, x: str, kernel: Float[AnyArray, "n m"], bias: Float[AnyArray, " m"] | None = None
+    ) -> str:
         """(B, n) @ (n, m) + (m,)."""
         inputs = [x, self.constant(kernel)] + ([] if bias is None else [self.constant(bias)])
         return self.op("Gemm", *inputs)
 
     def conv(
-        self, x: str, kernel: np.ndarray, bias: np.ndarray | None = None, *, stride: int = 1, pad: int = 0
+        self,
+        x: str,
+        kernel: Float[AnyArray, "h w channels_in channels"],
+        bias: Float[AnyArray, " channels"] | None = None,
+        *,
+        stride: int = 1,
+        pad: int = 0,
     ) -> str:
         """NCHW convolution with a Flax (h, w, in, out) kernel and symmetric padding."""
         weights = np.transpose(kernel, (3, 2, 0, 1))
