@@ -78,17 +78,23 @@ _GROUPS_OF_2: dict[str, dict[str, dict[str, str]]] = {
 _DROPPED_AFTER_1 = {"world.random.crop_px": 24}
 """Fields of version 1 that version 2 lacks, with the value that they had."""
 
+_ADDED_AFTER_1 = {"student.depth_source": "learned"}
+"""Fields that version 1 lacked, with what it did."""
+
 
 def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     """The JSON of a configuration of an earlier version with the fields of this one.
 
-    Fields that it lacks stay away, and fields that no version knows stay where they are.
+    Other fields that it lacks stay away, and fields that no version knows stay where they are.
     """
     made = copy.deepcopy(dict(config))
     if version < 2:
         for name in _DROPPED_AFTER_1:
             section, field = _section_of(made, name)
             section.pop(field, None)
+        for name, value in _ADDED_AFTER_1.items():
+            section, field = _section_of(made, name)
+            section.setdefault(field, value)
         for section, groups in _GROUPS_OF_2.items():
             if section in made:
                 made[section] = _grouped(made[section], groups)
@@ -102,6 +108,9 @@ def as_version_1(config: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in _DROPPED_AFTER_1.items():
         section, field = _section_of(made, name)
         section[field] = value
+    for name in _ADDED_AFTER_1:
+        section, field = _section_of(made, name)
+        section.pop(field, None)
     for section, groups in _GROUPS_OF_2.items():
         taken = {group: made[section].pop(group) for group in groups}
         for group, fields in groups.items():

@@ -9,8 +9,10 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import RandomConfig
 from mjx_envs import kinematics, scene
 
@@ -60,7 +62,14 @@ def dynamics(config: RandomConfig, units: Units) -> Dynamics:
     )
 
 
-def start_qpos(config: RandomConfig, joints, xy, yaw_rad, rest_height_m, xp: ModuleType = np):
+def start_qpos(
+    config: RandomConfig,
+    joints: Float[AnyArray, "7"],
+    xy: Float[AnyArray, "2"],
+    yaw_rad: Float[AnyArray, ""],
+    rest_height_m: Float[AnyArray, ""] | float,
+    xp: ModuleType = np,
+) -> Float[AnyArray, "16"]:
     """(16,) joints around home, gripper open, object at rest on the table.
 
     Args:
@@ -77,7 +86,12 @@ def start_qpos(config: RandomConfig, joints, xy, yaw_rad, rest_height_m, xp: Mod
     return xp.concatenate([q_arm, fingers, place, height, kinematics.quat_about_z(yaw_rad, xp)])
 
 
-def displaced(T_world_cam, shift_m, turn, xp: ModuleType = np):
+def displaced(
+    T_world_cam: Float[AnyArray, "4 4"],
+    shift_m: Float[AnyArray, "3"],
+    turn: Float[AnyArray, "4"],
+    xp: ModuleType = np,
+) -> Float[AnyArray, "4 4"]:
     """(4, 4) camera pose moved by `shift_m` (3,) in the world and turned by the quaternion `turn` (4,) about
     its own axes."""
     rotation = T_world_cam[:3, :3] @ kinematics.quat_to_mat(turn, xp)

@@ -16,9 +16,13 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
+
+from ddgrasp.arrays import AnyArray
 
 _HIDDEN_M = 0.001
 
+Factor = Float[AnyArray, ""] | float
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -139,7 +143,7 @@ class ObjectModel(NamedTuple):
     friction: Any
     """Sliding friction coefficient."""
 
-    def scaled(self, size, mass, friction) -> "ObjectModel":
+    def scaled(self, size: Factor, mass: Factor, friction: Factor) -> "ObjectModel":
         """One object with all lengths, its mass and its friction times these factors."""
         return ObjectModel(
             slot_size=self.slot_size * size,

@@ -25,14 +25,14 @@ def add_noisy_demos(
     out. UserError if the source needs colour that the demos lack.
     """
     check_colour(source, demos)
-    ends = np.concatenate([[0], demos.ends])
+    ends = [0, *demos.ends.tolist()]
     held = np.split(demos.steps("held"), ends[1:-1])
     lengths = [useful_steps(episode, config.student.training.demo_held_steps) for episode in held]
     keep_clean = np.random.default_rng(config.seed).random(len(demos)) < config.student.training.clean_share
     chosen = np.flatnonzero(~keep_clean)
 
     def read(i: int) -> Clip:
-        rows = int(ends[chosen[i]]), int(ends[chosen[i]]) + lengths[chosen[i]]
+        rows = ends[chosen[i]], ends[chosen[i]] + lengths[chosen[i]]
         rgb = demos.steps("rgb", *rows) if source.needs_rgb else None
         return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb)
 

@@ -61,7 +61,7 @@ def grip_chain() -> list[tuple[np.ndarray, np.ndarray]]:
 
     One entry for each arm joint; `grip_tip` is p.
     """
-    return [(kinematics.quat_to_mat(np.array(link.quat)), np.array(link.pos_m)) for link in scene.ARM_LINKS]
+    return [(kinematics.quat_to_mat(np.array(link.quat, float)), np.array(link.pos_m)) for link in scene.ARM_LINKS]
 
 
 def grip_tip() -> np.ndarray:

@@ -38,7 +38,7 @@ def weights(tmp_path_factory):
 
 def config(weights, in_sim: PriorInSim = "depth", depth=DDGDepthConfig()) -> DDGConfig:  # noqa: B008
     prior = PriorConfig(source="depth_anything_v2", weights=str(weights), input_px=28, in_sim=in_sim)
-    return DDGConfig(prior=PriorConfig(source=prior), depth=depth)
+    return DDGConfig(prior=prior, depth=depth)
 
 
 def test_recordings_and_simulation_on_rgb_see_the_network(weights):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ddgrasp import contract
+from ddgrasp.config import CAMERAS, ROBOTS
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy.clock import SimClock
@@ -168,6 +169,7 @@ def test_every_pair_is_refused_or_can_be_made(recording):
                 refused.add((robot, camera))
                 continue
             made[robot, camera] = registry.make_devices(Setup(preset, options, info, SimClock()))
+    assert set(registry.ROBOTS) == set(ROBOTS) and set(registry.CAMERAS) == set(CAMERAS)
     assert refused == set(registry.REFUSED) == {("franka", "stereo"), ("franka", "replay")}
     names = {pair: tuple(type(device).__name__ for device in devices) for pair, devices in made.items()}
     assert names == {

@@ -1,7 +1,11 @@
 """The configuration checks itself: every field has bounds or choices, from Python and the command line."""
 
+import ast
 import dataclasses
+import inspect
+import itertools
 import math
+import textwrap
 import typing
 from typing import Annotated, Literal
 
@@ -70,6 +74,19 @@ def test_every_field_states_what_it_may_hold_and_what_it_is_for(name):
                 assert any(isinstance(extra, wanted) for extra in arguments[1:]), (name, field)
             else:
                 assert origin is Literal or leaf is bool or leaf in ALL.values(), (name, field)
+
+
+@pytest.mark.parametrize("name", sorted(ALL))
+def test_every_field_has_a_help_text(name):
+    body = ast.parse(textwrap.dedent(inspect.getsource(ALL[name]))).body[0].body  # pyright: ignore
+    told = {
+        before.target.id
+        for before, after in itertools.pairwise(body)
+        if isinstance(before, ast.AnnAssign) and isinstance(after, ast.Expr)
+    }
+    sub = {field for field, kind in kinds(ALL[name]).items() if kind in ALL.values()}
+    assert kinds(ALL[name]).keys() - sub <= told
+    assert ALL[name].__doc__
 
 
 @pytest.mark.parametrize("name", sorted(ALL))
@@ -189,8 +206,8 @@ def test_choices_are_those_that_the_code_knows():
         "ddg fit --ddg.prior.in-sim deph => Unknown ddg.prior.in_sim 'deph'. Did you mean 'depth'?",
         "ddg fit --data nowhere => --data is nowhere, which does not exist",
         "ddg sample --model x --data x --seed -1 => --seed is -1; expected at least 0",
-        "ddg distil --model x --data x --evaluations 0 => --evaluations is 0; expected at least 1",
-        "ddg generate --model x --demos x --seed -1 => --seed is -1; expected at least 0",
+        "ddg distil --model x --data x --out x --evaluations 0 => --evaluations is 0; expected at least 1",
+        "ddg generate --model x --demos x --out x --seed -1 => --seed is -1; expected at least 0",
         "ddg score --columns sim_gt dgd => Unknown columns 'dgd'. Did you mean 'ddg'?",
         "ddg score --features resnet => Unknown features 'resnet'. Did you mean 'resnet18'?",
         "ddg score --features resnet18 => weights",

@@ -11,7 +11,7 @@ from app.commands.checks import check_config_values
 from ddg_jax import generate, sample, train
 from ddg_jax.prior import make_prior
 from ddg_jax.sensor import BY_COLOUR, SENSORS
-from ddgrasp import artifacts, config, contract
+from ddgrasp import artifacts, config, contract, upgrades
 from ddgrasp.config import (
     Config,
     DDGConfig,
@@ -94,7 +94,7 @@ def training_depth(settings: Config, source, demos: EpisodeStore, folder: Path, 
     if have:
         begun = EpisodeStore(folder / "begun.zarr", create=True)
         for i in range(have):
-            rows = ([0, *frames.ends][i], frames.ends[i])
+            rows = ([0, *frames.ends.tolist()][i], int(frames.ends[i]))
             begun.append(
                 {name: frames.steps(name, *rows) for name in frames.fields}, {"from_demo": np.bool_(True)}
             )
@@ -183,6 +183,12 @@ def test_the_rigs_camera_looks_at_clean_depth_in_colour(demos, tmp_path):
     assert np.mean(source.frames(depth, dark, number, number) > 0) < np.mean(seen > 0) - 0.2
     with pytest.raises(UserError, match=r"holds no colour, .* --demos.rgb"):
         training_depth(settings, source, demos, tmp_path)
+
+
+def test_students_from_before_there_was_a_choice_were_trained_on_learned_depth():
+    flat = upgrades.as_version_1(artifacts.to_json(with_source("dextrah")))
+    assert "depth_source" not in flat["student"]
+    assert upgrades.upgraded(flat, 1)["student"]["depth_source"] == "learned"
 
 
 def test_missing_colour_is_refused_before_the_first_stage():

@@ -1,8 +1,6 @@
 """Each range of RandomConfig moves what it names, over its whole width, and nothing else."""
 
 from dataclasses import fields, replace
-from types import SimpleNamespace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -53,8 +51,10 @@ def sampler(table):
 
     @jax.jit
     def draw_all(ranges, keys):
-        # traced numbers, one program for all ranges: no RandomConfig, which checks its values
-        config: Any = SimpleNamespace(**dict(zip(names, ranges, strict=True)))
+        # traced numbers, one program for all ranges: a RandomConfig without the checks of its values
+        config = object.__new__(RandomConfig)
+        for name, value in zip(names, ranges, strict=True):
+            object.__setattr__(config, name, value)
 
         def one(key):
             k_params, k_qpos, k_start, k_camera = jax.random.split(key, 4)

@@ -82,6 +82,7 @@ class Config(Section):
     """Everything a run needs; a preset is one value of this."""
 
     preset: Text
+    """Name of the preset that the values started from."""
     seed: Seed = 0
     """Of all random numbers."""
     world: WorldConfig = field(default_factory=WorldConfig)

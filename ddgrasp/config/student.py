@@ -27,6 +27,8 @@ Stem = Literal["conv7", "space_to_depth"]
 Norm = Literal["group", "none"]
 Pooling = Literal["spatial_softmax", "tokens", "mean"]
 Conditioning = Literal["film", "concat"]
+Source = Sensor
+"""Every camera model is a depth source; others (student_jax/depth_source.py) are added to this Literal."""
 STEM_STRIDE = 4
 """Picture pixels per side and position after the encoder's stem; sizes must be multiples of it."""
 GROUP_CHANNELS = 8
@@ -227,7 +229,7 @@ class StudentConfig(Section, name="student"):
     dagger: DaggerConfig = field(default_factory=DaggerConfig)
     init_from: Text = ""
     """Run directory or pretrained folder whose student to start from; empty starts from nothing."""
-    depth_source: Sensor = "learned"
+    depth_source: Source = "learned"
     """What gives the demos' clean depth a camera's artefacts: learned (the run's generator), ideal (nothing),
     dextrah, kinect or stereo (the rig's camera on the clean picture; needs demos.rgb)."""
 
