@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 import onnx
-from jaxtyping import Float
-from numpy.typing import ArrayLike
+from jaxtyping import Real, Shaped
 from onnx import TensorProto, helper, numpy_helper
 
 from ddgrasp.arrays import AnyArray
@@ -32,7 +31,9 @@ class GraphBuilder:
         self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
         return output
 
-    def constant(self, value: ArrayLike, dtype: type = np.float32) -> str:
+    def constant(
+        self, value: Shaped[AnyArray, "..."] | Sequence[float] | float, dtype: type = np.float32
+    ) -> str:
         """An initializer."""
         array = np.ascontiguousarray(value, dtype)
         key = (array.dtype.str, array.shape, array.tobytes())
@@ -86,18 +87,16 @@ class GraphBuilder:
         """Flax Dense on (B, n): x @ kernel + bias."""
         return self.affine(x, params["kernel"], params.get("bias"))
 
-    def affine(
-        self, x: str, kernel: Float[AnyArray, "n m"], bias: Float[AnyArray, " m"] | None = None
-    ) -> str:
-        """(B, n) @ (n, m) + (m,)."""
+    def affine(self, x: str, kernel: Real[AnyArray, "n m"], bias: Real[AnyArray, " m"] | None = None) -> str:
+        """(B, n) @ (n, m) + (m,); both become float32, as all constants."""
         inputs = [x, self.constant(kernel)] + ([] if bias is None else [self.constant(bias)])
         return self.op("Gemm", *inputs)
 
     def conv(
         self,
         x: str,
-        kernel: Float[AnyArray, "h w channels_in channels"],
-        bias: Float[AnyArray, " channels"] | None = None,
+        kernel: Real[AnyArray, "h w channels_in channels"],
+        bias: Real[AnyArray, " channels"] | None = None,
         *,
         stride: int = 1,
         pad: int = 0,
