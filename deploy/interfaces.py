@@ -4,16 +4,19 @@ All timestamps are seconds on the clock's own monotonic scale, so that ages can 
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float, Float32, UInt16
+
+Depth = UInt16[np.ndarray, "H W"] | Float32[np.ndarray, "H W"]
 
 
 @dataclass(frozen=True)
 class Frame:
     """One raw depth picture as the camera gave it."""
 
-    depth: np.ndarray
+    depth: Depth
     """(H, W) planar depth: uint16 millimetres or float32 metres; 0 = invalid."""
     timestamp_s: float
     """When it was exposed, on the loop's clock."""
@@ -23,13 +26,13 @@ class Frame:
 class RobotState:
     """Measured joints."""
 
-    q_rad: np.ndarray
+    q_rad: Float[np.ndarray, "7"]
     """(7,) arm joint positions."""
     width_m: float
     """Opening between the finger pads."""
     timestamp_s: float
 
-    def vector(self) -> np.ndarray:
+    def vector(self) -> Float32[np.ndarray, "8"]:
         """(8,) float32, the policy's state input: arm joints (rad), then the gripper's width (m)."""
         return np.append(self.q_rad, self.width_m).astype(np.float32)
 
@@ -38,6 +41,7 @@ class CameraError(Exception):
     """A camera gave no frame (unplugged, timed out). The loop holds position and tries again."""
 
 
+@runtime_checkable
 class Camera(Protocol):
     """A depth camera that always hands out its newest frame."""
 
@@ -54,6 +58,7 @@ class Camera(Protocol):
         ...
 
 
+@runtime_checkable
 class Robot(Protocol):
     """A seven-joint arm with a parallel gripper, position controlled."""
 
@@ -65,7 +70,7 @@ class Robot(Protocol):
         """Measured joints and gripper width."""
         ...
 
-    def command(self, q_target_rad: np.ndarray, close: bool) -> None:
+    def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
         """Set the (7,) joint target and the gripper, without waiting for the motion to end."""
         ...
 
@@ -78,6 +83,7 @@ class Robot(Protocol):
         ...
 
 
+@runtime_checkable
 class Clock(Protocol):
     """Time of the loop."""
 

@@ -1,6 +1,7 @@
 """Where the Franka's hand is, in NumPy. Source: Franka's published modified Denavit-Hartenberg table."""
 
 import numpy as np
+from jaxtyping import Float, Float64
 
 DH_A_M = (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088)
 DH_D_M = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0)
@@ -11,7 +12,7 @@ GRIP_D_M = 0.1034
 """From the hand's mounting face to the middle of the finger pads."""
 
 
-def grip_pose(q_rad: np.ndarray) -> np.ndarray:
+def grip_pose(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "4 4"]:
     """(4, 4) T_base_grip for (7,) joint positions: z points out of the hand, the fingers open along y."""
     pose = np.eye(4)
     for a, d, alpha, theta in zip(DH_A_M, DH_D_M, DH_ALPHA_RAD, q_rad, strict=True):
@@ -19,12 +20,12 @@ def grip_pose(q_rad: np.ndarray) -> np.ndarray:
     return pose @ _modified_dh(0.0, FLANGE_D_M, 0.0, HAND_YAW_RAD) @ _modified_dh(0.0, GRIP_D_M, 0.0, 0.0)
 
 
-def grip_position(q_rad: np.ndarray) -> np.ndarray:
+def grip_position(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "3"]:
     """(3,) position of the point between the finger pads in the robot's base frame, metres."""
     return grip_pose(q_rad)[:3, 3]
 
 
-def position_jacobian(q_rad: np.ndarray) -> np.ndarray:
+def position_jacobian(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "3 7"]:
     """(3, 7) derivative of `grip_position` by the joints: z_i x (grip - origin_i)."""
     pose, axes, origins = np.eye(4), [], []
     for a, d, alpha, theta in zip(DH_A_M, DH_D_M, DH_ALPHA_RAD, q_rad, strict=True):

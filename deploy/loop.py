@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp.errors import UserError
 from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotState
@@ -49,9 +50,9 @@ class Step:
     index: int
     frame: Frame | None
     state: RobotState
-    action: np.ndarray | None
+    action: Float[np.ndarray, "8"] | None
     """(8,), None where the loop held position."""
-    q_target_rad: np.ndarray | None
+    q_target_rad: Float[np.ndarray, "7"] | None
     """(7,) after the safety filter, None where the loop held position."""
 
 

@@ -6,10 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 import onnxruntime as ort
+from jaxtyping import Float, Float32
 
 from ddgrasp import artifacts, contract
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.errors import UserError
+from deploy.interfaces import Depth
 
 POLICY_FILE = "policy.onnx"
 """As the stage `export` names it."""
@@ -112,7 +114,7 @@ class OnnxPolicy:
             return "all-invalid depth: no pixel above 0"
         return ""
 
-    def act(self, depth: np.ndarray, state: np.ndarray) -> np.ndarray:
+    def act(self, depth: Depth, state: Float[np.ndarray, "8"]) -> Float32[np.ndarray, "8"]:
         """(8,) action for the newest frame (H, W) and the state (8,). Call once per control period."""
         self._frames.append(depth)
         while len(self._frames) < contract.DEPTH_FRAMES:

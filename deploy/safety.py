@@ -8,6 +8,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp import contract
 from ddgrasp.layout import ACTION, closes
@@ -65,7 +66,9 @@ class SafetyFilter:
         """The arm was told to hold: the next step accelerates from rest."""
         self._last_step_rad = np.zeros(len(contract.ARM_JOINTS))
 
-    def target(self, q_rad: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, bool, list[str]]:
+    def target(
+        self, q_rad: Float[np.ndarray, "7"], action: np.ndarray
+    ) -> tuple[Float[np.ndarray, "7"], bool, list[str]]:
         """Joint target for a measured position and an action.
 
         Args:

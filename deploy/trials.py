@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from ddgrasp.config import Config
 from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
 from deploy.devices.rig_robot import SimRobot
+from deploy.interfaces import Depth
 from deploy.loop import ControlLoop, LoopReport, Step
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
@@ -139,13 +141,15 @@ class _Filming:
 
     def __init__(self, camera: StereoCamera, every: int):
         self._camera, self._every = camera, every
-        self._columns: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
 
     def look(self, step: Step) -> None:
+        """Takes the picture if it is due; what the loop's `on_step` is called with."""
         if step.index % self._every == 0 and step.frame is not None:
             self._columns.append((step.index, self._camera.picture(), step.frame.depth))
 
     def film(self) -> Film:
+        """The pictures so far."""
         if not self._columns:
             return Film((), np.zeros((0, 0, 0, 3), np.uint8), np.zeros((0, 0, 0), np.uint16))
         steps, rgb, depth = zip(*self._columns, strict=True)

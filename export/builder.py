@@ -1,10 +1,14 @@
 """A thin writer of ONNX nodes: every method adds one operator and returns the name of its output."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import onnx
+from jaxtyping import Real, Shaped
 from onnx import TensorProto, helper, numpy_helper
+
+from ddgrasp.arrays import AnyArray
 
 OPSET = 18
 IR_VERSION = 10
@@ -21,13 +25,15 @@ class GraphBuilder:
         self.constants: dict[str, onnx.TensorProto] = {}
         self._names_of_constants: dict[tuple, str] = {}
 
-    def op(self, kind: str, *inputs: str, **attributes) -> str:
+    def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
         """One operator with one output."""
         output = f"{kind.lower()}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
         return output
 
-    def constant(self, value, dtype: type = np.float32) -> str:
+    def constant(
+        self, value: Shaped[AnyArray, "..."] | Sequence[float] | float, dtype: type = np.float32
+    ) -> str:
         """An initializer."""
         array = np.ascontiguousarray(value, dtype)
         key = (array.dtype.str, array.shape, array.tobytes())
@@ -77,17 +83,23 @@ class GraphBuilder:
         """(B, 1), one of (B, n)."""
         return self.columns(x, slice(index, index + 1))
 
-    def dense(self, x: str, params: dict) -> str:
+    def dense(self, x: str, params: Mapping[str, AnyArray]) -> str:
         """Flax Dense on (B, n): x @ kernel + bias."""
         return self.affine(x, params["kernel"], params.get("bias"))
 
-    def affine(self, x: str, kernel: np.ndarray, bias: np.ndarray | None = None) -> str:
-        """(B, n) @ (n, m) + (m,)."""
+    def affine(self, x: str, kernel: Real[AnyArray, "n m"], bias: Real[AnyArray, " m"] | None = None) -> str:
+        """(B, n) @ (n, m) + (m,); both become float32, as all constants."""
         inputs = [x, self.constant(kernel)] + ([] if bias is None else [self.constant(bias)])
         return self.op("Gemm", *inputs)
 
     def conv(
-        self, x: str, kernel: np.ndarray, bias: np.ndarray | None = None, *, stride: int = 1, pad: int = 0
+        self,
+        x: str,
+        kernel: Real[AnyArray, "h w channels_in channels"],
+        bias: Real[AnyArray, " channels"] | None = None,
+        *,
+        stride: int = 1,
+        pad: int = 0,
     ) -> str:
         """NCHW convolution with a Flax (h, w, in, out) kernel and symmetric padding."""
         weights = np.transpose(kernel, (3, 2, 0, 1))

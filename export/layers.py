@@ -1,13 +1,15 @@
 """ONNX nodes of the convolutional layers that encoder and hand view share (student_jax/encoder.py). NCHW."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from export.builder import GraphBuilder
 from student_jax import encoder
 
-Params = Mapping
+Params = Mapping[str, Any]
+"""Nested, arrays by name."""
 
 
 def write_stem(g: GraphBuilder, x: str, params: Params, kind: str) -> str:

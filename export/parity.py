@@ -7,12 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
+from jaxtyping import Float, Float32, UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.depth import to_metres, to_millimetres
 from student_jax import denoiser, preprocess
+
+RawDepth = UInt16[np.ndarray, "*batch H W"] | Float32[np.ndarray, "*batch H W"]
+Actions = Float32[np.ndarray, "B chunk 8"]
 
 HOLE_SHARE = 0.1
 """Share of invalid pixels in random frames."""
@@ -26,11 +30,11 @@ NOT_FINITE = (np.nan, np.inf, -np.inf, -1.0, 100.0)
 class Inputs:
     """One batch as the file takes it."""
 
-    depth: np.ndarray
+    depth: UInt16[np.ndarray, "B 3 H W"] | Float32[np.ndarray, "B 3 H W"]
     """(B, 3, H, W) uint16 millimetres or float32 metres."""
-    state: np.ndarray
+    state: Float32[np.ndarray, "B 8"]
     """(B, 8) float32."""
-    noise: np.ndarray
+    noise: Float32[np.ndarray, "B chunk 8"]
     """(B, chunk, 8) float32."""
 
     def feed(self) -> dict[str, np.ndarray]:
@@ -49,22 +53,24 @@ def open_session(model: bytes | Path | str, threads: int = 1) -> ort.InferenceSe
     return ort.InferenceSession(source, options, providers=["CPUExecutionProvider"])
 
 
-def run_onnx(session: ort.InferenceSession, inputs: Inputs) -> np.ndarray:
+def run_onnx(session: ort.InferenceSession, inputs: Inputs) -> Actions:
     """(B, chunk, 8) actions."""
     return np.asarray(session.run([contract.ONNX_OUTPUT_ACTION], inputs.feed())[0])
 
 
-def depth_in_metres(depth: np.ndarray) -> np.ndarray:
+def depth_in_metres(depth: RawDepth) -> Float32[np.ndarray, "*batch H W"]:
     """Raw depth of either type as float32 metres."""
     return to_metres(depth) if depth.dtype == np.uint16 else depth.astype(np.float32)
 
 
-def raw_depth(depth_m: np.ndarray, depth_dtype: str) -> np.ndarray:
+def raw_depth(depth_m: Float[np.ndarray, "*batch H W"], depth_dtype: str) -> RawDepth:
     """Metres, 0 = invalid, as a camera of that type would give them."""
     return depth_m.astype(np.float32) if depth_dtype == "float32_m" else to_millimetres(depth_m)
 
 
-def random_frames(rng: np.random.Generator, batch: int, profile: CameraProfile) -> np.ndarray:
+def random_frames(
+    rng: np.random.Generator, batch: int, profile: CameraProfile
+) -> Float32[np.ndarray, "B 3 H W"]:
     """(B, 3, H, W) metres: the table with blobs, sensor noise and square holes, rarely an empty frame."""
     table = preprocess.table_depth(profile, 10.0)
     depth = np.broadcast_to(table, (batch, contract.DEPTH_FRAMES, *table.shape)).copy()
@@ -89,7 +95,7 @@ def random_inputs(
     student: StudentConfig,
     profile: CameraProfile,
     depth_dtype: str,
-    frames_m: np.ndarray | None = None,
+    frames_m: Float[np.ndarray, "B 3 H W"] | None = None,
 ) -> Inputs:
     """Random states and noise with the given frames (B, 3, H, W) in metres, or with random ones.
 
@@ -107,7 +113,7 @@ def random_inputs(
 
 def jax_policy(
     params: dict, student: StudentConfig, profile: CameraProfile, steps: int = 0
-) -> Callable[[Inputs], np.ndarray]:
+) -> Callable[[Inputs], Actions]:
     """The reference: `sample_actions`, compiled."""
     import jax
 
@@ -121,7 +127,7 @@ def jax_policy(
 
 
 def max_abs_diff(
-    session: ort.InferenceSession, reference: Callable[[Inputs], np.ndarray], batches: Iterator[Inputs]
+    session: ort.InferenceSession, reference: Callable[[Inputs], Actions], batches: Iterator[Inputs]
 ) -> float:
     """Largest absolute difference between any two actions; infinite if either is not finite."""
     worst = 0.0

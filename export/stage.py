@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 
 from ddgrasp import artifacts, contract
 from ddgrasp.artifacts import Artifact
@@ -53,7 +54,11 @@ def export_policy(config: Config, params: dict, student_manifest_hash: str = "")
 
 
 def measure(
-    config: Config, params: dict, model: bytes, frames_m: np.ndarray | None, progress: Progress
+    config: Config,
+    params: dict,
+    model: bytes,
+    frames_m: Float32[np.ndarray, "N 3 H W"] | None,
+    progress: Progress,
 ) -> dict:
     """Parity with JAX and latency on one thread. UserError if parity misses the configured bound.
 
@@ -93,7 +98,7 @@ def _pick(frames_m: np.ndarray | None, size: int, rng: np.random.Generator) -> n
     return None if frames_m is None else frames_m[rng.integers(len(frames_m), size=size)]
 
 
-def demo_frames(demos: Path, config: Config, count: int = 64) -> np.ndarray | None:
+def demo_frames(demos: Path, config: Config, count: int = 64) -> Float32[np.ndarray, "N 3 H W"] | None:
     """(N, 3, H, W) metres: frame triples of the first demonstrations in the stage directory `demos`; None if
     there are none."""
     from demos.stage import STORE

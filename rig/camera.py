@@ -2,6 +2,7 @@
 
 import mujoco
 import numpy as np
+from jaxtyping import Float, Float64, UInt8, UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import Config, RecordConfig, StereoConfig
@@ -26,21 +27,21 @@ class RigCamera:
     def depth_mm(
         self,
         data: mujoco.MjData,
-        T_world_cam: np.ndarray,
+        T_world_cam: Float[np.ndarray, "4 4"],
         rng: np.random.Generator,
         object_name: str = "",
-    ) -> np.ndarray:
+    ) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 millimetres as the camera reports them, 0 = invalid."""
 
         def draw(camera: Camera) -> Buffers:
             return render(self.model, data, camera, far_m=FAR_M)
 
-        def draw_depth(camera: Camera) -> np.ndarray:
+        def draw_depth(camera: Camera) -> Float[np.ndarray, "H W"]:
             return render_depth(self.model, data, camera, far_m=FAR_M)
 
         return self.stereo.sense(draw, T_world_cam, rng, rig_materials(self.model, object_name), draw_depth)
 
-    def rgb(self, data: mujoco.MjData, T_world_cam: np.ndarray) -> np.ndarray:
+    def rgb(self, data: mujoco.MjData, T_world_cam: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour, aligned to depth."""
         buffers = render(self.model, data, self.stereo.camera(T_world_cam), far_m=FAR_M)
         return np.rint(np.clip(buffers.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
@@ -51,7 +52,7 @@ def make_camera(config: Config, world: RigWorld) -> RigCamera:
     return RigCamera(world.model, config.record.stereo, config.world.profile)
 
 
-def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> np.ndarray:
+def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:
     """(4, 4) T_world_cam near the nominal extrinsics: position, aim and roll drawn uniformly."""
     position = np.array(contract.CAMERA_POSITION_M)
     aim = np.array(contract.CAMERA_LOOK_AT_M)
@@ -64,7 +65,7 @@ def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> np.ndarray:
     return T_world_cam
 
 
-def camera_pose(config: Config, rng: np.random.Generator) -> np.ndarray:
+def camera_pose(config: Config, rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:
     """(4, 4) T_world_cam of one trial: the nominal place within the calibration error trained for."""
     spread = config.world.random
     shift_m = rng.uniform(-1, 1, 3) * spread.camera_position_m

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import UInt8, UInt16
 
 INVALID_RGB = (255, 0, 255)
 LABEL_PX = 22
@@ -13,9 +14,9 @@ class Film:
     """T columns of a trial."""
 
     steps: tuple[int, ...]
-    rgb: np.ndarray
+    rgb: UInt8[np.ndarray, "T H W 3"]
     """(T, H, W, 3) uint8."""
-    depth_mm: np.ndarray
+    depth_mm: UInt16[np.ndarray, "T H W"]
     """(T, H, W) uint16."""
 
 

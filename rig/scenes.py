@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from jaxtyping import Bool, UInt16
 
 from ddgrasp.config import RecordConfig
 from ddgrasp.contract import CameraProfile
@@ -18,9 +19,9 @@ class StandingScene:
     """Frames of one scene in which nothing moves."""
 
     object_name: str
-    depth_mm: np.ndarray
+    depth_mm: UInt16[np.ndarray, "T H W"]
     """(T, H, W) uint16, as the camera reports it."""
-    object_px: np.ndarray
+    object_px: Bool[np.ndarray, "H W"]
     """(H, W) bool: pixels that show the object, from the renderer; no method sees this."""
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp import contract
 from ddgrasp.artifacts import Artifact
@@ -25,7 +26,7 @@ from sensors.statistics import stats
 STATIC_FRAMES = 10
 """Frames of a standing scene behind the temporal statistics."""
 
-Policy = Callable[[np.ndarray], np.ndarray]
+Policy = Callable[[Float[np.ndarray, "40"]], Float[np.ndarray, "8"]]
 """Observation (40,) to action (8,)."""
 
 
@@ -66,7 +67,7 @@ def record_trajectory(
             act(world, policy(world.observation()))
 
 
-def act(world: RigWorld, action: np.ndarray) -> None:
+def act(world: RigWorld, action: Float[np.ndarray, "8"]) -> None:
     """Execute one (8,) action for one control period."""
     q, _ = world.state()
     target = q + contract.ACTION_SCALE_RAD * np.clip(action[ACTION.arm], -1.0, 1.0)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from jaxtyping import Float, Float64
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig, WorldConfig
@@ -57,11 +58,11 @@ class RigWorld:
         )
         self._hold_steps = 0
 
-    def state(self) -> tuple[np.ndarray, float]:
+    def state(self) -> tuple[Float64[np.ndarray, "7"], float]:
         """Arm joint positions (7,) rad and the gripper's opening (m)."""
         return self.data.qpos[QPOS.arm].copy(), float(self.data.qpos[QPOS.fingers].sum())
 
-    def command(self, q_target_rad: np.ndarray, close: bool) -> None:
+    def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
         """Joint targets (7,) rad and whether to close the gripper; in force from the next `step`."""
         self.data.ctrl[CONTROLS.arm] = np.clip(
             q_target_rad, contract.JOINT_LOWER_RAD, contract.JOINT_UPPER_RAD
@@ -75,7 +76,7 @@ class RigWorld:
             mujoco.mj_kinematics(self.model, self.data)
             self._hold_steps = self._hold_steps + 1 if self._held() else 0
 
-    def observation(self) -> np.ndarray:
+    def observation(self) -> Float[np.ndarray, "40"]:
         """(40,) what the teacher sees; for the teacher alone."""
         return grasp_math.observation(
             self.data.qpos, self.data.qvel, np.asarray(self._spec.grasp_symmetry), self._branch,

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
@@ -79,7 +80,8 @@ class FrankaRobot:
         q = np.asarray(self._arm.state.q, float)
         return RobotState(q, self._hand.width_m(), self._clock.now())
 
-    def command(self, q_target_rad: np.ndarray, close: bool) -> None:
+    def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
+        """Set the (7,) joint target, pre-empting the last, and the gripper. Raises what stopped the last."""
         assert self._hand is not None
         joints = [float(q) for q in q_target_rad]
         self._move(self._franky.JointMotion(joints, return_when_finished=False))
@@ -128,6 +130,7 @@ class _Hand:
             threading.Thread(target=self._guard, args=(work,), daemon=True).start()
 
     def width_m(self) -> float:
+        """As the gripper last reported it. Raises what stopped it."""
         if self._error is not None:
             raise self._error
         return self._width_m
@@ -139,6 +142,7 @@ class _Hand:
             self._changed.set()
 
     def stop(self) -> None:
+        """End both threads, after what they are at; the gripper keeps its grip."""
         self._stopping.set()
         self._changed.set()
 

@@ -101,6 +101,7 @@ class RealSenseCamera:
         return self._frame
 
     def stop(self) -> None:
+        """Close the stream, if it is open."""
         if self._pipeline is not None:
             self._pipeline.stop()
             self._pipeline = None

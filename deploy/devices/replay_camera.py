@@ -8,7 +8,7 @@ from deploy.devices.options import Setup
 from deploy.interfaces import Clock, Frame, Robot
 
 if TYPE_CHECKING:
-    from sensors.recordings.recording import Recording
+    import sensors.recordings.recording
 
 
 def make(setup: Setup, robot: Robot) -> "ReplayCamera":
@@ -23,7 +23,12 @@ class ReplayCamera:
     `period_s` is the time between two recorded frames.
     """
 
-    def __init__(self, recording: "Recording", clock: Clock, period_s: float = contract.CONTROL_DT_S):
+    def __init__(
+        self,
+        recording: "sensors.recordings.recording.Recording",
+        clock: Clock,
+        period_s: float = contract.CONTROL_DT_S,
+    ):
         self._recording, self._clock, self._period_s = recording, clock, period_s
         self._start_s: float | None = None
         self._shown = -1
@@ -40,10 +45,12 @@ class ReplayCamera:
         return len(self._recording)
 
     def start(self) -> None:
+        """The first frame is shown from now on (or from the first `read`, if that comes before)."""
         if self._start_s is None:
             self._start_s = self._clock.now()
 
     def read(self) -> Frame:
+        """The frame of this moment, millimetres; its time is when it was first due."""
         self.start()
         assert self._start_s is not None
         elapsed = int((self._clock.now() - self._start_s) / self._period_s + 1e-6)

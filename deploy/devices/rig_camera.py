@@ -4,14 +4,15 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from deploy.devices.options import Setup
 from deploy.devices.rig_robot import SimRobot
 from deploy.interfaces import Frame, Robot
 
 if TYPE_CHECKING:
-    from rig.camera import RigCamera
-    from rig.world import RigWorld
+    import rig.camera
+    import rig.world
 
 
 def make(setup: Setup, robot: Robot) -> "StereoCamera":
@@ -30,9 +31,9 @@ class StereoCamera:
 
     def __init__(
         self,
-        world: "RigWorld",
-        camera: "RigCamera",
-        T_world_cam: np.ndarray,
+        world: "rig.world.RigWorld",
+        camera: "rig.camera.RigCamera",
+        T_world_cam: Float[np.ndarray, "4 4"],
         rng: np.random.Generator,
         catch_up: Callable[[], float],
         object_name: str = "",
@@ -46,6 +47,7 @@ class StereoCamera:
         """Nothing to open."""
 
     def read(self) -> Frame:
+        """The world as it is now; the same frame again within a control period."""
         timestamp_s = self._catch_up()
         if self._frame is None or timestamp_s > self._frame.timestamp_s:
             depth = self._camera.depth_mm(self._world.data, self._T_world_cam, self._rng, self._object_name)
@@ -55,6 +57,6 @@ class StereoCamera:
     def stop(self) -> None:
         """Nothing to close."""
 
-    def picture(self) -> np.ndarray:
+    def picture(self) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour picture of the scene as it stands, from the same place (for people)."""
         return self._camera.rgb(self._world.data, self._T_world_cam)

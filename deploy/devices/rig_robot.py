@@ -4,13 +4,14 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp import contract
 from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotState
 
 if TYPE_CHECKING:
-    from rig.world import RigWorld
+    import rig.world
 
 _EARLY_S = 1e-6
 """Clock readings this much before a period's end count as its end (rounding)."""
@@ -34,7 +35,7 @@ class SimRobot:
     looks on the simulated clock, and as many as really passed on the real one.
     """
 
-    def __init__(self, world: "RigWorld", clock: Clock, period_s: float = contract.CONTROL_DT_S):
+    def __init__(self, world: "rig.world.RigWorld", clock: Clock, period_s: float = contract.CONTROL_DT_S):
         self.world = world
         self._clock, self._period_s = clock, period_s
         self._start_s: float | None = None
@@ -47,15 +48,18 @@ class SimRobot:
             self._start_s = self._clock.now()
 
     def read_state(self) -> RobotState:
+        """The world's joints and gripper at the start of the current period."""
         now_s = self.catch_up()
         q, width_m = self.world.state()
         return RobotState(np.asarray(q, float), float(width_m), now_s)
 
-    def command(self, q_target_rad: np.ndarray, close: bool) -> None:
+    def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
+        """Set the (7,) joint target and the gripper; the world moves when someone looks at it."""
         self.world.command(q_target_rad, close)
         self._close, self._holding = close, False
 
     def hold(self) -> None:
+        """Make the present joints the target; the gripper keeps what it does."""
         if not self._holding:  # once: measuring again and again would sag under load
             q, _ = self.world.state()
             self.world.command(np.asarray(q, float), self._close)

@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 
 from ddgrasp.config import StereoConfig
 from ddgrasp.contract import CameraProfile
@@ -24,7 +25,10 @@ from sensors.models import planes
 from sensors.models.materials import NEAR_INFRARED_RGB, Material
 
 Render = Callable[[Camera], Buffers]
-RenderDepth = Callable[[Camera], np.ndarray]
+Map = Float[np.ndarray, "H W"]
+RenderDepth = Callable[[Camera], Map]
+Infrared = UInt8[np.ndarray, "H W"]
+Pose = Float[np.ndarray, "4 4"]
 
 LAMP_POSITION_W_M = (0.3, -0.8, 2.2)
 """Centre of the room's lamp, world frame."""
@@ -82,11 +86,11 @@ class ActiveStereo:
     def sense(
         self,
         render: Render,
-        T_world_cam: np.ndarray,
+        T_world_cam: Pose,
         rng: np.random.Generator,
         materials: Mapping[int, Material] | None = None,
         render_depth: RenderDepth | None = None,
-    ) -> np.ndarray:
+    ) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 planar depth in millimetres, 0 = invalid, in the left imager's frame.
 
         Args:
@@ -99,18 +103,18 @@ class ActiveStereo:
         left, right = self.infrared(render, T_world_cam, rng, materials, render_depth)
         return self.depth_mm(self.disparity(left, right))
 
-    def camera(self, T_world_cam: np.ndarray) -> Camera:
+    def camera(self, T_world_cam: Pose) -> Camera:
         """The left imager, in whose frame depth is reported."""
         return _camera(self.profile, T_world_cam, 0.0)
 
     def infrared(
         self,
         render: Render,
-        T_world_cam: np.ndarray,
+        T_world_cam: Pose,
         rng: np.random.Generator,
         materials: Mapping[int, Material] | None = None,
         render_depth: RenderDepth | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[Infrared, Infrared]:
         """Left and right infrared pictures, (H, W) uint8."""
         baseline = self.profile.baseline_m
         projector_m = self.config.projector_position * baseline
@@ -130,7 +134,7 @@ class ActiveStereo:
         left, right = (self._expose(image, exposure, rng) for image in images)
         return left, right
 
-    def disparity(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    def disparity(self, left: Infrared, right: Infrared) -> Float32[np.ndarray, "H W"]:
         """(H, W) float32 disparity of the left picture in pixels, 0 = no match."""
         pad = self._disparities
         padded = [cv2.copyMakeBorder(i, 0, 0, pad, 0, cv2.BORDER_REFLECT) for i in (left, right)]
@@ -147,7 +151,7 @@ class ActiveStereo:
         steps = self.config.subpixel_steps
         return np.where(valid, np.rint(fine * steps) / steps, 0).astype(np.float32)
 
-    def depth_mm(self, disparity_px: np.ndarray) -> np.ndarray:
+    def depth_mm(self, disparity_px: Map) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 millimetres from disparity; out-of-range becomes 0."""
         depth_m = self._fb_px_m / np.maximum(disparity_px, 1e-3)
         valid = (
@@ -285,7 +289,7 @@ def _dot_pattern(config: StereoConfig, profile: CameraProfile, projector: Camera
     return (np.minimum(texture, 2.0) * cosine**PROJECTOR_FALLOFF).astype(np.float32)
 
 
-def albedo_texture(seed: int, height_px: int, width_px: int) -> np.ndarray:
+def albedo_texture(seed: int, height_px: int, width_px: int) -> Float32[np.ndarray, "height width"]:
     """(height, width) float32 noise of unit variance over several octaves, seamless."""
     rng = np.random.default_rng(seed)
     frequency = np.hypot(np.fft.fftfreq(height_px)[:, None], np.fft.fftfreq(width_px)[None, :])
@@ -380,7 +384,7 @@ def _refine(
     return np.clip(fine, coarse_px - 0.5, coarse_px + 0.5), residual
 
 
-def flatten(fine_px: np.ndarray, valid: np.ndarray, config: StereoConfig) -> np.ndarray:
+def flatten(fine_px: Map, valid: Bool[np.ndarray, "H W"], config: StereoConfig) -> Map:
     """(H, W) disparity, noise on flat surfaces averaged away over a window, edges and relief kept.
 
     Lee's filter (1980) about the window's plane instead of its mean: with v the variance of the window from

@@ -6,11 +6,15 @@ fail differently, as real ones do: dark rubber and bare metal send too little ba
 without the dots.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import mujoco
+import numpy as np
+from jaxtyping import Float
 
+Colour = Sequence[float | int] | Float[np.ndarray, " channels"]
+"""Red, green and blue in [0, 1]; what follows them is ignored."""
 NEAR_INFRARED_RGB = (0.7, 0.2, 0.1)
 """Weights by which a guess of the near-infrared reflectance follows the visible colour."""
 
@@ -30,7 +34,7 @@ class Material:
     """Share of the projector's light that comes back from within, spread and without its dots, 0 to 1."""
 
     @classmethod
-    def from_rgb(cls, rgb, specular: float = 0.05, texture: float = 0.0) -> "Material":
+    def from_rgb(cls, rgb: Colour, specular: float = 0.05, texture: float = 0.0) -> "Material":
         """A guess: near-infrared reflectance follows red more than green and blue."""
         red, green, blue = (float(c) for c in rgb[:3])
         r, g, b = NEAR_INFRARED_RGB
@@ -103,7 +107,7 @@ def rig_materials(model: mujoco.MjModel, object_name: str = "") -> dict[int, Mat
     return materials
 
 
-def object_material(object_name: str, slot: str, rgb) -> Material:
+def object_material(object_name: str, slot: str, rgb: Colour) -> Material:
     """Material of one slot of an object; guessed from its colour if the object is not listed."""
     listed = OBJECT_MATERIALS.get(object_name)
     if listed is None:

@@ -2,9 +2,12 @@
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Float64
+
+Map = Float[np.ndarray, "H W"]
 
 
-def slopes(picture: np.ndarray, window_px: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+def slopes(picture: Map, window_px: int) -> tuple[tuple[Map, Map], Map]:
     """Plane of every window of an (H, W) picture: ((slope along u, along v), mean), (H, W) each."""
     offset = np.arange(window_px, dtype=np.float32) - (window_px - 1) / 2
     ramp = offset / np.sum(offset**2)
@@ -15,8 +18,8 @@ def slopes(picture: np.ndarray, window_px: int) -> tuple[tuple[np.ndarray, np.nd
 
 
 def residual_variance(
-    picture: np.ndarray, window_px: int, border: int = cv2.BORDER_REPLICATE
-) -> tuple[np.ndarray, np.ndarray]:
+    picture: Map, window_px: int, border: int = cv2.BORDER_REPLICATE
+) -> tuple[Float64[np.ndarray, "H W"], Float64[np.ndarray, "H W"]]:
     """(H, W) mean squared distance of each window's pixels from its plane; (H, W) the plane at its centre.
 
     In double precision: the variance is a small difference of squares. `border` is how OpenCV continues

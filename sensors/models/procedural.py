@@ -13,10 +13,11 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import Float
 
 from ddgrasp.config import DextrahConfig, KinectConfig
 from ddgrasp.contract import CameraProfile
-from sensors.models.sense import Sense, batched
+from sensors.models.sense import Key, Sense, batched
 
 NEAREST_M = 0.05
 """Noise never brings a surface nearer than this."""
@@ -62,12 +63,12 @@ def _kinect_frame(
 # --- the equations ---------------------------------------------------------------------------------
 
 
-def axial_deviation_m(depth_m: Array, per_m: float) -> Array:
+def axial_deviation_m(depth_m: Float[Array, "*shape"], per_m: float) -> Float[Array, "*shape"]:
     """sigma_z = per_m z^2 (Khoshelham and Elberink 2012, eq. 11)."""
     return per_m * depth_m**2
 
 
-def quantised(depth_m: Array, fb_px_m: float, steps_per_px: float) -> Array:
+def quantised(depth_m: Float[Array, "*shape"], fb_px_m: float, steps_per_px: float) -> Float[Array, "*shape"]:
     """z = n f B / round(n f B / z), n steps per pixel (Barron and Malik 2013; n f B is their 35130 cm).
 
     They round x + 1/2, which moves every depth by half a step; here the nearest step is taken.
@@ -76,13 +77,15 @@ def quantised(depth_m: Array, fb_px_m: float, steps_per_px: float) -> Array:
     return scaled / jnp.maximum(jnp.round(scaled / jnp.maximum(depth_m, NEAREST_M)), 1.0)
 
 
-def add_disparity(depth_m: Array, noise_px: Array, fb_px_m: float) -> Array:
+def add_disparity(
+    depth_m: Float[Array, "*shape"], noise_px: Float[Array, "*shape"], fb_px_m: float
+) -> Float[Array, "*shape"]:
     """z' = f B / (f B / z + noise); 0 stays 0."""
     disparity = fb_px_m / jnp.maximum(depth_m, NEAREST_M) + noise_px
     return jnp.where(depth_m > 0, fb_px_m / jnp.clip(disparity, 1e-3, fb_px_m / NEAREST_M), 0.0)
 
 
-def shifted(depth_m: Array, shift_px: Array) -> Array:
+def shifted(depth_m: Float[Array, "H W"], shift_px: Float[Array, "2 H W"]) -> Float[Array, "H W"]:
     """z'(v, u) = z(v + s_0, u + s_1) at the nearest pixel: edges become ragged, depths are not mixed.
 
     depth_m (H, W), shift_px (2, H, W); places outside take the nearest pixel inside.
@@ -93,7 +96,7 @@ def shifted(depth_m: Array, shift_px: Array) -> Array:
     return depth_m[jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)]
 
 
-def smooth_field(key: Array, shape: tuple[int, ...], correlation_px: float) -> Array:
+def smooth_field(key: Key, shape: tuple[int, ...], correlation_px: float) -> Float[Array, "*lead H W"]:
     """(..., H, W) Gaussian noise of unit variance at every pixel, correlated over `correlation_px`."""
     *lead, height, width = shape
     up, across = (_interpolation(size, correlation_px) for size in (height, width))
@@ -109,7 +112,7 @@ def _interpolation(size: int, spacing_px: float) -> Array:
     return weights / jnp.linalg.norm(weights, axis=1, keepdims=True)
 
 
-def draw_sticks(key: Array, depth_m: Array, config: DextrahConfig) -> Array:
+def draw_sticks(key: Key, depth_m: Float[Array, "H W"], config: DextrahConfig) -> Float[Array, "H W"]:
     """Thin segments of one random depth each over (H, W): every pixel starts one with probability `stick`."""
     height, width = depth_m.shape
     expected = config.stick * height * width

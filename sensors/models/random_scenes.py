@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
+from jaxtyping import Float, UInt16
 
 from ddgrasp.config import StereoConfig
 from ddgrasp.contract import D455, CameraProfile
@@ -25,11 +26,14 @@ _TYPES = ("box", "sphere", "capsule", "cylinder")
 
 @dataclass(frozen=True)
 class Picture:
-    """clean_mm and stereo_mm (H, W) uint16 millimetres, 0 = nothing in range / invalid; objects: how many."""
+    """A room as it is and as a camera reports it, planar millimetres."""
 
-    clean_mm: np.ndarray
-    stereo_mm: np.ndarray
+    clean_mm: UInt16[np.ndarray, "H W"]
+    """0 = nothing in range."""
+    stereo_mm: UInt16[np.ndarray, "H W"]
+    """0 = invalid."""
     objects: int
+    """How many."""
     camera_height_m: float
     camera_pitch_rad: float
     """0 looks along the floor, pi / 2 straight down."""
@@ -77,7 +81,7 @@ def take_picture(rng: np.random.Generator, device: ActiveStereo) -> Picture:
     def draw(camera: Camera) -> Buffers:
         return render(model, data, camera, far_m=FAR_M)
 
-    def draw_depth(camera: Camera) -> np.ndarray:
+    def draw_depth(camera: Camera) -> Float[np.ndarray, "H W"]:
         return render_depth(model, data, camera, far_m=FAR_M)
 
     stereo_mm = device.sense(draw, T_world_cam, rng, _materials(rng, model), draw_depth)

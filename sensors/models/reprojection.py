@@ -8,6 +8,7 @@ which stand a few centimetres apart along the rows.
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp.contract import CameraProfile
 from mjx_envs.camera import Buffers, Camera
@@ -21,7 +22,10 @@ MOST_STRETCH_PX = 4
 
 
 def from_beside(
-    depth_m: np.ndarray, rgb: np.ndarray, profile: CameraProfile, T_world_cam: np.ndarray
+    depth_m: Float[np.ndarray, "H W"],
+    rgb: Float[np.ndarray, "H W 3"],
+    profile: CameraProfile,
+    T_world_cam: Float[np.ndarray, "4 4"],
 ) -> Callable[[Camera], Buffers]:
     """A renderer of the surfaces in one picture, for cameras moved along its rows.
 

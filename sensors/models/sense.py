@@ -10,17 +10,19 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
+from jaxtyping import Float, Float32, PRNGKeyArray, UInt32
 
 from ddgrasp.errors import UserError
 
-Sense = Callable[[Array, ArrayLike, ArrayLike | None], Array]
+Key = PRNGKeyArray | UInt32[Array, "2"]
+Sense = Callable[[Key, ArrayLike, ArrayLike | None], Float32[Array, "*batch H W"]]
 """(key, depth_m (..., H, W), rgb (..., H, W, 3) or None) -> (..., H, W) float32.
 
 Depth is planar metres, 0 = invalid, before and after; an invalid pixel stays invalid. rgb is uint8 or float
 in [0, 1]; families that work without it ignore it. Every picture of a batch gets a key of its own, split from
 `key`; the same key gives the same result.
 """
-SenseFrame = Callable[[Array, Array, Array | None], Array]
+SenseFrame = Callable[[Key, Float32[Array, "H W"], Float32[Array, "H W 3"] | None], Float[Array, "H W"]]
 """The same for one picture (H, W)."""
 
 
@@ -30,7 +32,7 @@ def batched(sense_frame: SenseFrame) -> Sense:
     Raises UserError (while tracing) for depth that is not floating point, or is no picture.
     """
 
-    def sense(key: Array, depth_m: ArrayLike, rgb: ArrayLike | None = None) -> Array:
+    def sense(key: Key, depth_m: ArrayLike, rgb: ArrayLike | None = None) -> Float32[Array, "*batch H W"]:
         depth = check_depth(depth_m)
         colour = None if rgb is None else to_unit_rgb(rgb)
         if colour is not None and colour.shape != (*depth.shape, 3):
@@ -56,7 +58,7 @@ def ideal() -> Sense:
     return batched(lambda key, depth_m, rgb: depth_m)
 
 
-def check_depth(depth_m: ArrayLike) -> Array:
+def check_depth(depth_m: ArrayLike) -> Float32[Array, "*batch H W"]:
     """(..., H, W) float32; UserError for integers (millimetres?) or fewer axes."""
     depth = jnp.asarray(depth_m)
     if not jnp.issubdtype(depth.dtype, jnp.floating) or depth.ndim < 2:
@@ -67,7 +69,7 @@ def check_depth(depth_m: ArrayLike) -> Array:
     return depth.astype(jnp.float32)
 
 
-def to_unit_rgb(rgb: ArrayLike) -> Array:
+def to_unit_rgb(rgb: ArrayLike) -> Float32[Array, "..."]:
     """uint8 or float colours to float32 in [0, 1]."""
     colour = jnp.asarray(rgb)
     scale = 1 / 255 if jnp.issubdtype(colour.dtype, jnp.integer) else 1.0

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float32
 
 from ddgrasp.config import StereoConfig
 from ddgrasp.contract import CameraProfile
@@ -21,7 +22,7 @@ from mjx_envs.camera import nominal_camera
 from sensors.models.active_stereo import ActiveStereo, albedo_texture
 from sensors.models.materials import TABLE_TEXTURE
 from sensors.models.reprojection import from_beside
-from sensors.models.sense import Sense, batched
+from sensors.models.sense import Key, Sense, batched
 
 GREY = 0.5
 """Colour of everything where none is given."""
@@ -35,7 +36,7 @@ def stereo(config: StereoConfig, profile: CameraProfile) -> Sense:
     wear = 1.0 + TABLE_TEXTURE * texture[..., None]
     one_at_a_time = threading.Lock()  # OpenCV's matcher keeps buffers of its own
 
-    def on_host(seed, depth_m, rgb) -> np.ndarray:
+    def on_host(seed, depth_m, rgb) -> Float32[np.ndarray, "*batch H W"]:
         seed, depth_m, rgb = (np.asarray(a) for a in (seed, depth_m, rgb))
         out = np.empty(depth_m.shape, np.float32)
         with one_at_a_time:
@@ -46,7 +47,9 @@ def stereo(config: StereoConfig, profile: CameraProfile) -> Sense:
                 out[index] = to_metres(camera.sense(render, T_world_cam, rng))
         return out
 
-    def sense_frame(key: Array, depth_m: Array, rgb: Array | None) -> Array:
+    def sense_frame(
+        key: Key, depth_m: Float32[Array, "H W"], rgb: Float32[Array, "H W 3"] | None
+    ) -> Float32[Array, "H W"]:
         if depth_m.shape != (profile.height_px, profile.width_px):
             raise UserError(
                 f"Depth is {depth_m.shape[1]}x{depth_m.shape[0]}; this stereo camera was made for "

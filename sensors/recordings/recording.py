@@ -11,10 +11,11 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 import cv2
 import numpy as np
+from jaxtyping import Float32, UInt8, UInt16
 
 from ddgrasp import depth
 from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
@@ -49,7 +50,7 @@ class SkippedFrame:
 class Recording:
     """One trajectory of RGB-D frames in time order.
 
-    `frames_mm` and `frames_rgb` are read from disk on demand; the object itself is small.
+    Pictures are read from disk on demand; the object itself is small.
     """
 
     path: Path
@@ -104,6 +105,7 @@ class Recording:
 
     @property
     def name(self) -> str:
+        """The folder's name."""
         return self.path.name
 
     @property
@@ -133,7 +135,7 @@ class Recording:
         """Whether the frames follow each other in time (temporal statistics make sense)."""
         return bool(self.meta.get("consecutive_frames", False))
 
-    def depth_mm(self, index: int) -> np.ndarray:
+    def depth_mm(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 planar depth in millimetres, 0 = invalid."""
         file = self.depth_files[index]
         raw = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -141,11 +143,11 @@ class Recording:
             raise UserError(f"{file}: cannot be decoded as PNG; delete it or copy it again.")
         return depth.from_counts(raw, self.meta["depth_unit_m"])
 
-    def depth_m(self, index: int) -> np.ndarray:
+    def depth_m(self, index: SupportsIndex) -> Float32[np.ndarray, "H W"]:
         """(H, W) float32 planar depth in metres, 0 = invalid."""
         return depth.to_metres(self.depth_mm(index))
 
-    def rgb(self, index: int) -> np.ndarray:
+    def rgb(self, index: SupportsIndex) -> UInt8[np.ndarray, "h w 3"]:
         """(h, w, 3) uint8 colour at the colour camera's own size."""
         file = self.color_files[index]
         bgr = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR)
@@ -153,7 +155,7 @@ class Recording:
             raise UserError(f"{file}: cannot be decoded as JPEG; delete it or copy it again.")
         return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
-    def frames(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def frames(self) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], UInt16[np.ndarray, "H W"]]]:
         """(rgb uint8 (h, w, 3), depth uint16 mm (H, W)) in time order."""
         for index in range(len(self)):
             yield self.rgb(index), self.depth_mm(index)
@@ -230,6 +232,9 @@ class RecordingWriter:
         Args:
             rgb: (h, w, 3) uint8.
             depth_mm: (H, W) uint16 millimetres, 0 = invalid.
+
+        Raises:
+            UserError: another type or shape, or another size of depth than the frames before.
         """
         if depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
             raise UserError(

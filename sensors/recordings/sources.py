@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 
 @dataclass(frozen=True)
@@ -14,8 +15,8 @@ class RawFrame:
 
     name: str
     depth: np.ndarray | None
-    """(H, W) counts or floating-point lengths; None if it cannot be read."""
-    rgb: np.ndarray | None
+    """(H, W) counts or floating-point lengths (what is neither is left out); None if it cannot be read."""
+    rgb: UInt8[np.ndarray, "h w 3"] | None
     """(h, w, 3) uint8; None if there is none."""
 
 

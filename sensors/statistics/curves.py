@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Real, UInt16
 
 from sensors.models import planes
 from sensors.statistics import stats
@@ -45,8 +46,8 @@ FB_TOLERANCE = 5e-4
 class Stream:
     """Depth frames of one camera and what turns them into disparity."""
 
-    depth_mm: np.ndarray
-    """(T, H, W) uint16, 0 = invalid."""
+    depth_mm: Real[np.ndarray, "T H W"]
+    """(T, H, W), from cameras uint16; 0 = invalid."""
     fx_px: float
     """Focal length; pixels are square and the principal point is the picture's centre."""
     fb_px_m: float
@@ -59,14 +60,14 @@ class Stream:
 class Surface:
     """What a picture's pixels probably look at, (H, W) each."""
 
-    depth_m: np.ndarray
-    edge_px: np.ndarray
+    depth_m: Float32[np.ndarray, "H W"]
+    edge_px: Float32[np.ndarray, "H W"]
     """Distance to the nearest depth edge."""
-    angle_deg: np.ndarray
+    angle_deg: Float[np.ndarray, "H W"]
     """Between the ray and the surface's normal; nan near edges."""
-    seen: np.ndarray
+    seen: Bool[np.ndarray, "H W"]
     """bool: both imagers see the point, and the border is not near."""
-    shadow: np.ndarray
+    shadow: Bool[np.ndarray, "H W"]
     """bool: the right imager's picture would have the point, but a nearer surface covers it there."""
 
 
@@ -79,7 +80,7 @@ class Curve:
     count: tuple[int, ...]
 
 
-def surface(depth_mm: np.ndarray, fx_px: float, fb_px_m: float) -> Surface:
+def surface(depth_mm: Real[np.ndarray, "H W"], fx_px: float, fb_px_m: float) -> Surface:
     """Estimates the surface behind one (H, W) picture."""
     inverse = np.divide(1000.0, depth_mm, out=np.zeros(depth_mm.shape, np.float32), where=depth_mm > 0)
     inverse = cv2.medianBlur(fill_from_background(inverse), 5)
@@ -236,7 +237,7 @@ def flicker_by_edge(stream: Stream) -> Curve:
     return _curve(EDGE_BINS_PX, changed / np.maximum(count, 1), count)
 
 
-def _typical_mm(frames_mm: np.ndarray) -> np.ndarray:
+def _typical_mm(frames_mm: Real[np.ndarray, "T H W"]) -> UInt16[np.ndarray, "H W"]:
     """(H, W) uint16: the lower median over time of pixels valid in most frames, others 0."""
     ordered = np.sort(frames_mm, axis=0)
     valid = np.count_nonzero(frames_mm, axis=0)
@@ -245,7 +246,7 @@ def _typical_mm(frames_mm: np.ndarray) -> np.ndarray:
     return np.where(valid > len(frames_mm) / 2, typical, 0).astype(np.uint16)
 
 
-def static_runs(depth_mm: np.ndarray, fb_px_m: float) -> tuple[slice, ...]:
+def static_runs(depth_mm: Real[np.ndarray, "T H W"], fb_px_m: float) -> tuple[slice, ...]:
     """Runs of at least STATIC_FRAMES consecutive frames of a (T, H, W) recording that stand still.
 
     The median change of disparity between two frames has a floor, the camera's noise; a pair near the
@@ -269,7 +270,7 @@ def static_runs(depth_mm: np.ndarray, fb_px_m: float) -> tuple[slice, ...]:
     return tuple(runs)
 
 
-def grid_share(depth_mm: np.ndarray, fb_px_m: float, steps_per_px: float) -> float:
+def grid_share(depth_mm: Real[np.ndarray, "*shape"], fb_px_m: float, steps_per_px: float) -> float:
     """Share of depths that lie on the grid of disparities k / steps_per_px, where the grid is visible.
 
     Visible: neighbouring grid depths at least 4 mm apart, so that by chance a quarter would lie on it. f B is

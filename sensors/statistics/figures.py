@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt16
 
 from ddgrasp.contract import CameraProfile
 from sensors.recordings.recording import Recording
@@ -108,7 +109,7 @@ def stream_of(recording: Recording, factor: int = 1) -> Stream:
     return Stream(depth, fx_px / factor, fb_px_m / factor, static)
 
 
-def rig_stream(depth_mm: np.ndarray, profile: CameraProfile, scenes: int) -> Stream:
+def rig_stream(depth_mm: UInt16[np.ndarray, "frames H W"], profile: CameraProfile, scenes: int) -> Stream:
     """(scenes * n, H, W) frames of the rig's camera, n consecutive ones of each standing scene."""
     per_scene = len(depth_mm) // scenes
     static = tuple(slice(i * per_scene, (i + 1) * per_scene) for i in range(scenes))

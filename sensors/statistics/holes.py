@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Float32
 
 MEDIAN_PX = 5
 BILATERAL_PX, BILATERAL_SPATIAL_PX, BILATERAL_PER_M = 9, 4.0, 0.02
@@ -9,7 +10,7 @@ BILATERAL_PX, BILATERAL_SPATIAL_PX, BILATERAL_PER_M = 9, 4.0, 0.02
 are larger than a stereo camera's noise on a surface (a third of a pixel for a D455 at 320 px)."""
 
 
-def smooth_surface(inverse: np.ndarray) -> np.ndarray:
+def smooth_surface(inverse: Float[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
     """Inverse depth (H, W) float32 without holes -> the surface under its noise, steps kept.
 
     A median and a bilateral filter (Tomasi and Manduchi 1998).
@@ -18,7 +19,7 @@ def smooth_surface(inverse: np.ndarray) -> np.ndarray:
     return cv2.bilateralFilter(flat, BILATERAL_PX, BILATERAL_PER_M, BILATERAL_SPATIAL_PX)
 
 
-def fill_from_background(inverse: np.ndarray) -> np.ndarray:
+def fill_from_background(inverse: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     """Fills holes (0) of an inverse depth map (H, W) with the farther of the row's nearest valid pixels.
 
     A stereo camera loses pixels mostly beside near objects, where one imager sees the background and the

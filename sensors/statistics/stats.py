@@ -1,6 +1,7 @@
 """What a depth stream's defects measure: holes, their sizes, temporal noise, flicker. NumPy and OpenCV.
 
-All functions take (T, H, W) or (H, W) uint16 millimetres with 0 = invalid.
+Depth is (T, H, W) or (H, W) with 0 = invalid, from cameras uint16 millimetres. Where no unit is named, any
+will do, and a mask of the valid pixels, too.
 """
 
 from collections.abc import Sequence
@@ -8,6 +9,10 @@ from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Int, Real, Shaped, UInt16
+
+Stream = Real[np.ndarray, "T H W"]
+Frame = Real[np.ndarray, "H W"]
 
 RANGE_TOLERANCE = 0.1
 """A pixel belongs to a range if its median depth is within 10 % of it."""
@@ -39,7 +44,7 @@ class DepthStatistics:
         return asdict(self)
 
 
-def measure(depth_mm: np.ndarray, range_mm: float = 750.0) -> DepthStatistics:
+def measure(depth_mm: Stream, range_mm: float = 750.0) -> DepthStatistics:
     """Statistics of a (T, H, W) stream; the temporal ones assume a static scene and camera."""
     sizes = [hole_sizes_px(frame) for frame in depth_mm]
     every = np.concatenate(sizes) if sizes else np.zeros(0)
@@ -55,28 +60,28 @@ def measure(depth_mm: np.ndarray, range_mm: float = 750.0) -> DepthStatistics:
     )
 
 
-def hole_sizes_px(depth_mm: np.ndarray, connectivity: int = 8) -> np.ndarray:
+def hole_sizes_px(depth_mm: Frame, connectivity: int = 8) -> Int[np.ndarray, " holes"]:
     """(n,) pixel counts of the connected invalid regions of one (H, W) frame."""
     holes = (depth_mm <= 0).astype(np.uint8)
     _, _, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=connectivity)
     return stats[1:, cv2.CC_STAT_AREA]
 
 
-def left_band_px(depth_mm: np.ndarray) -> int:
+def left_band_px(depth_mm: Frame) -> int:
     """Leading columns of one (H, W) frame of which more than half the pixels are invalid."""
     valid_columns = np.flatnonzero(np.mean(depth_mm == 0, axis=0) <= 0.5)
     return int(valid_columns[0]) if len(valid_columns) else depth_mm.shape[1]
 
 
-def size_counts(depth: np.ndarray, edges_px: Sequence[float]) -> np.ndarray:
+def size_counts(depth: Stream, edges_px: Sequence[float | int]) -> Int[np.ndarray, " bins"]:
     """(bins,) connected invalid regions of a (T, H, W) stream, in any unit, by size."""
     sizes = [hole_sizes_px(frame) for frame in depth]
     return np.histogram(np.concatenate(sizes), edges_px)[0]
 
 
 def lost_by_bin(
-    values: np.ndarray, lost: np.ndarray, edges: Sequence[float]
-) -> tuple[np.ndarray, np.ndarray]:
+    values: Real[np.ndarray, " n"], lost: Bool[np.ndarray, " n"], edges: Sequence[float | int]
+) -> tuple[Int[np.ndarray, " bins"], Int[np.ndarray, " bins"]]:
     """(bins,) invalid pixels and (bins,) pixels between consecutive `edges` of a quantity.
 
     Args:
@@ -86,18 +91,18 @@ def lost_by_bin(
     return np.histogram(values[lost], edges)[0], np.histogram(values, edges)[0]
 
 
-def validity_changes(depth: np.ndarray) -> np.ndarray:
+def validity_changes(depth: Shaped[np.ndarray, "T ..."]) -> Bool[np.ndarray, "T-1 ..."]:
     """(T - 1, ...) bool: pixels of a (T, ...) stream whose validity the next frame changes."""
     valid = depth > 0
     return valid[1:] != valid[:-1]
 
 
-def flicker_fraction(depth_mm: np.ndarray) -> float:
+def flicker_fraction(depth_mm: Stream) -> float:
     """Share of pixels of a (T, H, W) stream that change validity from one frame to the next."""
     return float(np.mean(validity_changes(depth_mm))) if len(depth_mm) > 1 else float("nan")
 
 
-def temporal_deviation_mm(depth_mm: np.ndarray, range_mm: float = 750.0) -> float:
+def temporal_deviation_mm(depth_mm: Stream, range_mm: float = 750.0) -> float:
     """Median over pixels near `range_mm` of the deviation over time; nan if there are none."""
     if len(depth_mm) < 2:
         return float("nan")
@@ -111,7 +116,7 @@ def temporal_deviation_mm(depth_mm: np.ndarray, range_mm: float = 750.0) -> floa
     return float(np.median(np.nanstd(values[:, near], axis=0, ddof=1)))
 
 
-def decimated(depth_mm: np.ndarray, factor: int) -> np.ndarray:
+def decimated(depth_mm: Real[np.ndarray, "H W"], factor: int) -> UInt16[np.ndarray, "h w"]:
     """(H / factor, W / factor) median of the valid pixels per cell, as a D4xx's decimation filter.
 
     A cell without valid pixels is invalid. Rows and columns that do not fill a cell are dropped.
