@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import Float, Float32, Int
 
 from learning.layers import depth_to_space, sinusoids, space_to_depth, time_frequencies
 
@@ -23,7 +24,10 @@ class ResBlock(nn.Module):
     width: int
 
     @nn.compact
-    def __call__(self, x: Array, time: Array) -> Array:
+    def __call__(
+        self, x: Float[Array, "B H W C"], time: Float[Array, "B T"]
+    ) -> Float[Array, "B H W {self.width}"]:
+        """(B, H, W, C), time embedding (B, T) -> (B, H, W, width)."""
         groups = math.gcd(GROUPS, self.width)
         h = nn.silu(nn.GroupNorm(math.gcd(GROUPS, x.shape[-1]))(x))
         h = nn.Conv(self.width, (3, 3))(h)
@@ -36,12 +40,13 @@ class ResBlock(nn.Module):
 
 
 class SelfAttention(nn.Module):
-    """Attention between all positions of a feature map, as a residual. (B, H, W, C) -> same."""
+    """Attention between all positions of a feature map, as a residual."""
 
     heads: int
 
     @nn.compact
-    def __call__(self, x: Array) -> Array:
+    def __call__(self, x: Float[Array, "B H W C"]) -> Float[Array, "B H W C"]:
+        """(B, H, W, C) -> same."""
         b, h, w, c = x.shape
         tokens = nn.GroupNorm(math.gcd(GROUPS, c))(x).reshape(b, h * w, c)
         out = nn.MultiHeadDotProductAttention(self.heads, out_kernel_init=nn.initializers.zeros)(tokens)
@@ -64,7 +69,9 @@ class UNet(nn.Module):
     factor: int
 
     @nn.compact
-    def __call__(self, x_k: Array, c: Array, step: Array) -> Array:
+    def __call__(
+        self, x_k: Float[Array, "B H W C"], c: Float[Array, "B H W"], step: Int[Array, " B"]
+    ) -> Float32[Array, "B H W C"]:
         """x_k (B, H, W, C), c (B, H, W), step (B,) int -> (B, H, W, C) float32. Any H, W."""
         height, width, maps = x_k.shape[1:]
         both = self._padded(jnp.concatenate([x_k, c[..., None]], axis=-1))
