@@ -19,6 +19,7 @@ from ddg_jax.prior import Prior, make_prior
 from ddg_jax.representation import channels, correlations, decode
 from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.depth import resize_nearest
 from ddgrasp.errors import UserError
@@ -83,8 +84,8 @@ def _init_shapes(config: DDGConfig) -> Any:
 
 def frame_noise(
     key: Key[Array, ""],
-    episode: Int[Array, ""] | Int[Array, " B"],
-    frame: Int[Array, " B"],
+    episode: Int[ArrayLike, ""] | Int[ArrayLike, " B"],
+    frame: Int[AnyArray, " B"],
     shape: tuple[int, ...],
     correlation: float | tuple[float, ...],
 ) -> Float[Array, "B ..."]:
@@ -100,7 +101,7 @@ def frame_noise(
     """
     r = jnp.asarray(correlation)
 
-    def own(e: Array, t: ArrayLike) -> Array:
+    def own(e: AnyArray, t: ArrayLike) -> Array:
         return jax.random.normal(jax.random.fold_in(jax.random.fold_in(key, e), t), shape)
 
     over_episodes = None if jnp.ndim(episode) == 0 else 0

@@ -95,7 +95,7 @@ def predict_clean(
     return jnp.concatenate([valid[..., None], out[..., 1:]], axis=-1)
 
 
-def _output(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
+def _output(config: DDGConfig, params: Params, x_k: AnyArray, c: AnyArray, step: AnyArray) -> Array:
     out: Any = make_unet(config).apply({"params": params}, x_k, c, step)
     return out
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Float32, Int
 
+from ddgrasp.arrays import AnyArray
 from learning.layers import depth_to_space, sinusoids, space_to_depth, time_frequencies
 
 GROUPS = 8
@@ -70,7 +71,7 @@ class UNet(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x_k: Float[Array, "B H W C"], c: Float[Array, "B H W"], step: Int[Array, " B"]
+        self, x_k: Float[AnyArray, "B H W C"], c: Float[AnyArray, "B H W"], step: Int[AnyArray, " B"]
     ) -> Float32[Array, "B H W C"]:
         """x_k (B, H, W, C), c (B, H, W), step (B,) int -> (B, H, W, C) float32. Any H, W."""
         height, width, maps = x_k.shape[1:]
@@ -96,7 +97,7 @@ class UNet(nn.Module):
         stride = self.factor * 2 ** (len(self.widths) - 1)
         return jnp.pad(x, ((0, 0), (0, -x.shape[1] % stride), (0, -x.shape[2] % stride), (0, 0)))
 
-    def _time_embedding(self, step: Array) -> Array:
+    def _time_embedding(self, step: AnyArray) -> Array:
         size = 4 * self.widths[0]
         time = nn.Dense(size)(sinusoids(step, time_frequencies(size, jnp), cosine_first=True))
         return nn.silu(nn.Dense(size)(nn.silu(time)))
