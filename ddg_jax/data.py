@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jaxtyping import Float, Float16, Float32, Int
 
 from ddg_jax.inverse_depth import invert
 from ddg_jax.piecewise import piecewise_smooth
@@ -27,22 +28,23 @@ LEAST_KEPT = 0.98
 class Frames:
     """Frames of several recordings, one after the other.
 
-    depth_m (N, H, W) float32, 0 = hole; surface_m (N, H, W) float32, what it would be without the sensor's
-    artefacts, as far as it shows itself (`surfaces`); prior (N, H, W) float16; recording (N,) int: which
-    one a frame is from. What could not be used: frames without a valid pixel or damaged; whole recordings.
+    What could not be used: frames without a valid pixel or damaged; whole recordings.
     """
 
-    depth_m: np.ndarray
-    surface_m: np.ndarray
-    prior: np.ndarray
-    recording: np.ndarray
+    depth_m: Float32[np.ndarray, "N H W"]
+    """0 = hole."""
+    surface_m: Float32[np.ndarray, "N H W"]
+    """What it would be without the sensor's artefacts, as far as it shows itself (`surfaces`)."""
+    prior: Float16[np.ndarray, "N H W"]
+    recording: Int[np.ndarray, " N"]
+    """Which one a frame is from."""
     skipped_frames: int = 0
     refused_recordings: int = 0
 
     def __len__(self) -> int:
         return len(self.depth_m)
 
-    def part(self, chosen: slice | np.ndarray) -> "Frames":
+    def part(self, chosen: slice | Int[np.ndarray, " n"]) -> "Frames":
         """The chosen frames."""
         return replace(
             self,
@@ -53,7 +55,7 @@ class Frames:
         )
 
     @property
-    def number(self) -> np.ndarray:
+    def number(self) -> Int[np.ndarray, " N"]:
         """(N,) number of each frame within its recording, as far as it is here."""
         first = np.searchsorted(self.recording, self.recording)
         return np.arange(len(self)) - first
@@ -116,7 +118,9 @@ def load_frames(
     )
 
 
-def surfaces(depth_m: np.ndarray, kind: str, progress: Progress | None = None) -> np.ndarray:
+def surfaces(
+    depth_m: Float[np.ndarray, "N H W"], kind: str, progress: Progress | None = None
+) -> Float[np.ndarray, "N H W"]:
     """Recorded depth (N, H, W) metres -> the same with holes filled and noise smoothed away (config.surface),
     frame by frame.
     """
@@ -175,10 +179,11 @@ def _tell_of_crop(recording: Recording, config: DDGConfig, progress: Progress) -
 
 @dataclass(frozen=True)
 class Batch:
-    """x_0 (B, H, W, C) (see ddg_jax/representation.py), c (B, H, W), float32."""
+    """What a training step learns from."""
 
-    x_0: np.ndarray
-    c: np.ndarray
+    x_0: Float32[np.ndarray, "B H W C"]
+    """See ddg_jax/representation.py."""
+    c: Float32[np.ndarray, "B H W"]
 
 
 def make_batch(frames: Frames, config: DDGConfig, seed: int, step: int) -> Batch:

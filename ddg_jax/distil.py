@@ -16,6 +16,7 @@ import numpy as np
 import optax
 from jax import Array
 from jax.typing import ArrayLike
+from jaxtyping import Float, Int, Int32
 
 from ddg_jax.data import Frames, make_batch
 from ddg_jax.train import (
@@ -109,11 +110,11 @@ def distil_step(
     config: DDGConfig,
     state: TrainState,
     teacher: Params,
-    limit: ArrayLike,
-    path: ArrayLike,
-    x_0: Array,
-    c: Array,
-) -> tuple[TrainState, dict[str, Array]]:
+    limit: Float[ArrayLike, ""],
+    path: Int[ArrayLike, "3 B"],
+    x_0: Float[Array, "B H W C"],
+    c: Float[Array, "B H W"],
+) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
     """One optimiser step of the student on x_0 (B, H, W, C), c (B, H, W).
 
     Pure: its noise comes from `train.step_keys`.
@@ -154,7 +155,9 @@ def distil_step(
     return state, {"loss": loss, "grad_norm": optax.global_norm(grads)}
 
 
-def teacher_path(steps: int, count: int, number: np.ndarray, spacing: str) -> np.ndarray:
+def teacher_path(
+    steps: int, count: int, number: Int[np.ndarray, " B"], spacing: str
+) -> Int32[np.ndarray, "3 B"]:
     """(3, B) int32: where the teacher starts, passes and ends during step `number` (B,) of the student.
 
     steps: of the forward process; count: the student's, half of the teacher's.
@@ -163,7 +166,13 @@ def teacher_path(steps: int, count: int, number: np.ndarray, spacing: str) -> np
     return np.stack([path[2 * number + ahead] for ahead in range(3)])
 
 
-def one_step_target(made: diffusion.Schedule, x_k: Array, k: Array, x_end: Array, end: Array) -> Array:
+def one_step_target(
+    made: diffusion.Schedule,
+    x_k: Float[Array, "B ..."],
+    k: Int[Array, " B"],
+    x_end: Float[Array, "B ..."],
+    end: Int[Array, " B"],
+) -> Float[Array, "B ..."]:
     """The x_0 whose DDIM step takes x_k (step k) to x_end (step `end`) (Salimans & Ho 2022, appendix G).
 
     With r = sqrt((1 - alpha_bar_end) / (1 - alpha_bar_k)):

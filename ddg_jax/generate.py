@@ -14,6 +14,7 @@ from itertools import islice
 
 import jax
 import numpy as np
+from jaxtyping import Key, UInt8, UInt16
 
 from ddg_jax.sample import Generator, batch_size, condition, grafted, predict
 from ddgrasp import depth
@@ -33,19 +34,18 @@ class Clip:
 
     number: int
     """Decides its noise."""
-    depth_mm: np.ndarray
-    """(T, H, W) uint16."""
-    rgb: np.ndarray | None = None
-    """(T, h, w, 3) uint8, for priors that need it in simulation."""
+    depth_mm: UInt16[np.ndarray, "T H W"]
+    rgb: UInt8[np.ndarray, "T h w 3"] | None = None
+    """For priors that need it in simulation."""
 
 
 def noisy_episodes(
-    key: jax.Array,
+    key: Key[jax.Array, ""],
     generator: Generator,
     lengths: Sequence[int],
     read: Callable[[int], Clip],
     first: int = 0,
-) -> Iterator[np.ndarray]:
+) -> Iterator[UInt16[np.ndarray, "T H W"]]:
     """Yields the grafted depth, (T, H, W) uint16 millimetres, of episodes `first`, `first` + 1, ... in order.
 
     Holds a batch and the episodes that it touches.

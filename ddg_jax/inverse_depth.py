@@ -1,18 +1,19 @@
 """Inverse depth, the unit of every prior, normalised as relative depth networks are trained to give it."""
 
 import numpy as np
+from jaxtyping import Float, Float32
 
 NORMALISED_LIMIT = 2.5
 """|c| of normalised priors never exceeds this."""
 _STATISTICS_STRIDE = 7
 
 
-def invert(depth_m: np.ndarray) -> np.ndarray:
-    """1/d in 1/m, 0 where depth is 0 (infinitely far, or a hole). Any shape, float32."""
+def invert(depth_m: Float[np.ndarray, "*x"]) -> Float32[np.ndarray, "*x"]:
+    """1/d in 1/m, 0 where depth is 0 (infinitely far, or a hole). Any shape."""
     return np.divide(1, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)
 
 
-def normalise(inverse: np.ndarray) -> np.ndarray:
+def normalise(inverse: Float[np.ndarray, "T H W"]) -> Float32[np.ndarray, "T H W"]:
     """Affine-normalised inverse depth of a sequence (T, H, W): median 0, mean deviation 1/2, clipped."""
     sample = inverse.reshape(-1)[::_STATISTICS_STRIDE]
     shift = np.median(sample)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Float32, UInt8
 
 from ddg_jax.inverse_depth import invert, normalise
 from ddgrasp.config import DDGConfig
@@ -46,13 +47,18 @@ class DepthNetworkPrior:
         self.source: str | dict[str, str] = manifest.summary() | {"in_simulation": config.prior.in_sim}
 
     def from_recording(
-        self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator
-    ) -> np.ndarray:
+        self,
+        depth_m: Float[np.ndarray, "T H W"],
+        rgb: UInt8[np.ndarray, "T h w 3"] | None,
+        rng: np.random.Generator,
+    ) -> Float32[np.ndarray, "T H W"]:
         """See `Prior`; depth gives the size only."""
         del rng
         return self._from_rgb(rgb, depth_m.shape[1:])
 
-    def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None = None) -> np.ndarray:
+    def from_sim(
+        self, depth_m: Float[np.ndarray, "T H W"], rgb: UInt8[np.ndarray, "T h w 3"] | None = None
+    ) -> Float32[np.ndarray, "T H W"]:
         """See `Prior`."""
         if self._config.prior.in_sim == "depth":
             return normalise(invert(depth_m))
@@ -89,7 +95,7 @@ class DepthNetworkPrior:
         return video if network.video else pictures
 
 
-def at_size(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def at_size(image: Float[np.ndarray, "H W"], size: tuple[int, int]) -> Float[np.ndarray, "h w"]:
     """(H, W) -> `size`, averaged after a centred crop to its aspect ratio: the part of the scene that depth
     resized by `ddgrasp.depth.crop_nearest` shows.
     """
@@ -102,7 +108,9 @@ def at_size(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(cropped, size[::-1], interpolation=mode)
 
 
-def metric_depth(relative: np.ndarray, depth_m: np.ndarray, far_m: float) -> np.ndarray:
+def metric_depth(
+    relative: Float[np.ndarray, "*x"], depth_m: Float[np.ndarray, "*x"], far_m: float
+) -> Float32[np.ndarray, "*x"]:
     """The monocular baseline: depth in metres from relative inverse depth, fitted to what a camera measured.
 
     1 / d = a relative + b by least squares over the valid pixels (Ranftl et al. 2020, eq. 4), d <= `far_m`.

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float
 
 from sensors.statistics.holes import fill_from_background
 
@@ -31,7 +32,7 @@ _STEP = 12**-0.5
 """Primal and dual step: the operator's squared norm is at most 12."""
 
 
-def piecewise_smooth(inverse: np.ndarray) -> np.ndarray:
+def piecewise_smooth(inverse: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     """(H, W) inverse depth in 1/m, 0 = unknown -> without unknowns, noise and blurred edges; 0 if all are."""
     start = fill_from_background(inverse)
     fidelity = FIDELITY * (inverse > 0).astype(np.float32)
@@ -69,7 +70,7 @@ class _State(NamedTuple):
 def _minimise(u_0: Array, fidelity: Array, weight: Array) -> Array:
     """First-order primal-dual iterations (Chambolle & Pock 2011, algorithm 1)."""
 
-    def iterate(_: int, s: _State) -> _State:
+    def iterate(_: Array, s: _State) -> _State:
         v_0, v_1 = s.v_ahead
         p_0, p_1 = (p + _STEP * (_next(s.u_ahead, i) - s.v_ahead[i]) for i, p in enumerate(s.p))
         over = jnp.maximum(1, jnp.sqrt(p_0**2 + p_1**2) / weight)

@@ -11,10 +11,11 @@ smoothing.
 """
 
 from collections.abc import Iterable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from ddg_jax.inverse_depth import invert, normalise
 from ddg_jax.network_prior import NETWORKS, DepthNetworkPrior
@@ -29,6 +30,7 @@ SAME_SURFACE = 0.05
 """Relative inverse-depth difference below which two frames see the same surface (temporal smoothing)."""
 
 
+@runtime_checkable
 class Prior(Protocol):
     """Source of c. Frames of one call belong to one recording or episode, in time order."""
 
@@ -41,12 +43,17 @@ class Prior(Protocol):
     """For reports: "built-in", or which weights were used."""
 
     def from_recording(
-        self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator
-    ) -> np.ndarray:
+        self,
+        depth_m: Float[np.ndarray, "T H W"],
+        rgb: UInt8[np.ndarray, "T h w 3"] | None,
+        rng: np.random.Generator,
+    ) -> Float32[np.ndarray, "T H W"]:
         """depth_m (T, H, W) with holes (0), rgb (T, h, w, 3) uint8 -> c (T, H, W) float32."""
         ...
 
-    def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None) -> np.ndarray:
+    def from_sim(
+        self, depth_m: Float[np.ndarray, "T H W"], rgb: UInt8[np.ndarray, "T h w 3"] | None
+    ) -> Float32[np.ndarray, "T H W"]:
         """Clean depth_m (T, H, W), 0 = nothing within range, rgb likewise -> c (T, H, W) float32."""
         ...
 
@@ -68,8 +75,11 @@ class InverseDepthPrior:
         self.surface = surface
 
     def from_recording(
-        self, depth_m: np.ndarray, rgb: np.ndarray | None, rng: np.random.Generator
-    ) -> np.ndarray:
+        self,
+        depth_m: Float[np.ndarray, "T H W"],
+        rgb: UInt8[np.ndarray, "T h w 3"] | None,
+        rng: np.random.Generator,
+    ) -> Float32[np.ndarray, "T H W"]:
         """See `Prior`; `rng` chooses the frames filled under decoy holes and their shapes."""
         inverse = invert(depth_m)
         holes = inverse == 0
@@ -80,7 +90,9 @@ class InverseDepthPrior:
         filled = np.stack([fill_from_background(frame) for frame in inverse])
         return self._scaled(self._blurred(map(smooth_surface, smooth_in_time(filled))))
 
-    def from_sim(self, depth_m: np.ndarray, rgb: np.ndarray | None = None) -> np.ndarray:
+    def from_sim(
+        self, depth_m: Float[np.ndarray, "T H W"], rgb: UInt8[np.ndarray, "T h w 3"] | None = None
+    ) -> Float32[np.ndarray, "T H W"]:
         """See `Prior`."""
         inverse = invert(depth_m)
         # Filters that edges do not survive whole are passed by both sides.
@@ -120,13 +132,13 @@ def make_prior(config: DDGConfig) -> Prior:
     return kind(config.prior.blur_px, config.prior.decoy_holes, config.depth.surface)
 
 
-def decoy_holes(holes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def decoy_holes(holes: Bool[np.ndarray, "H W"], rng: np.random.Generator) -> Bool[np.ndarray, "H W"]:
     """A hole mask (H, W) moved to a random place (wrapping around), so that it lies on intact surface."""
     shift = (int(rng.integers(holes.shape[0])), int(rng.integers(holes.shape[1])))
     return np.roll(holes, shift, axis=(0, 1))
 
 
-def smooth_in_time(inverse: np.ndarray) -> np.ndarray:
+def smooth_in_time(inverse: Float[np.ndarray, "T H W"]) -> Float[np.ndarray, "T H W"]:
     """Mean over each frame and its two neighbours (T, H, W), of pixels that still see the same surface."""
     total, count = inverse.copy(), np.ones_like(inverse)
     for here, there in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Float32
 
 from ddgrasp.config import DEPTH, DEVIATION, DDGConfig
 
@@ -33,10 +34,12 @@ FARTHEST_M = 50.0
 
 
 class Decoded(NamedTuple):
-    """What x says: depth_m, the generator's own map, 0 in holes; mask M, where that is an artefact."""
+    """What x says."""
 
-    depth_m: Array
-    mask: Array
+    depth_m: Float32[Array, "*b"]
+    """The generator's own map, 0 in holes."""
+    mask: Bool[Array, "*b"]
+    """M, where that is an artefact."""
 
 
 def channels(config: DDGConfig) -> int:
@@ -49,7 +52,9 @@ def correlations(config: DDGConfig) -> tuple[float, ...]:
     return (config.sampling.frame_correlation, config.sampling.deviation_correlation)[: channels(config)]
 
 
-def encode(config: DDGConfig, depth_m: ArrayLike, surface_m: ArrayLike) -> Array:
+def encode(
+    config: DDGConfig, depth_m: Float[ArrayLike, "*b"], surface_m: Float[ArrayLike, "*b"]
+) -> Float32[Array, "*b C"]:
     """Measured planar metres (0 = hole) of surfaces at `surface_m`, same shape -> x (..., C) float32."""
     depth_m = jnp.asarray(depth_m)
     if config.depth.representation == DEPTH:
@@ -60,7 +65,7 @@ def encode(config: DDGConfig, depth_m: ArrayLike, surface_m: ArrayLike) -> Array
     return x.astype(jnp.float32)
 
 
-def decode(config: DDGConfig, x: ArrayLike, surface_m: ArrayLike) -> Decoded:
+def decode(config: DDGConfig, x: Float[ArrayLike, "*b C"], surface_m: Float[ArrayLike, "*b"]) -> Decoded:
     """x (..., C) on surfaces at `surface_m` (...) metres, 0 = nothing there -> depth and artefact mask (...).
 
     An artefact is a hole or, in `deviation`, a deviation of `deviation_threshold` or more.

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Float32, Int, Key, UInt8
 
 from ddg_jax.distil import X_LIMIT, params_file
 from ddg_jax.graft import graft
@@ -18,6 +19,7 @@ from ddg_jax.prior import Prior, make_prior
 from ddg_jax.representation import channels, correlations, decode
 from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddgrasp import artifacts
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.depth import resize_nearest
 from ddgrasp.errors import UserError
@@ -81,8 +83,12 @@ def _init_shapes(config: DDGConfig) -> Any:
 
 
 def frame_noise(
-    key: Array, episode: Array, frame: Array, shape: tuple[int, ...], correlation: float | tuple[float, ...]
-) -> Array:
+    key: Key[Array, ""],
+    episode: Int[ArrayLike, ""] | Int[ArrayLike, " B"],
+    frame: Int[AnyArray, " B"],
+    shape: tuple[int, ...],
+    correlation: float | tuple[float, ...],
+) -> Float[Array, "B ..."]:
     """Standard normal noise (B, *shape): sqrt(r) g_episode + sqrt(1 - r) g_frame, r = `correlation`.
 
     Frames of one episode share g_episode, so holes stay where they are between frames, as on a camera; every
@@ -95,7 +101,7 @@ def frame_noise(
     """
     r = jnp.asarray(correlation)
 
-    def own(e: Array, t: ArrayLike) -> Array:
+    def own(e: AnyArray, t: ArrayLike) -> Array:
         return jax.random.normal(jax.random.fold_in(jax.random.fold_in(key, e), t), shape)
 
     over_episodes = None if jnp.ndim(episode) == 0 else 0
@@ -109,8 +115,15 @@ def frame_noise(
 
 @partial(jax.jit, static_argnums=(0,), static_argnames=("steps",))
 def sample(
-    config: DDGConfig, key: Array, params: Params, c: Array, episode: Array, frame: Array, *, steps: int
-) -> Array:
+    config: DDGConfig,
+    key: Key[Array, ""],
+    params: Params,
+    c: Float[Array, "B H W"],
+    episode: Int[Array, ""] | Int[Array, " B"],
+    frame: Int[Array, " B"],
+    *,
+    steps: int,
+) -> Float32[Array, "B H W C"]:
     """Generated maps x (see ddg_jax/representation.py), (B, H, W, C) float32.
 
     Args:
@@ -161,31 +174,31 @@ def sample(
 
 @dataclass(frozen=True)
 class Generated:
-    """depth_m: the result, grafted (paper III-B2). predicted_m: the generator's own map. Both (B, H, W)
-    float32, 0 = hole. mask (B, H, W) bool: M, the artefacts that were grafted.
-    """
+    """Simulated depth with a camera's artefacts; 0 = hole."""
 
-    depth_m: np.ndarray
-    predicted_m: np.ndarray
-    mask: np.ndarray
+    depth_m: Float32[np.ndarray, "B H W"]
+    """The result, grafted (paper III-B2)."""
+    predicted_m: Float32[np.ndarray, "B H W"]
+    """The generator's own map."""
+    mask: Bool[np.ndarray, "B H W"]
+    """M, the artefacts that were grafted."""
 
 
 def generate(
-    key: Array,
+    key: Key[Array, ""],
     generator: Generator,
     depth_m: np.ndarray,
-    rgb: np.ndarray | None = None,
+    rgb: UInt8[np.ndarray, "B h w 3"] | None = None,
     *,
-    episode: int | np.ndarray = 0,
-    frame: np.ndarray | None = None,
+    episode: int | Int[np.ndarray, " B"] = 0,
+    frame: Int[np.ndarray, " B"] | None = None,
     steps: int | None = None,
 ) -> Generated:
     """Gives simulated frames the camera's artefacts: one episode, or a batch from many environments.
 
     Args:
       depth_m: (B, H, W) clean planar depth, 0 = nothing within range; in time order if of one episode. Any
-      size
-        with the generator's aspect ratio; the artefacts are made at the generator's size.
+        size with the generator's aspect ratio; the artefacts are made at the generator's size.
       rgb: (B, h, w, 3) uint8, for priors that need it.
       episode: number of the episode, which decides its noise; (B,) if every frame has its own.
       frame: (B,) numbers within the episode, 0, 1, ... by default.
@@ -199,8 +212,12 @@ def generate(
 
 
 def condition(
-    generator: Generator, depth_m: np.ndarray, rgb: np.ndarray | None, *, one_episode: bool
-) -> np.ndarray:
+    generator: Generator,
+    depth_m: np.ndarray,
+    rgb: UInt8[np.ndarray, "B H W 3"] | None,
+    *,
+    one_episode: bool,
+) -> Float32[np.ndarray, "B h w"]:
     """c (B, h, w) at the generator's size of one sequence, or of frames that have nothing to do with each
     other. Arguments and errors of `generate`.
     """
@@ -213,7 +230,9 @@ def condition(
     return np.concatenate([prior.from_sim(d[None], p) for d, p in zip(clean, pictures, strict=True)])
 
 
-def grafted(config: DDGConfig, depth_m: np.ndarray, x: np.ndarray) -> Generated:
+def grafted(
+    config: DDGConfig, depth_m: Float[np.ndarray, "B H W"], x: Float[np.ndarray, "B h w C"]
+) -> Generated:
     """Maps x (B, h, w, C) of `predict` on clean depth_m (B, H, W)."""
     sized = np.moveaxis(resize_nearest(np.moveaxis(x, -1, 1), depth_m.shape[1:]), 1, -1)
     return Generated(*map(np.asarray, _graft(config, np.asarray(depth_m, np.float32), sized)))
@@ -231,14 +250,14 @@ def batch_size(config: DDGConfig) -> int:
 
 
 def predict(
-    key: Array,
+    key: Key[Array, ""],
     generator: Generator,
-    c: np.ndarray,
+    c: Float[np.ndarray, "B H W"],
     *,
-    episode: int | np.ndarray = 0,
-    frame: np.ndarray | None = None,
+    episode: int | Int[np.ndarray, " B"] = 0,
+    frame: Int[np.ndarray, " B"] | None = None,
     steps: int | None = None,
-) -> np.ndarray:
+) -> Float32[np.ndarray, "B H W C"]:
     """Maps x (B, H, W, C) for priors c (B, H, W), in batches of one compiled size, split over this
     process's devices. Arguments of `generate`.
     """

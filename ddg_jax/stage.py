@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from ddg_jax import data
 from ddg_jax.distil import distil
@@ -139,7 +140,9 @@ def _panels(generator: Generator, frames: data.Frames, seed: int) -> dict[str, n
     }
 
 
-def hole_statistics(depth_m: np.ndarray, recording: np.ndarray) -> dict[str, float]:
+def hole_statistics(
+    depth_m: Float[np.ndarray, "N H W"], recording: Int[np.ndarray, " N"]
+) -> dict[str, float]:
     """Share of invalid pixels, regions per frame, median region, left band and validity flicker of (N, H, W)
     metres; `recording` (N,) says which frames follow each other.
     """
@@ -154,7 +157,7 @@ def hole_statistics(depth_m: np.ndarray, recording: np.ndarray) -> dict[str, flo
     }
 
 
-def flicker_fraction(valid: np.ndarray, recording: np.ndarray) -> float:
+def flicker_fraction(valid: Bool[np.ndarray, "N H W"], recording: Int[np.ndarray, " N"]) -> float:
     """Share of pixels that change validity between neighbouring frames of one recording; valid (N, H, W),
     recording (N,). nan if every frame is from another one.
     """
@@ -162,7 +165,9 @@ def flicker_fraction(valid: np.ndarray, recording: np.ndarray) -> float:
     return float(np.mean((valid[1:] != valid[:-1])[same])) if same.any() else float("nan")
 
 
-def deviation_statistics(depth_m: np.ndarray, surface_m: np.ndarray) -> dict[str, float]:
+def deviation_statistics(
+    depth_m: Float[np.ndarray, "N H W"], surface_m: Float[np.ndarray, "N H W"]
+) -> dict[str, float]:
     """Median and 99th percentile of |1/d - 1/d_surface| in 1/m, over valid pixels of (N, H, W) metres."""
     known = (depth_m > 0) & (surface_m > 0)
     if not known.any():

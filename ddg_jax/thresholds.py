@@ -13,6 +13,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from ddg_jax import data
@@ -48,7 +49,9 @@ class Masked:
     """Largest |d_final - d_clean| where M = 0: 0 by the paper's equation."""
 
 
-def masked(config: DDGConfig, x: np.ndarray, frames: data.Frames, threshold: float) -> Masked:
+def masked(
+    config: DDGConfig, x: Float[np.ndarray, "N H W C"], frames: data.Frames, threshold: float
+) -> Masked:
     """Statistics of maps x (N, H, W, C) on the surfaces of `frames`."""
     clean_m = frames.surface_m
     made = grafted(replace(config, graft=replace(config.graft, noise_threshold=threshold)), clean_m, x)

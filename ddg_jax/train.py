@@ -19,10 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from jaxtyping import Float, Int, Key, UInt32
 
 from ddg_jax.data import Frames, make_batch
 from ddg_jax.representation import channels
 from ddg_jax.unet import UNet
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import CROSS_ENTROPY, SQUARED, UNIFORM, DDGConfig
 from ddgrasp.progress import Progress
 from learning import diffusion
@@ -57,7 +59,7 @@ def make_optimizer(config: DDGConfig, steps: int, scale: float = 1.0) -> optax.G
     )
 
 
-def init_params(config: DDGConfig, key: Array) -> Params:
+def init_params(config: DDGConfig, key: Key[Array, ""]) -> Params:
     """Fresh parameters of the network."""
     c = jnp.zeros((1, config.depth.height_px, config.depth.width_px))
     x = jnp.zeros((*c.shape, channels(config)))
@@ -65,7 +67,7 @@ def init_params(config: DDGConfig, key: Array) -> Params:
 
 
 @partial(jax.jit, static_argnums=0)
-def init_state(config: DDGConfig, key: Array) -> TrainState:
+def init_state(config: DDGConfig, key: UInt32[Array, " words"]) -> TrainState:
     """State before the first step. `key` is raw key data."""
     params = init_params(config, jax.random.fold_in(jax.random.wrap_key_data(key), 0))
     return first_state(params, make_optimizer(config, config.training.steps), key)
@@ -78,7 +80,13 @@ def config_schedule(config: DDGConfig) -> diffusion.Schedule:
     )
 
 
-def predict_clean(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
+def predict_clean(
+    config: DDGConfig,
+    params: Params,
+    x_k: Float[AnyArray, "B H W C"],
+    c: Float[AnyArray, "B H W"],
+    step: Int[AnyArray, " B"],
+) -> Float[Array, "B H W C"]:
     """The clean map x_0 (B, H, W, C) that the network sees in x_k; c (B, H, W), step (B,) int."""
     out = _output(config, params, x_k, c, step)
     if config.training.hole_loss == SQUARED:
@@ -87,12 +95,17 @@ def predict_clean(config: DDGConfig, params: Params, x_k: Array, c: Array, step:
     return jnp.concatenate([valid[..., None], out[..., 1:]], axis=-1)
 
 
-def _output(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
+def _output(config: DDGConfig, params: Params, x_k: AnyArray, c: AnyArray, step: AnyArray) -> Array:
     out: Any = make_unet(config).apply({"params": params}, x_k, c, step)
     return out
 
 
-def valid_log_odds(config: DDGConfig, output: Array, x_k: Array, step: Array) -> Array:
+def valid_log_odds(
+    config: DDGConfig,
+    output: Float[AnyArray, "B H W C"],
+    x_k: Float[AnyArray, "B H W C"],
+    step: Int[AnyArray, " B"],
+) -> Float[Array, "B H W"]:
     """log P(valid | x_k, c) - log P(hole | x_k, c), (B, H, W); output, x_k (B, H, W, C), step (B,) int.
 
     Bayes' rule: what the network makes of the neighbours and c, plus the pixel's own likelihood ratio,
@@ -103,7 +116,13 @@ def valid_log_odds(config: DDGConfig, output: Array, x_k: Array, step: Array) ->
     return LOG_ODDS_PER_OUTPUT * output[..., 0] + own
 
 
-def predict_noise(config: DDGConfig, params: Params, x_k: Array, c: Array, step: Array) -> Array:
+def predict_noise(
+    config: DDGConfig,
+    params: Params,
+    x_k: Float[AnyArray, "B H W C"],
+    c: Float[AnyArray, "B H W"],
+    step: Int[AnyArray, " B"],
+) -> Float[Array, "B H W C"]:
     """eps_theta(d_k (+) c, k), (B, H, W, C).
 
     The U-Net's output enters as the clean map that explains x_k, and eps is what remains: depth given c is
@@ -114,7 +133,7 @@ def predict_noise(config: DDGConfig, params: Params, x_k: Array, c: Array, step:
     return diffusion.eps_from_x_0(config_schedule(config), x_k, step, x_0)
 
 
-def loss_weight(config: DDGConfig, step: Array) -> Array:
+def loss_weight(config: DDGConfig, step: Int[AnyArray, " B"]) -> Float[Array, " B"]:
     """Weight of each step's noise error, (B,).
 
     "uniform" is the paper's 1. "truncated" is clip(SNR, *config.snr_limits) / SNR: per unit of error in x_0
@@ -126,7 +145,14 @@ def loss_weight(config: DDGConfig, step: Array) -> Array:
     return jnp.clip(snr, *config.training.snr_limits) / snr
 
 
-def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Array, eps: Array) -> Array:
+def noise_loss(
+    config: DDGConfig,
+    params: Params,
+    x_0: Float[AnyArray, "B H W C"],
+    c: Float[AnyArray, "B H W"],
+    step: Int[AnyArray, " B"],
+    eps: Float[AnyArray, "B H W C"],
+) -> Float[Array, ""]:
     """mean w_k |eps - eps_theta(d_k (+) c, k)|^2 (paper eq. 4; w_k: `loss_weight`). x_0, eps (B, H, W, C);
     c (B, H, W); step (B,) int.
 
@@ -144,15 +170,15 @@ def noise_loss(config: DDGConfig, params: Params, x_0: Array, c: Array, step: Ar
     return jnp.mean(weight * jnp.mean(error, axis=(1, 2, 3)))
 
 
-def step_keys(state: TrainState) -> Array:
+def step_keys(state: TrainState) -> Key[Array, "3"]:
     """(3,) keys of the step that `state` takes next: for eps, k and the noise on c."""
     return jax.random.split(step_key(state, ahead=1), 3)
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
 def train_step(
-    config: DDGConfig, state: TrainState, x_0: Array, c: Array
-) -> tuple[TrainState, dict[str, Array]]:
+    config: DDGConfig, state: TrainState, x_0: Float[AnyArray, "B H W C"], c: Float[AnyArray, "B H W"]
+) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
     """One optimiser step on x_0 (B, H, W, C), c (B, H, W). Pure: its noise comes from `step_keys`."""
     eps_key, step_key, prior_key = step_keys(state)
     eps = jax.random.normal(eps_key, x_0.shape)

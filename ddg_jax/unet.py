@@ -11,7 +11,9 @@ from collections.abc import Sequence
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import Float, Float32, Int
 
+from ddgrasp.arrays import AnyArray
 from learning.layers import depth_to_space, sinusoids, space_to_depth, time_frequencies
 
 GROUPS = 8
@@ -23,7 +25,10 @@ class ResBlock(nn.Module):
     width: int
 
     @nn.compact
-    def __call__(self, x: Array, time: Array) -> Array:
+    def __call__(
+        self, x: Float[Array, "B H W C"], time: Float[Array, "B T"]
+    ) -> Float[Array, "B H W {self.width}"]:
+        """(B, H, W, C), time embedding (B, T) -> (B, H, W, width)."""
         groups = math.gcd(GROUPS, self.width)
         h = nn.silu(nn.GroupNorm(math.gcd(GROUPS, x.shape[-1]))(x))
         h = nn.Conv(self.width, (3, 3))(h)
@@ -36,12 +41,13 @@ class ResBlock(nn.Module):
 
 
 class SelfAttention(nn.Module):
-    """Attention between all positions of a feature map, as a residual. (B, H, W, C) -> same."""
+    """Attention between all positions of a feature map, as a residual."""
 
     heads: int
 
     @nn.compact
-    def __call__(self, x: Array) -> Array:
+    def __call__(self, x: Float[Array, "B H W C"]) -> Float[Array, "B H W C"]:
+        """(B, H, W, C) -> same."""
         b, h, w, c = x.shape
         tokens = nn.GroupNorm(math.gcd(GROUPS, c))(x).reshape(b, h * w, c)
         out = nn.MultiHeadDotProductAttention(self.heads, out_kernel_init=nn.initializers.zeros)(tokens)
@@ -64,7 +70,9 @@ class UNet(nn.Module):
     factor: int
 
     @nn.compact
-    def __call__(self, x_k: Array, c: Array, step: Array) -> Array:
+    def __call__(
+        self, x_k: Float[AnyArray, "B H W C"], c: Float[AnyArray, "B H W"], step: Int[AnyArray, " B"]
+    ) -> Float32[Array, "B H W C"]:
         """x_k (B, H, W, C), c (B, H, W), step (B,) int -> (B, H, W, C) float32. Any H, W."""
         height, width, maps = x_k.shape[1:]
         both = self._padded(jnp.concatenate([x_k, c[..., None]], axis=-1))
@@ -89,7 +97,7 @@ class UNet(nn.Module):
         stride = self.factor * 2 ** (len(self.widths) - 1)
         return jnp.pad(x, ((0, 0), (0, -x.shape[1] % stride), (0, -x.shape[2] % stride), (0, 0)))
 
-    def _time_embedding(self, step: Array) -> Array:
+    def _time_embedding(self, step: AnyArray) -> Array:
         size = 4 * self.widths[0]
         time = nn.Dense(size)(sinusoids(step, time_frequencies(size, jnp), cosine_first=True))
         return nn.silu(nn.Dense(size)(nn.silu(time)))

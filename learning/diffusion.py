@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
+from jaxtyping import Float, Float32, Float64, Int, Int32
 
 from ddgrasp.config import SPACINGS
 from ddgrasp.errors import UserError, unknown_name
@@ -32,10 +33,10 @@ PREDICTED, CONSISTENT = "predicted", "consistent"
 
 
 class Schedule(NamedTuple):
-    """betas (K,) and alpha_bars (K,), float32 NumPy: constants for jitted functions."""
+    """Of K steps; NumPy, so that they are constants of jitted functions."""
 
-    betas: np.ndarray
-    alpha_bars: np.ndarray
+    betas: Float32[np.ndarray, " K"]
+    alpha_bars: Float32[np.ndarray, " K"]
 
     @property
     def steps(self) -> int:
@@ -43,12 +44,12 @@ class Schedule(NamedTuple):
         return len(self.betas)
 
 
-def linear_betas(steps: int, first: float = 1e-4, last: float = 0.02) -> np.ndarray:
+def linear_betas(steps: int, first: float = 1e-4, last: float = 0.02) -> Float64[np.ndarray, " {steps}"]:
     """beta_k from `first` to `last` in equal steps, (K,) float64 (Ho et al. 2020, section 4)."""
     return np.linspace(first, last, steps)
 
 
-def cosine_betas(steps: int, terminal_time: float = 1.0) -> np.ndarray:
+def cosine_betas(steps: int, terminal_time: float = 1.0) -> Float64[np.ndarray, " {steps}"]:
     """beta_k = 1 - f(T(k+1)/K) / f(Tk/K), f(u) = cos^2(pi/2 (u+s)/(1+s)), (K,) (N. & D. 2021, eq. 17, T = 1).
 
     With `terminal_time` T below 1 the last sample keeps some signal. At T = 1 alpha_bar reaches zero, and
@@ -60,7 +61,7 @@ def cosine_betas(steps: int, terminal_time: float = 1.0) -> np.ndarray:
     return np.minimum(1 - f[1:] / f[:-1], MAX_BETA)
 
 
-def shifted_betas(betas: np.ndarray, log_snr_shift: float) -> np.ndarray:
+def shifted_betas(betas: Float64[np.ndarray, " K"], log_snr_shift: float) -> Float64[np.ndarray, " K"]:
     """Betas whose log SNR, log(alpha_bar / (1 - alpha_bar)), is moved by `log_snr_shift` at every step.
 
     Negative values make every step noisier, which large pictures want (Hoogeboom et al. 2023, eq. 5).
@@ -86,12 +87,12 @@ def make_schedule(name: str, steps: int, log_snr_shift: float = 0.0) -> Schedule
     return schedule_of(betas)
 
 
-def schedule_of(betas: np.ndarray) -> Schedule:
+def schedule_of(betas: Float64[np.ndarray, " K"]) -> Schedule:
     """The schedule with these betas, (K,) float64."""
     return Schedule(betas.astype(np.float32), np.cumprod(1 - betas).astype(np.float32))
 
 
-def timesteps(steps: int, count: int, spacing: str = "trailing") -> np.ndarray:
+def timesteps(steps: int, count: int, spacing: str = "trailing") -> Int32[np.ndarray, " {count}"]:
     """`count` of the steps K-1..0 that a few-step sampler visits, descending, (count,) int32.
 
     "leading" ends at 0 and starts short of K-1; "trailing" starts at K-1, where x is pure noise, and ends
@@ -114,19 +115,26 @@ def timesteps(steps: int, count: int, spacing: str = "trailing") -> np.ndarray:
     return visited.astype(np.int32)
 
 
-def previous_steps(visited: np.ndarray) -> np.ndarray:
+def previous_steps(visited: Int[np.ndarray, " count"]) -> Int32[np.ndarray, " count"]:
     """The step each visited step leads to: the next visited one, finally -1. (count,) int32."""
     return np.append(visited[1:], -1).astype(np.int32)
 
 
-def alpha_bar_at(schedule: Schedule, step: ArrayLike, x: ArrayLike) -> Array:
+def alpha_bar_at(
+    schedule: Schedule, step: Int[ArrayLike, "*lead"], x: Float[ArrayLike, "*x"]
+) -> Float[Array, "..."]:
     """alpha_bar at `step` (any leading shape of x; -1 gives 1), with axes added to broadcast against x."""
     step = jnp.asarray(step)
     value = jnp.where(step < 0, 1.0, jnp.asarray(schedule.alpha_bars)[jnp.maximum(step, 0)])
     return value.reshape(value.shape + (1,) * (jnp.ndim(x) - value.ndim))
 
 
-def q_sample(schedule: Schedule, x_0: ArrayLike, step: ArrayLike, eps: ArrayLike) -> Array:
+def q_sample(
+    schedule: Schedule,
+    x_0: Float[ArrayLike, "*x"],
+    step: Int[ArrayLike, "*lead"],
+    eps: Float[ArrayLike, "*x"],
+) -> Float[Array, "*x"]:
     """x_k = sqrt(alpha_bar) x_0 + sqrt(1 - alpha_bar) eps (Ho et al. 2020, eq. 4). x_0, eps: (B, ...), step
     (B,).
     """
@@ -134,34 +142,53 @@ def q_sample(schedule: Schedule, x_0: ArrayLike, step: ArrayLike, eps: ArrayLike
     return jnp.sqrt(a) * x_0 + jnp.sqrt(1 - a) * eps
 
 
-def predict_x_0(schedule: Schedule, x_k: ArrayLike, step: ArrayLike, eps: ArrayLike) -> Array:
+def predict_x_0(
+    schedule: Schedule,
+    x_k: Float[ArrayLike, "*x"],
+    step: Int[ArrayLike, "*lead"],
+    eps: Float[ArrayLike, "*x"],
+) -> Float[Array, "*x"]:
     """x_0 = (x_k - sqrt(1 - alpha_bar) eps) / sqrt(alpha_bar): `q_sample` solved for x_0 (eq. 15)."""
     a = alpha_bar_at(schedule, step, x_k)
     return jnp.asarray((x_k - jnp.sqrt(1 - a) * eps) / jnp.sqrt(a))
 
 
-def eps_from_x_0(schedule: Schedule, x_k: ArrayLike, step: ArrayLike, x_0: ArrayLike) -> Array:
+def eps_from_x_0(
+    schedule: Schedule,
+    x_k: Float[ArrayLike, "*x"],
+    step: Int[ArrayLike, "*lead"],
+    x_0: Float[ArrayLike, "*x"],
+) -> Float[Array, "*x"]:
     """eps = (x_k - sqrt(alpha_bar) x_0) / sqrt(1 - alpha_bar): `q_sample` solved for eps."""
     a = alpha_bar_at(schedule, step, x_k)
     return jnp.asarray((x_k - jnp.sqrt(a) * x_0) / jnp.sqrt(1 - a))
 
 
-def signal_to_noise(schedule: Schedule, step: ArrayLike) -> Array:
+def signal_to_noise(schedule: Schedule, step: Int[ArrayLike, "*lead"]) -> Float[Array, "*lead"]:
     """alpha_bar / (1 - alpha_bar) at `step`, shaped like `step`."""
     a = jnp.asarray(schedule.alpha_bars)[jnp.asarray(step)]
     return a / (1 - a)
 
 
 def posterior_mean(
-    schedule: Schedule, x_k: ArrayLike, x_0: ArrayLike, step: ArrayLike, previous: ArrayLike
-) -> Array:
+    schedule: Schedule,
+    x_k: Float[ArrayLike, "*x"],
+    x_0: Float[ArrayLike, "*x"],
+    step: Int[ArrayLike, "*lead"],
+    previous: Int[ArrayLike, "*lead"],
+) -> Float[Array, "*x"]:
     """Mean of q(x_previous | x_k, x_0) (Ho et al., eq. 7; alpha = alpha_bar_k / alpha_bar_previous)."""
     a, a_prev = alpha_bar_at(schedule, step, x_k), alpha_bar_at(schedule, previous, x_k)
     alpha = a / a_prev
     return (jnp.sqrt(a_prev) * (1 - alpha) * x_0 + jnp.sqrt(alpha) * (1 - a_prev) * x_k) / (1 - a)
 
 
-def posterior_variance(schedule: Schedule, step: ArrayLike, previous: ArrayLike, x: ArrayLike) -> Array:
+def posterior_variance(
+    schedule: Schedule,
+    step: Int[ArrayLike, "*lead"],
+    previous: Int[ArrayLike, "*lead"],
+    x: Float[ArrayLike, "*x"],
+) -> Float[Array, "..."]:
     """beta~ = (1 - alpha_bar_previous) / (1 - alpha_bar_k) * (1 - alpha_k) (Ho et al. 2020, eq. 7), 0 at the
     end.
     """
@@ -171,13 +198,13 @@ def posterior_variance(schedule: Schedule, step: ArrayLike, previous: ArrayLike,
 
 def ddpm_step(
     schedule: Schedule,
-    x_k: ArrayLike,
-    step: ArrayLike,
-    previous: ArrayLike,
-    eps: ArrayLike,
-    noise: ArrayLike,
-    clip: ArrayLike | None,
-) -> Array:
+    x_k: Float[ArrayLike, "*x"],
+    step: Int[ArrayLike, "*lead"],
+    previous: Int[ArrayLike, "*lead"],
+    eps: Float[ArrayLike, "*x"],
+    noise: Float[ArrayLike, "*x"],
+    clip: Float[ArrayLike, ""] | None,
+) -> Float[Array, "*x"]:
     """One ancestral step x_k -> x_previous from predicted `eps` (Ho et al. 2020, algorithm 2).
 
     `noise` is standard normal, shaped like x_k, unused when previous = -1. `clip`: |x_0| is limited to it.
@@ -226,12 +253,16 @@ class DDIMCoefficients:
 
 
 def ddim_coefficients(
-    schedule: Schedule, step: ArrayLike, previous: ArrayLike, x: ArrayLike, eta: float = 0.0
+    schedule: Schedule,
+    step: Int[ArrayLike, "*lead"],
+    previous: Int[ArrayLike, "*lead"],
+    x: Float[ArrayLike, "*x"],
+    eta: float = 0.0,
 ) -> DDIMCoefficients:
-    """Of `q_sample` as it stands: 1 x_k = sqrt(a) x_0 + sqrt(1 - a) eps, computed in x's precision.
+    """Coefficients of `q_sample` as it stands: 1 x_k = sqrt(a) x_0 + sqrt(1 - a) eps.
 
-    Steps may be traced and have any leading shape of x. sigma is eta times the DDPM's (Song et al. 2021,
-    eq. 16): eta = 0 is deterministic, eta = 1 injects the DDPM's variance.
+    Computed in x's precision. Steps may be traced and have any leading shape of x. sigma is eta times the
+    DDPM's (Song et al. 2021, eq. 16): eta = 0 is deterministic, eta = 1 injects the DDPM's variance.
     """
     a, a_prev = alpha_bar_at(schedule, step, x), alpha_bar_at(schedule, previous, x)
     sigma = eta * jnp.sqrt(posterior_variance(schedule, step, previous, x))
@@ -241,7 +272,7 @@ def ddim_coefficients(
     return DDIMCoefficients(row, jnp.sqrt(a), sigma)
 
 
-def ddim_table(schedule: Schedule, visited: np.ndarray) -> np.ndarray:
+def ddim_table(schedule: Schedule, visited: Int[np.ndarray, " count"]) -> Float32[np.ndarray, "count 4"]:
     """(len(visited), 4) float32: `DDIMCoefficients.row` of each visited step, eta = 0.
 
     Of `q_sample` solved for x_0, 1/sqrt(a) x_k = x_0 + sqrt(1 - a)/sqrt(a) eps, so that an exported graph
@@ -255,13 +286,13 @@ def ddim_table(schedule: Schedule, visited: np.ndarray) -> np.ndarray:
 
 def ddim_step(
     c: DDIMCoefficients,
-    x_k: ArrayLike,
-    eps: ArrayLike,
-    clip: ArrayLike | None,
+    x_k: Float[ArrayLike, "*x"],
+    eps: Float[ArrayLike, "*x"],
+    clip: Float[ArrayLike, ""] | None,
     *,
-    noise: ArrayLike = 0.0,
+    noise: Float[ArrayLike, "*#x"] = 0.0,
     after_clip: str = PREDICTED,
-) -> Array:
+) -> Float[Array, "*x"]:
     """One DDIM step x_k -> x_k' from predicted `eps` (Song et al. 2021, eq. 12).
 
     Args:
@@ -282,11 +313,11 @@ def ddim_step(
 
 def ddim_sample(
     predict: Callable[[Array, Array], Array],
-    noise: Array,
+    noise: Float[Array, "*x"],
     schedule: Schedule,
     count: int,
     clip: float = 1.0,
-) -> Array:
+) -> Float[Array, "*x"]:
     """Deterministic DDIM from noise (B, ...) to samples within `clip`; `predict(x, k (B,)) -> eps`.
 
     `count` trailing steps, eps consistent with the clipped x_0: an exported graph unrolls the same.
@@ -302,7 +333,9 @@ def ddim_sample(
     return jax.lax.scan(body, noise, steps)[0]
 
 
-def log_snr_half(schedule: Schedule, step: ArrayLike, x: ArrayLike) -> Array:
+def log_snr_half(
+    schedule: Schedule, step: Int[ArrayLike, "*lead"], x: Float[ArrayLike, "*x"]
+) -> Float[Array, "..."]:
     """lambda = log(sqrt(alpha_bar) / sqrt(1 - alpha_bar)) at `step`, broadcast against x; inf at -1."""
     a = alpha_bar_at(schedule, step, x)
     return 0.5 * (jnp.log(a) - jnp.log1p(-a))
@@ -310,13 +343,13 @@ def log_snr_half(schedule: Schedule, step: ArrayLike, x: ArrayLike) -> Array:
 
 def dpm_solver_step(
     schedule: Schedule,
-    x_k: ArrayLike,
-    step: ArrayLike,
-    previous: ArrayLike,
-    x_0: ArrayLike,
-    before: ArrayLike,
-    x_0_before: ArrayLike,
-) -> Array:
+    x_k: Float[ArrayLike, "*x"],
+    step: Int[ArrayLike, "*lead"],
+    previous: Int[ArrayLike, "*lead"],
+    x_0: Float[ArrayLike, "*x"],
+    before: Int[ArrayLike, "*lead"],
+    x_0_before: Float[ArrayLike, "*x"],
+) -> Float[Array, "*x"]:
     """One step of DPM-Solver++(2M), x_k -> x_previous, second order (Lu et al. 2022, algorithm 2).
 
     x_0 is the prediction at `step`, x_0_before the one at `before`, the step visited before it; where

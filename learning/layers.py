@@ -5,16 +5,19 @@ Trained weights depend on every order stated here.
 
 import math
 from types import ModuleType
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import Float32, Real, Shaped
+
+from ddgrasp.arrays import AnyArray
 
 MAX_PERIOD = 10_000.0
 
 
-def time_frequencies(size: int, xp: ModuleType = np) -> Any:
+def time_frequencies(size: int, xp: ModuleType = np) -> Float32[AnyArray, " {size}//2"]:
     """(size / 2,) float32 angular frequencies MAX_PERIOD^(-2i / size) (Vaswani et al. 2017, section 3.5).
 
     Args:
@@ -26,7 +29,13 @@ def time_frequencies(size: int, xp: ModuleType = np) -> Any:
     return xp.exp(-math.log(MAX_PERIOD) * xp.arange(half) / half).astype(xp.float32)
 
 
-def sinusoids(position: Any, frequencies: Any, *, cosine_first: bool, xp: ModuleType = jnp) -> Any:
+def sinusoids(
+    position: Real[ArrayLike, "*batch"],
+    frequencies: Float32[AnyArray, " n"],
+    *,
+    cosine_first: bool,
+    xp: ModuleType = jnp,
+) -> Float32[AnyArray, "*batch 2*n"]:
     """(...,) positions and (n,) frequencies to (..., 2n): all sines then all cosines, or the other way round.
 
     Args:
@@ -37,7 +46,9 @@ def sinusoids(position: Any, frequencies: Any, *, cosine_first: bool, xp: Module
     return xp.concatenate(pair[::-1] if cosine_first else pair, axis=-1)
 
 
-def space_to_depth(x: Array, factor: int) -> Array:
+def space_to_depth(
+    x: Shaped[Array, "B H W C"], factor: int
+) -> Shaped[Array, "B H//{factor} W//{factor} C*{factor}**2"]:
     """(B, H, W, C) -> (B, H/f, W/f, f*f*C); H and W divisible by `factor`.
 
     Within a patch pixels go row by row, and a pixel's channels stay together: channel (i f + j) C + c is
@@ -48,7 +59,9 @@ def space_to_depth(x: Array, factor: int) -> Array:
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, h // factor, w // factor, factor * factor * c)
 
 
-def depth_to_space(x: Array, factor: int) -> Array:
+def depth_to_space(
+    x: Shaped[Array, "B H W C"], factor: int
+) -> Shaped[Array, "B H*{factor} W*{factor} C//{factor}**2"]:
     """(B, H, W, f*f*C) -> (B, H*f, W*f, C): inverse of `space_to_depth`."""
     b, h, w, c = x.shape
     x = x.reshape(b, h, w, factor, factor, c // factor**2)

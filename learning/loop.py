@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jax import Array
+from jaxtyping import Float
 
 from ddgrasp.progress import Progress, Task
 from learning.checkpoints import Checkpoints, intact
@@ -13,7 +14,7 @@ from learning.train_state import TrainState
 LOG_EVERY = 10
 SAVE_EVERY = 200
 
-Metrics = dict[str, Array]
+Metrics = dict[str, Float[Array, ""]]
 StepFunction = Callable[[TrainState, int], tuple[TrainState, Metrics]]
 """(state, step number) -> (next state, scalars for the curves)."""
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jaxtyping import Int, Key, UInt32
 
 from learning.params import Params
 
@@ -23,7 +24,9 @@ class TrainState:
     """Raw key data (uint32); a step's randomness comes from `step_key`."""
 
 
-def first_state(params: Params, optimizer: optax.GradientTransformation, key: Array) -> TrainState:
+def first_state(
+    params: Params, optimizer: optax.GradientTransformation, key: UInt32[Array, " words"]
+) -> TrainState:
     """State before the first step. `key` is raw key data."""
     # Copies: a donated state must not take the caller's parameters and key, or its own average, with it.
     own, average = (jax.tree.map(jnp.array, params) for _ in range(2))
@@ -40,13 +43,13 @@ def updated(
     return TrainState(state.step + 1, params, ema, opt_state, state.key)
 
 
-def averaged(ema: Params, params: Params, step: Array, decay: float) -> Params:
+def averaged(ema: Params, params: Params, step: Int[Array, ""], decay: float) -> Params:
     """EMA update; the decay starts small so that the first, random weights are forgotten."""
     now = jnp.minimum(decay, (1 + step) / (10 + step))
     return jax.tree.map(lambda old, new: now * old + (1 - now) * new, ema, params)
 
 
-def step_key(state: TrainState, ahead: int = 0) -> Array:
+def step_key(state: TrainState, ahead: int = 0) -> Key[Array, ""]:
     """Key of the step that `state` takes next: fold_in(key, step + ahead).
 
     `ahead` is 1 where fold_in(key, 0) made the parameters.

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float, UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
@@ -14,11 +16,11 @@ from student_jax.data import stack_steps
 from student_jax.depth_source import DepthSource
 from student_jax.policy import sample_actions
 
-Corrupt = Callable[[Scene], np.ndarray]
-"""The scene of B environments -> depth as the student sees it, (B, H, W) uint16."""
+Corrupt = Callable[[Scene], UInt16[np.ndarray, "B H W"]]
+"""The scene of B environments -> depth as the student sees it."""
 
 
-def keep_clean(scene: Scene) -> np.ndarray:
+def keep_clean(scene: Scene) -> UInt16[np.ndarray, "B H W"]:
     """Ideal camera."""
     return scene.depth_mm
 
@@ -29,7 +31,7 @@ class SourceCamera:
     def __init__(self, source: DepthSource, first: int = 0):
         self._source, self._first = source, first
 
-    def __call__(self, scene: Scene) -> np.ndarray:
+    def __call__(self, scene: Scene) -> UInt16[np.ndarray, "B H W"]:
         """(B, H, W) uint16 with artefacts."""
         count = len(scene.depth_mm)
         episode, frame = self._first + np.arange(count), np.full(count, scene.step)
@@ -40,13 +42,14 @@ class StudentActor:
     """Acts in `demos.rollout.Roller` and keeps what the student saw.
 
     Args:
+      params: the policy's, a tree of arrays.
       noise: start of the reverse diffusion, as in `DeployConfig.noise`: zero or normal.
       teacher_share: probability that an action is the teacher's instead.
     """
 
     def __init__(
         self,
-        params,
+        params: Any,
         config: StudentConfig,
         profile: contract.CameraProfile,
         corrupt: Corrupt,
@@ -60,7 +63,7 @@ class StudentActor:
         self._chunk = np.zeros(0)
         self.seen_mm: list[np.ndarray] = []
 
-    def __call__(self, scene: Scene) -> np.ndarray:
+    def __call__(self, scene: Scene) -> Float[np.ndarray, "B 8"]:
         """(B, 8) actions for the scene."""
         self.seen_mm.append(self._corrupt(scene))
         position = scene.step % self._config.head.execute_steps

@@ -6,6 +6,7 @@ of what it had lifted, and on ideal depth never. So training ripples them.
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Key
 
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
@@ -19,8 +20,11 @@ _MIN_DISPARITY_PX = 0.5
 
 
 def disparity_noise(
-    key: jax.Array, depth_m: jax.Array, profile: CameraProfile, config: StudentConfig
-) -> jax.Array:
+    key: Key[jax.Array, ""],
+    depth_m: Float[jax.Array, "B F H W"],
+    profile: CameraProfile,
+    config: StudentConfig,
+) -> Float[jax.Array, "B F H W"]:
     """Depth with correlated disparity noise and a few wrong matches on its valid pixels.
 
     disparity = f b / depth, so that depth errors grow with the square of depth (Nguyen et al. 2012). Each

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt16
 
 from ddgrasp import contract
 from ddgrasp.layout import ACTION, OBSERVATION, closes
@@ -17,26 +18,25 @@ YAW_MULTIPLE = 2
 class Frames:
     """N control steps of many episodes, one after another."""
 
-    depth_mm: list[np.ndarray]
-    """Per episode (T, H, W) uint16 as the student sees it, holes 0."""
-    state: np.ndarray
-    """(N, 8)."""
-    action: np.ndarray
-    """(N, 8) the teacher's labels."""
-    observation: np.ndarray
-    """(N, 40) the teacher's."""
-    held: np.ndarray
-    """(N,) float, object in the hand."""
-    episode: np.ndarray
-    """(N,) index into `depth_mm`."""
-    step: np.ndarray
-    """(N,) index within the episode."""
+    depth_mm: list[UInt16[np.ndarray, "T H W"]]
+    """Per episode, as the student sees it, holes 0."""
+    state: Float32[np.ndarray, "N 8"]
+    action: Float32[np.ndarray, "N 8"]
+    """The teacher's labels."""
+    observation: Float32[np.ndarray, "N 40"]
+    """The teacher's."""
+    held: Float32[np.ndarray, " N"]
+    """1 where the object is in the hand."""
+    episode: Int[np.ndarray, " N"]
+    """Index into `depth_mm`."""
+    step: Int[np.ndarray, " N"]
+    """Index within the episode."""
     _cumulative: tuple[float, np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.state)
 
-    def draw(self, rng: np.random.Generator, count: int, held_weight: float) -> np.ndarray:
+    def draw(self, rng: np.random.Generator, count: int, held_weight: float) -> Int[np.ndarray, " {count}"]:
         """(count,) indices at random; a step with the object in the hand counts `held_weight`.
 
         Most of an episode holds the lifted object, and there is little to learn from that.
@@ -46,7 +46,7 @@ class Frames:
         total = self._cumulative[1]
         return np.searchsorted(total, rng.random(count) * total[-1], side="right")
 
-    def depth_stack(self, index: np.ndarray) -> np.ndarray:
+    def depth_stack(self, index: Int[np.ndarray, " B"]) -> UInt16[np.ndarray, "B 3 H W"]:
         """(B, 3, H, W) uint16: the last three frames at each index, the first repeated at the start."""
         return np.stack([self._stack_one(int(self.episode[i]), int(self.step[i])) for i in index])
 
@@ -54,7 +54,7 @@ class Frames:
         frames = self.depth_mm[episode]
         return np.stack([frames[t] for t in stack_steps(step)])
 
-    def action_chunks(self, index: np.ndarray, chunk: int) -> np.ndarray:
+    def action_chunks(self, index: Int[np.ndarray, " B"], chunk: int) -> Float32[np.ndarray, "B {chunk} 8"]:
         """(B, chunk, 8) labels from each index on, the episode's last one repeated at its end."""
         ahead = index[:, None] + np.arange(chunk)[None]
         ahead = np.minimum(ahead, len(self) - 1)
@@ -68,7 +68,9 @@ def stack_steps(step: int) -> list[int]:
     return [max(0, step - k) for k in reversed(range(contract.DEPTH_FRAMES))]
 
 
-def aux_targets(observation: np.ndarray, held: np.ndarray) -> Aux:
+def aux_targets(
+    observation: Float[np.ndarray, "N 40"], held: Float[np.ndarray, " N"] | Bool[np.ndarray, " N"]
+) -> Aux:
     """What perception is to report of the teacher's observations (N, 40); `held_logit` is 0 or 1."""
     quat = observation[:, OBSERVATION.grasp_quat]
     yaw = 2.0 * np.arctan2(quat[:, 2], quat[:, 1]) * YAW_MULTIPLE
@@ -81,11 +83,11 @@ def aux_targets(observation: np.ndarray, held: np.ndarray) -> Aux:
 
 
 def make_frames(
-    depth_mm: Sequence[np.ndarray],
-    states: Sequence[np.ndarray],
-    actions: Sequence[np.ndarray],
-    observations: Sequence[np.ndarray],
-    held: Sequence[np.ndarray],
+    depth_mm: Sequence[UInt16[np.ndarray, "_ H W"]],
+    states: Sequence[Float[np.ndarray, "_ 8"]],
+    actions: Sequence[Float[np.ndarray, "_ 8"]],
+    observations: Sequence[Float[np.ndarray, "_ 40"]],
+    held: Sequence[Float[np.ndarray, " _"] | Bool[np.ndarray, " _"]],
 ) -> Frames:
     """Frames of whole episodes; each argument has one array (T, ...) per episode.
 
@@ -103,7 +105,7 @@ def make_frames(
     )
 
 
-def sharpen_gripper(action: np.ndarray) -> np.ndarray:
+def sharpen_gripper(action: Float[np.ndarray, "*b 8"]) -> Float[np.ndarray, "*b 8"]:
     """Labels with the gripper command at -1 or 1: the robot only looks at its sign."""
     sharp = np.array(action)
     sharp[..., ACTION.gripper] = np.where(closes(sharp), 1.0, -1.0)[..., None]
@@ -112,7 +114,7 @@ def sharpen_gripper(action: np.ndarray) -> np.ndarray:
 
 def random_crops(
     rng: np.random.Generator, count: int, profile: contract.CameraProfile, shift_px: int
-) -> np.ndarray:
+) -> Int32[np.ndarray, "{count} 2"]:
     """(count, 2) int32 crop origins, the centred one shifted by up to `shift_px` pixels each way."""
     shift = rng.integers(-shift_px, shift_px + 1, (count, 2))
     return (np.array(profile.crop_origin_px) + shift).astype(np.int32)

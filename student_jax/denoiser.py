@@ -1,14 +1,15 @@
 """Joint-state stream and the network that predicts the noise in an action chunk (Ho et al., 2020, eq. 14)."""
 
 from types import ModuleType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
+from jaxtyping import Float, Float32, Int, Real
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
 from learning.layers import sinusoids, time_frequencies
 
@@ -17,23 +18,26 @@ STATE_LOWER = np.array([*contract.JOINT_LOWER_RAD, 0.0], np.float32)
 STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M], np.float32)
 
 
-def normalise_state(state: jax.Array) -> jax.Array:
+def normalise_state(state: Float[AnyArray, "B 8"]) -> Float[jax.Array, "B 8"]:
     """(B, 8) seven joints (rad) and gripper width (m) to [-1, 1] between their limits."""
     return 2.0 * (state - STATE_LOWER) / (STATE_UPPER - STATE_LOWER) - 1.0
 
 
-def embed_time(k: Any, features: int, xp: ModuleType = jnp) -> Any:
+def embed_time(
+    k: Real[AnyArray, " B"], features: int, xp: ModuleType = jnp
+) -> Float32[AnyArray, "B {features}"]:
     """(B,) diffusion steps to (B, features): sines, then cosines. `xp`: numpy for the exported graph."""
     return sinusoids(k, time_frequencies(features), cosine_first=False, xp=xp)
 
 
 class StateStream(nn.Module):
-    """(B, 8) joint state to (B, state_features)."""
+    """Joint state to features: two dense layers."""
 
     config: StudentConfig
 
     @nn.compact
-    def __call__(self, state: jax.Array) -> jax.Array:
+    def __call__(self, state: Float[AnyArray, "B 8"]) -> Float[jax.Array, "B D"]:
+        """(B, 8) -> (B, state_features)."""
         x = nn.relu(nn.Dense(self.config.head.state_features, name="first")(normalise_state(state)))
         return nn.relu(nn.Dense(self.config.head.state_features, name="second")(x))
 
@@ -45,7 +49,10 @@ class DenoiserBlock(nn.Module):
     film: bool
 
     @nn.compact
-    def __call__(self, x: jax.Array, condition: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[AnyArray, "B D"], condition: Float[AnyArray, "B C"]
+    ) -> Float[jax.Array, "B D"]:
+        """(B, width), what it is told (B, C) -> (B, width)."""
         y = nn.Dense(self.width, name="first")(nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="norm")(x))
         if self.film:
             scale, shift = jnp.split(nn.Dense(2 * self.width, name="film")(condition), 2, axis=-1)
@@ -59,7 +66,12 @@ class Denoiser(nn.Module):
     config: StudentConfig
 
     @nn.compact
-    def __call__(self, noisy_action: jax.Array, k: jax.Array, cond: jax.Array) -> jax.Array:
+    def __call__(
+        self,
+        noisy_action: Float[AnyArray, "B chunk 8"],
+        k: Int[AnyArray, " B"],
+        cond: Float[AnyArray, "B D"],
+    ) -> Float[jax.Array, "B chunk 8"]:
         """(B, chunk, 8), (B,) int, (B, D) -> (B, chunk, 8)."""
         config = self.config
         film = config.head.conditioning == "film"

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int, Key, UInt8, UInt16
 
 from ddg_jax.generate import Clip, noisy_episodes
 from ddg_jax.prior import Prior
@@ -28,6 +29,7 @@ _BATCH = 16
 """Frames that a camera model gets at once: one size, compiled once."""
 
 
+@runtime_checkable
 class DepthSource(Protocol):
     """Gives clean depth a camera's artefacts.
 
@@ -41,7 +43,7 @@ class DepthSource(Protocol):
 
     def episodes(
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
-    ) -> Iterator[np.ndarray]:
+    ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
         """(T, H, W) uint16 millimetres of episodes `first`, `first` + 1, ... in order.
 
         Args:
@@ -51,8 +53,12 @@ class DepthSource(Protocol):
         ...
 
     def frames(
-        self, depth_mm: np.ndarray, rgb: np.ndarray | None, episode: np.ndarray, frame: np.ndarray
-    ) -> np.ndarray:
+        self,
+        depth_mm: UInt16[np.ndarray, "B H W"],
+        rgb: UInt8[np.ndarray, "B H W 3"] | None,
+        episode: Int[np.ndarray, " B"],
+        frame: Int[np.ndarray, " B"],
+    ) -> UInt16[np.ndarray, "B H W"]:
         """(B, H, W) uint16 millimetres of B frames that have nothing to do with each other.
 
         Args:
@@ -68,7 +74,7 @@ class GeneratorSource:
     """A fitted generator; frames of one episode share noise over time."""
 
     generator: Generator
-    key: jax.Array
+    key: Key[jax.Array, ""]
 
     @property
     def needs_rgb(self) -> bool:
@@ -77,13 +83,17 @@ class GeneratorSource:
 
     def episodes(
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
-    ) -> Iterator[np.ndarray]:
+    ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
         """See `DepthSource`."""
         return noisy_episodes(self.key, self.generator, lengths, read, first)
 
     def frames(
-        self, depth_mm: np.ndarray, rgb: np.ndarray | None, episode: np.ndarray, frame: np.ndarray
-    ) -> np.ndarray:
+        self,
+        depth_mm: UInt16[np.ndarray, "B H W"],
+        rgb: UInt8[np.ndarray, "B H W 3"] | None,
+        episode: Int[np.ndarray, " B"],
+        frame: Int[np.ndarray, " B"],
+    ) -> UInt16[np.ndarray, "B H W"]:
         """See `DepthSource`."""
         rgb = rgb if self.needs_rgb else None
         noisy = generate(self.key, self.generator, _metres(depth_mm), rgb, episode=episode, frame=frame)
@@ -95,12 +105,12 @@ class SenseSource:
     """A camera model; every frame has noise of its own."""
 
     sense: Sense
-    key: jax.Array
+    key: Key[jax.Array, ""]
     needs_rgb: bool = False
 
     def episodes(
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
-    ) -> Iterator[np.ndarray]:
+    ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
         """See `DepthSource`."""
         for i in range(first, len(lengths)):
             clip = read(i)
@@ -108,8 +118,12 @@ class SenseSource:
             yield self.frames(clip.depth_mm, clip.rgb, number, np.arange(len(number)))
 
     def frames(
-        self, depth_mm: np.ndarray, rgb: np.ndarray | None, episode: np.ndarray, frame: np.ndarray
-    ) -> np.ndarray:
+        self,
+        depth_mm: UInt16[np.ndarray, "B H W"],
+        rgb: UInt8[np.ndarray, "B H W 3"] | None,
+        episode: Int[np.ndarray, " B"],
+        frame: Int[np.ndarray, " B"],
+    ) -> UInt16[np.ndarray, "B H W"]:
         """See `DepthSource`."""
         colour = rgb if self.needs_rgb else None
         parts = []

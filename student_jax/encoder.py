@@ -10,8 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
+from jaxtyping import Float, Float32, Int
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import GROUP_CHANNELS, STEM_STRIDE, StudentConfig
 from ddgrasp.contract import CameraProfile
 from learning.layers import space_to_depth
@@ -43,7 +45,8 @@ class GroupNorm(nn.Module):
     """GroupNorm over (h, w, GROUP_CHANNELS channels): two reductions, five times flax's speed on CPU."""
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[AnyArray, "B h w C"]) -> Float[jax.Array, "B h w C"]:
+        """(B, h, w, C) -> same."""
         batch, _, _, channels = x.shape
         groups = channels // GROUP_CHANNELS
         mean = x.mean((1, 2)).reshape(batch, groups, -1).mean(-1)
@@ -65,7 +68,8 @@ class ConvNorm(nn.Module):
     norm: str
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[AnyArray, "B h w C"]) -> Float[jax.Array, "B h2 w2 {self.channels}"]:
+        """(B, h, w, C) -> (B, h / stride, w / stride, channels), rounded up."""
         pad = self.kernel // 2
         x = nn.Conv(
             self.channels,
@@ -87,7 +91,8 @@ class BasicBlock(nn.Module):
     norm: str
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[AnyArray, "B h w C"]) -> Float[jax.Array, "B h2 w2 {self.channels}"]:
+        """(B, h, w, C) -> (B, h / stride, w / stride, channels), rounded up."""
         y = nn.relu(ConvNorm(self.channels, 3, self.stride, self.norm, name="first")(x))
         y = ConvNorm(self.channels, 3, 1, self.norm, name="second")(y)
         if x.shape[-1] != self.channels or self.stride != 1:
@@ -103,7 +108,8 @@ class Stem(nn.Module):
     norm: str
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[AnyArray, "B h w C"]) -> Float[jax.Array, "B h4 w4 {self.width}"]:
+        """(B, h, w, C) -> (B, h / 4, w / 4, width)."""
         if self.kind == "conv7":
             x = nn.relu(ConvNorm(self.width, 7, 2, self.norm, name="conv7")(x))
             x = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))  # after relu zeros pad as well as -inf
@@ -116,10 +122,10 @@ class Stem(nn.Module):
 class CellGeometry(NamedTuple):
     """Affine and projective constants that turn a cell of the feature map into a place in the world."""
 
-    rows_px: np.ndarray
-    """(h,) centre of each cell row, in pixels of the crop window."""
-    columns_px: np.ndarray
-    """(w,) centre of each cell column, in pixels of the crop window."""
+    rows_px: Float32[np.ndarray, " h"]
+    """Centre of each cell row, in pixels of the crop window."""
+    columns_px: Float32[np.ndarray, " w"]
+    """Centre of each cell column, in pixels of the crop window."""
 
 
 def cell_geometry(profile: CameraProfile, config: StudentConfig) -> CellGeometry:
@@ -128,7 +134,9 @@ def cell_geometry(profile: CameraProfile, config: StudentConfig) -> CellGeometry
     return CellGeometry(*preprocess.pixel_coordinates(window, map_stride(config)))
 
 
-def cell_maps(origin_rc: jax.Array, profile: CameraProfile, config: StudentConfig) -> jax.Array:
+def cell_maps(
+    origin_rc: Int[AnyArray, "B 2"], profile: CameraProfile, config: StudentConfig
+) -> Float32[jax.Array, "B cells 8"]:
     """What each cell of the feature map means in the robot's frame, per crop window.
 
     Args:
@@ -142,7 +150,7 @@ def cell_maps(origin_rc: jax.Array, profile: CameraProfile, config: StudentConfi
     return _maps_from_origin(jnp, origin_rc.astype(jnp.float32), profile, config)
 
 
-def static_cell_maps(profile: CameraProfile, config: StudentConfig) -> np.ndarray:
+def static_cell_maps(profile: CameraProfile, config: StudentConfig) -> Float32[np.ndarray, "cells 8"]:
     """`cell_maps` of the centred window as a (h*w, 8) NumPy constant, for the exported graph."""
     origin = np.asarray([profile.crop_origin_px], np.float32)
     return np.asarray(_maps_from_origin(np, origin, profile, config), np.float32)[0]
@@ -169,12 +177,12 @@ def _maps_from_origin(xp, origin, profile: CameraProfile, config: StudentConfig)
     return maps.reshape(shape[0], shape[1] * shape[2], 8)
 
 
-def cell_relief(picture: jax.Array, config: StudentConfig) -> jax.Array:
+def cell_relief(picture: Float[AnyArray, "B h w C"], config: StudentConfig) -> Float[jax.Array, "B cells"]:
     """(B, h*w) mean relief of the newest frame's valid pixels in each cell; 0 where a cell has none."""
     relief, valid = (newest_channel(picture, config, name) for name in ("relief", "valid"))
     stride = map_stride(config)
 
-    def cells(image: jax.Array) -> jax.Array:
+    def cells(image: AnyArray) -> jax.Array:
         batch, height, width = image.shape
         pad = ((0, 0), (0, -height % stride), (0, -width % stride))
         image = jnp.pad(image, pad)
@@ -184,7 +192,9 @@ def cell_relief(picture: jax.Array, config: StudentConfig) -> jax.Array:
     return cells(relief * valid) / jnp.maximum(cells(valid), 1.0)
 
 
-def newest_channel(picture: jax.Array, config: StudentConfig, name: str) -> jax.Array:
+def newest_channel(
+    picture: Float[AnyArray, "B h w C"], config: StudentConfig, name: str
+) -> Float[jax.Array, "B h w"]:
     """(B, h, w): one channel of the newest frame in a picture made by `prepare_depth`."""
     return picture[..., newest_channel_index(config, name)]
 
@@ -194,7 +204,11 @@ def newest_channel_index(config: StudentConfig, name: str) -> int:
     return (contract.DEPTH_FRAMES - 1) * len(config.picture.channels) + config.picture.channels.index(name)
 
 
-def spatial_softmax(logits: jax.Array, relief: jax.Array, maps: jax.Array) -> jax.Array:
+def spatial_softmax(
+    logits: Float[AnyArray, "B cells K"],
+    relief: Float[AnyArray, "B cells"],
+    maps: Float[AnyArray, "B cells 8"],
+) -> Float[jax.Array, "B K 6"]:
     """Expected place of each keypoint.
 
     Args:
@@ -213,13 +227,16 @@ def spatial_softmax(logits: jax.Array, relief: jax.Array, maps: jax.Array) -> ja
 
 
 class DepthEncoder(nn.Module):
-    """(B, h, w, C) picture and (B, 2) crop origins to (B, feature_size) features."""
+    """ResNet over the picture, pooled to a vector of features."""
 
     config: StudentConfig
     profile: CameraProfile
 
     @nn.compact
-    def __call__(self, picture: jax.Array, origin_rc: jax.Array) -> jax.Array:
+    def __call__(
+        self, picture: Float[AnyArray, "B h w C"], origin_rc: Int[AnyArray, "B 2"]
+    ) -> Float[jax.Array, "B {self.config.encoder.features}"]:
+        """(B, h, w, C) picture and (B, 2) crop origins -> (B, features)."""
         config = self.config
         x = Stem(config.encoder.stem, config.encoder.width, config.encoder.norm, name="stem")(picture)
         for index, (channels, stride) in enumerate(stage_plan(config)):
@@ -230,7 +247,7 @@ class DepthEncoder(nn.Module):
                 )
         return self._pool(x, picture, origin_rc)
 
-    def _pool(self, x: jax.Array, picture: jax.Array, origin_rc: jax.Array) -> jax.Array:
+    def _pool(self, x: AnyArray, picture: AnyArray, origin_rc: AnyArray) -> jax.Array:
         config = self.config
         cells = x.reshape(x.shape[0], -1, x.shape[-1])
         if config.encoder.pooling == "mean":
@@ -248,14 +265,14 @@ class DepthEncoder(nn.Module):
         return nn.relu(nn.Dense(config.encoder.features, name="features")(pooled))
 
 
-def crop_centre(origin_rc: jax.Array, profile: CameraProfile) -> jax.Array:
+def crop_centre(origin_rc: Int[AnyArray, "B 2"], profile: CameraProfile) -> Float[jax.Array, "B 2"]:
     """(B, 2) centre of each crop window in full-frame coordinates [-1, 1] (v, u); 0 when centred."""
     half = jnp.array([profile.crop_height_px, profile.crop_width_px], jnp.float32) / 2
     size = jnp.array([profile.height_px, profile.width_px], jnp.float32)
     return 2 * (origin_rc + half) / size - 1
 
 
-def static_crop_centre(profile: CameraProfile) -> np.ndarray:
+def static_crop_centre(profile: CameraProfile) -> Float32[np.ndarray, "2"]:
     """(2,) `crop_centre` of the centred window, for the exported graph."""
     row, column = profile.crop_origin_px
     v = 2 * (row + profile.crop_height_px / 2) / profile.height_px - 1

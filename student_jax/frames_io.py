@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, UInt16
 
 from ddg_jax.generate import Clip
 from ddgrasp.config import Config
@@ -48,13 +49,15 @@ def add_noisy_demos(
             task.advance()
 
 
-def useful_steps(held: np.ndarray, held_steps: int) -> int:
-    """Number of an episode's first steps up to `held_steps` with the object in the hand; held: (T,) bool."""
+def useful_steps(held: Bool[np.ndarray, " T"], held_steps: int) -> int:
+    """Number of an episode's first steps up to `held_steps` with the object in the hand."""
     enough = np.flatnonzero(np.cumsum(held) >= held_steps)
     return int(enough[0]) + 1 if len(enough) else len(held)
 
 
-def add_rollouts(frames: EpisodeStore, episodes: Episodes, seen_mm: list[np.ndarray]) -> None:
+def add_rollouts(
+    frames: EpisodeStore, episodes: Episodes, seen_mm: list[UInt16[np.ndarray, "B H W"]]
+) -> None:
     """Adds DAgger episodes with the depth that the student saw."""
     seen = np.stack(seen_mm, axis=1)
     for i, length in enumerate(episodes.length):

@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
+from jaxtyping import Float, Float32, Float64, Int
 
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from mjx_envs import kinematics, scene
@@ -31,16 +33,16 @@ MIN_COVERAGE = 0.25
 class Projection(NamedTuple):
     """Nominal camera and crop window as plain numbers: picture pixel = focal * xy / z + centre - origin."""
 
-    rotation: np.ndarray
-    """(3, 3) world to camera."""
-    offset_m: np.ndarray
-    """(3,) world to camera."""
-    focal_px: np.ndarray
-    """(2,) row, column, in pixels of the network's picture."""
-    centre_px: np.ndarray
-    """(2,) principal point in those pixels, had the crop window its origin at (0, 0)."""
-    shrink: np.ndarray
-    """(2,) picture pixels per camera pixel."""
+    rotation: Float32[np.ndarray, "3 3"]
+    """World to camera."""
+    offset_m: Float32[np.ndarray, "3"]
+    """World to camera."""
+    focal_px: Float32[np.ndarray, "2"]
+    """Row, column, in pixels of the network's picture."""
+    centre_px: Float32[np.ndarray, "2"]
+    """Principal point in those pixels, had the crop window its origin at (0, 0)."""
+    shrink: Float32[np.ndarray, "2"]
+    """Picture pixels per camera pixel."""
 
 
 def projection(profile: CameraProfile, config: StudentConfig) -> Projection:
@@ -56,7 +58,7 @@ def projection(profile: CameraProfile, config: StudentConfig) -> Projection:
     return Projection(*(np.asarray(x, np.float32) for x in numbers))
 
 
-def grip_chain() -> list[tuple[np.ndarray, np.ndarray]]:
+def grip_chain() -> list[tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]]:
     """[(R (3, 3), t (3,)), ...] of base to tip: point = R_1 Rz(q_1) (R_2 Rz(q_2) (... p) + t_2) + t_1.
 
     One entry for each arm joint; `grip_tip` is p.
@@ -66,7 +68,7 @@ def grip_chain() -> list[tuple[np.ndarray, np.ndarray]]:
     ]
 
 
-def grip_tip() -> np.ndarray:
+def grip_tip() -> Float64[np.ndarray, "3"]:
     """(3,) the point between the finger pads in the last link's frame, metres."""
     return np.array(scene.HAND_POS_M) + kinematics.rotate(
         np.array(scene.HAND_QUAT), np.array(scene.GRIP_POS_M)
@@ -74,8 +76,11 @@ def grip_tip() -> np.ndarray:
 
 
 def place(
-    grip_m: jax.Array, origin_rc: jax.Array, profile: CameraProfile, config: StudentConfig
-) -> tuple[jax.Array, jax.Array]:
+    grip_m: Float[AnyArray, "B 3"],
+    origin_rc: Int[AnyArray, "B 2"],
+    profile: CameraProfile,
+    config: StudentConfig,
+) -> tuple[Float[jax.Array, "B 2"], Float[jax.Array, "B 2"]]:
     """Where the nominal camera draws the hand.
 
     Args:
@@ -93,7 +98,9 @@ def place(
     return centre, per_metre
 
 
-def sampling_matrix(centre: jax.Array, step: jax.Array, count: int, length: int) -> jax.Array:
+def sampling_matrix(
+    centre: Float[AnyArray, " B"], step: Float[AnyArray, " B"], count: int, length: int
+) -> Float[jax.Array, "B {count} {length}"]:
     """(B, count, length) weights of `count` samples, `step` pixels apart around `centre`, both (B,).
 
     Linear interpolation, widened to the step where that is more than a pixel; nothing beyond the edge.
@@ -105,7 +112,12 @@ def sampling_matrix(centre: jax.Array, step: jax.Array, count: int, length: int)
     return jnp.maximum(0.0, 1.0 - jnp.abs(place_px[:, :, None] - pixels) / support) / support
 
 
-def cut(picture: jax.Array, centre: jax.Array, per_metre: jax.Array, config: StudentConfig) -> jax.Array:
+def cut(
+    picture: Float[AnyArray, "B h w C"],
+    centre: Float[AnyArray, "B 2"],
+    per_metre: Float[AnyArray, "B 2"],
+    config: StudentConfig,
+) -> Float[jax.Array, "B n n C"]:
     """(B, n, n, C) part of the picture (B, h, w, C) around `centre`, samples hand_view_pitch_m apart.
 
     Measures are averaged over valid pixels alone; the valid channel becomes the share of them.
@@ -124,13 +136,19 @@ def cut(picture: jax.Array, centre: jax.Array, per_metre: jax.Array, config: Stu
 
 
 class HandView(nn.Module):
-    """(B, h, w, C) picture, (B, 3) grip point and (B, 2) crop origins to (B, hand_view_features)."""
+    """Convolutions over the part of the picture around the hand, to a vector of features."""
 
     config: StudentConfig
     profile: CameraProfile
 
     @nn.compact
-    def __call__(self, picture: jax.Array, grip_m: jax.Array, origin_rc: jax.Array) -> jax.Array:
+    def __call__(
+        self,
+        picture: Float[AnyArray, "B h w C"],
+        grip_m: Float[AnyArray, "B 3"],
+        origin_rc: Int[AnyArray, "B 2"],
+    ) -> Float[jax.Array, "B {self.config.hand_view.features}"]:
+        """(B, h, w, C) picture, (B, 3) grip point and (B, 2) crop origins -> (B, features)."""
         config = self.config
         view = cut(picture, *place(grip_m, origin_rc, self.profile, config), config)
         x = Stem(STEM, config.hand_view.width, config.encoder.norm, name="stem")(view)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
@@ -25,8 +26,8 @@ _SEED = 45_000
 _ENCODE_BATCH = 64
 _COLUMNS = ("state", "action", "observation", "held")
 
-Samples = tuple[Seen, np.ndarray, np.ndarray]
-"""What perception reports, joint state (B, 8), action chunk (B, chunk, 8)."""
+Samples = tuple[Seen, Float[np.ndarray, "B 8"], Float[np.ndarray, "B chunk 8"]]
+"""What perception reports, joint state, action chunk."""
 
 
 def fit_on_poses(

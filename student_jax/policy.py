@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
+from jaxtyping import Float, Int, Key
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.layout import STATE, Layout
@@ -26,6 +28,7 @@ from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M, DepthEncode
 from student_jax.hand_view import HandView
 from student_jax.preprocess import crop_origin, prepare_depth
 
+Numbers = jax.Array | np.ndarray
 Positions = TypeVar("Positions", jax.Array, np.ndarray)
 
 AUX = Layout(position=3, yaw=2, held=1)
@@ -40,25 +43,24 @@ HEAD_PARAMS = ("state_stream", "denoiser")
 """The parameters that act; all others see."""
 PARAMS_FILE = "params.msgpack"
 """Name of the parameter file in the student's artifact (`learning.params`)."""
-Numbers = jax.Array | np.ndarray
 
 
 class Aux(NamedTuple):
     """Privileged predictions, supervised in simulation only."""
 
-    position: Numbers
-    """(B, 3) object position in network units; see `position_from_world` and `position_to_world`."""
-    yaw: Numbers
-    """(B, 2) cosine and sine of k times the grasp yaw, k being the object's symmetry."""
-    held_logit: Numbers
-    """(B,) logit of the object being in the hand."""
+    position: Float[Numbers, "B 3"]
+    """Object position in network units; see `position_from_world` and `position_to_world`."""
+    yaw: Float[Numbers, "B 2"]
+    """Cosine and sine of k times the grasp yaw, k being the object's symmetry."""
+    held_logit: Float[Numbers, " B"]
+    """Logit of the object being in the hand."""
 
 
 class Seen(NamedTuple):
     """What the policy makes of one observation; worth caching while only the head trains."""
 
-    features: Numbers
-    """(B, F) the encoder's vector."""
+    features: Float[Numbers, "B F"]
+    """The encoder's vector."""
     aux: Aux
 
 
@@ -67,7 +69,7 @@ def position_from_world(position_m: Positions) -> Positions:
     return (position_m - np.array(POSITION_CENTER_M, np.float32)) / POSITION_SCALE_M
 
 
-def position_to_world(position: Numbers) -> jax.Array:
+def position_to_world(position: Float[Numbers, "*b 3"]) -> Float[jax.Array, "*b 3"]:
     """(..., 3) network units to metres in the world."""
     return jnp.asarray(position) * POSITION_SCALE_M + jnp.array(POSITION_CENTER_M)
 
@@ -81,7 +83,6 @@ class StudentPolicy(nn.Module):
     def setup(self) -> None:
         """Flax: builds the parts that the configuration names."""
         self.encoder = DepthEncoder(self.config, self.profile)
-        """Flax: builds the parts that the configuration names."""
         self.aux_hidden = nn.Dense(self.config.encoder.features)
         self.aux_output = nn.Dense((AUX_BESIDE if self.config.hand_view.size_px else AUX).size)
         self.state_stream = StateStream(self.config)
@@ -89,12 +90,22 @@ class StudentPolicy(nn.Module):
         if self.config.hand_view.size_px:
             self.hand_view = HandView(self.config, self.profile)
 
-    def encode(self, depth_m: jax.Array, state: jax.Array, crop_rc: jax.Array | None = None) -> Seen:
+    def encode(
+        self,
+        depth_m: Float[AnyArray, "B 3 H W"],
+        state: Float[AnyArray, "B 8"],
+        crop_rc: Int[AnyArray, "B 2"] | None = None,
+    ) -> Seen:
         """(B, 3, H, W) metres, (B, 8), (B, 2) or None for the centred crop."""
         picture = prepare_depth(depth_m, crop_rc, self.profile, self.config)
         return self.encode_picture(picture, state, crop_rc)
 
-    def encode_picture(self, picture: jax.Array, state: jax.Array, crop_rc: jax.Array | None = None) -> Seen:
+    def encode_picture(
+        self,
+        picture: Float[AnyArray, "B h w C"],
+        state: Float[AnyArray, "B 8"],
+        crop_rc: Int[AnyArray, "B 2"] | None = None,
+    ) -> Seen:
         """As `encode`, from the output of `prepare_depth`."""
         origin = crop_origin(crop_rc, picture.shape[0], self.profile)
         features = self.encoder(picture, origin)
@@ -110,10 +121,10 @@ class StudentPolicy(nn.Module):
         position = near * beside + (1.0 - near) * raw[:, AUX.position]
         return Seen(features, Aux(position, raw[:, AUX.yaw], raw[:, AUX.held][:, 0]))
 
-    def _aux(self, *parts: jax.Array) -> jax.Array:
+    def _aux(self, *parts: AnyArray) -> jax.Array:
         return self.aux_output(nn.relu(self.aux_hidden(jnp.concatenate(parts, axis=-1))))
 
-    def condition(self, seen: Seen, state: jax.Array) -> jax.Array:
+    def condition(self, seen: Seen, state: Float[AnyArray, "B 8"]) -> Float[jax.Array, "B D"]:
         """(B, D) what the denoiser is told."""
         parts: list[Numbers] = [self.state_stream(state)]
         if self.config.head.features_to_head:
@@ -124,24 +135,29 @@ class StudentPolicy(nn.Module):
             parts += [aux.position, aux.yaw, nn.sigmoid(aux.held_logit)[:, None], beside]
         return jnp.concatenate(parts, axis=-1)
 
-    def denoise(self, noisy_action: jax.Array, k: jax.Array, cond: jax.Array) -> jax.Array:
+    def denoise(
+        self,
+        noisy_action: Float[AnyArray, "B chunk 8"],
+        k: Int[AnyArray, " B"],
+        cond: Float[AnyArray, "B D"],
+    ) -> Float[jax.Array, "B chunk 8"]:
         """(B, chunk, 8), (B,) int steps, (B, D) -> predicted noise (B, chunk, 8)."""
         return self.denoiser(noisy_action, k, cond)
 
     def __call__(
         self,
-        depth_m: jax.Array,
-        state: jax.Array,
-        noisy_action: jax.Array,
-        k: jax.Array,
-        crop_rc: jax.Array | None = None,
-    ) -> tuple[jax.Array, Aux]:
+        depth_m: Float[AnyArray, "B 3 H W"],
+        state: Float[AnyArray, "B 8"],
+        noisy_action: Float[AnyArray, "B chunk 8"],
+        k: Int[AnyArray, " B"],
+        crop_rc: Int[AnyArray, "B 2"] | None = None,
+    ) -> tuple[Float[jax.Array, "B chunk 8"], Aux]:
         """Predicted noise and auxiliary predictions: everything a training step needs."""
         seen = self.encode(depth_m, state, crop_rc)
         return self.denoise(noisy_action, k, self.condition(seen, state)), seen.aux
 
 
-def grip_position(state: jax.Array) -> jax.Array:
+def grip_position(state: Float[AnyArray, "B 8"]) -> Float[jax.Array, "B 3"]:
     """(B, 3) the point between the finger pads (m, robot base) from the joint state (B, 8)."""
     return kinematics.grip_pose(state[:, STATE.arm], jnp)[0]
 
@@ -156,7 +172,7 @@ def noise_schedule(config: StudentConfig) -> diffusion.Schedule:
     return diffusion.schedule_of(diffusion.cosine_betas(config.head.diffusion_steps, TERMINAL_TIME))
 
 
-def init_params(key: jax.Array, config: StudentConfig, profile: CameraProfile) -> dict:
+def init_params(key: Key[jax.Array, ""], config: StudentConfig, profile: CameraProfile) -> dict:
     """Fresh parameters (a dict of float32 arrays)."""
     depth = jnp.zeros((1, contract.DEPTH_FRAMES, profile.height_px, profile.width_px))
     action = jnp.zeros((1, config.head.chunk, contract.ACTION_SIZE))
@@ -178,12 +194,12 @@ def count_params(params: dict) -> int:
 def sample_from_seen(
     params: dict,
     seen: Seen,
-    state: jax.Array,
-    noise: jax.Array,
+    state: Float[AnyArray, "B 8"],
+    noise: Float[AnyArray, "B chunk 8"],
     config: StudentConfig,
     profile: CameraProfile,
     steps: int = 0,
-) -> jax.Array:
+) -> Float[jax.Array, "B chunk 8"]:
     """DDIM from (B, chunk, 8) standard normal noise to actions in [-1, 1]; steps 0 means the config's.
 
     Needs the parameters of HEAD_PARAMS alone.
@@ -191,7 +207,7 @@ def sample_from_seen(
     policy = StudentPolicy(config, profile)
     cond = cast(jax.Array, policy.apply({"params": params}, seen, state, method="condition"))
 
-    def predict(x: jax.Array, k: jax.Array) -> jax.Array:
+    def predict(x: AnyArray, k: AnyArray) -> jax.Array:
         return cast(jax.Array, policy.apply({"params": params}, x, k, cond, method="denoise"))
 
     return diffusion.ddim_sample(predict, noise, noise_schedule(config), steps or config.head.ddim_steps)
@@ -199,14 +215,14 @@ def sample_from_seen(
 
 def sample_actions(
     params: dict,
-    depth_m: jax.Array,
-    state: jax.Array,
-    noise: jax.Array,
+    depth_m: Float[AnyArray, "B 3 H W"],
+    state: Float[AnyArray, "B 8"],
+    noise: Float[AnyArray, "B chunk 8"],
     config: StudentConfig,
     profile: CameraProfile,
     steps: int = 0,
-    crop_rc: jax.Array | None = None,
-) -> jax.Array:
+    crop_rc: Int[AnyArray, "B 2"] | None = None,
+) -> Float[jax.Array, "B chunk 8"]:
     """The whole policy: (B, 3, H, W) metres, (B, 8), (B, chunk, 8) noise -> (B, chunk, 8) in [-1, 1]."""
     policy = StudentPolicy(config, profile)
     seen = policy.apply({"params": params}, depth_m, state, crop_rc, method="encode")

@@ -9,8 +9,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Float32, Int, Int32
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
@@ -32,8 +34,8 @@ class Axis(NamedTuple):
     """First crop pixel used."""
     length: int
     """Crop pixels used."""
-    matrix: np.ndarray | None
-    """(out, length) resize matrix; None if the pixels are taken as they are."""
+    matrix: Float32[np.ndarray, "out length"] | None
+    """Resize matrix; None if the pixels are taken as they are."""
 
 
 class Window(NamedTuple):
@@ -43,7 +45,7 @@ class Window(NamedTuple):
     columns: Axis
 
 
-def resize_matrix(length: int, out: int) -> np.ndarray:
+def resize_matrix(length: int, out: int) -> Float32[np.ndarray, "{out} {length}"]:
     """(out, length) float32: linear resize with a triangle filter widened when shrinking; rows sum to 1.
 
     Same numbers as `jax.image.resize(..., "linear", antialias=True)`.
@@ -71,7 +73,7 @@ def plan_window(profile: CameraProfile, config: StudentConfig) -> Window:
     )
 
 
-def table_depth(profile: CameraProfile, max_depth_m: float) -> np.ndarray:
+def table_depth(profile: CameraProfile, max_depth_m: float) -> Float32[np.ndarray, "H W"]:
     """(H, W) float32 planar depth of the empty table from the nominal camera, at most `max_depth_m`."""
     camera = nominal_camera(profile)
     rotation, height_m = camera.T_world_cam[:3, :3], camera.T_world_cam[2, 3]
@@ -82,7 +84,7 @@ def table_depth(profile: CameraProfile, max_depth_m: float) -> np.ndarray:
     return np.minimum(depth, max_depth_m).astype(np.float32)
 
 
-def clean_depth(depth_m: jax.Array, config: StudentConfig) -> jax.Array:
+def clean_depth(depth_m: Float[AnyArray, "*x"], config: StudentConfig) -> Float32[jax.Array, "*x"]:
     """Non-finite, too near and too far readings become 0 = invalid. Any shape, metres."""
     usable = (depth_m >= config.picture.min_depth_m) & (
         depth_m <= config.picture.max_depth_m
@@ -90,7 +92,7 @@ def clean_depth(depth_m: jax.Array, config: StudentConfig) -> jax.Array:
     return jnp.where(usable, depth_m, 0.0).astype(jnp.float32)
 
 
-def clip_crop(crop_rc: jax.Array, profile: CameraProfile) -> jax.Array:
+def clip_crop(crop_rc: Int[AnyArray, "B 2"], profile: CameraProfile) -> Int[jax.Array, "B 2"]:
     """(B, 2) crop origins moved to where the whole window fits into the frame."""
     highest = jnp.array(
         [profile.height_px - profile.crop_height_px, profile.width_px - profile.crop_width_px]
@@ -98,14 +100,18 @@ def clip_crop(crop_rc: jax.Array, profile: CameraProfile) -> jax.Array:
     return jnp.clip(crop_rc, 0, highest)
 
 
-def crop_origin(crop_rc: jax.Array | None, batch: int, profile: CameraProfile) -> jax.Array:
+def crop_origin(
+    crop_rc: Int[AnyArray, "B 2"] | None, batch: int, profile: CameraProfile
+) -> Int32[jax.Array, "{batch} 2"]:
     """(B, 2) int32 crop origins (row, column) in the full frame; None is the centred window."""
     if crop_rc is None:
         return jnp.broadcast_to(jnp.array(profile.crop_origin_px, jnp.int32), (batch, 2))
     return clip_crop(crop_rc, profile).astype(jnp.int32)
 
 
-def pixel_coordinates(window: Window, stride: int) -> tuple[np.ndarray, np.ndarray]:
+def pixel_coordinates(
+    window: Window, stride: int
+) -> tuple[Float32[np.ndarray, " h"], Float32[np.ndarray, " w"]]:
     """Crop pixel coordinates, rows (h,) and columns (w,), of the centres of `stride`-sized input cells."""
 
     def centres(axis: Axis) -> np.ndarray:
@@ -117,8 +123,8 @@ def pixel_coordinates(window: Window, stride: int) -> tuple[np.ndarray, np.ndarr
 
 
 def prepare_depth(
-    depth_m: jax.Array, crop_rc: jax.Array | None, profile: CameraProfile, config: StudentConfig
-) -> jax.Array:
+    depth_m: AnyArray, crop_rc: Int[AnyArray, "B 2"] | None, profile: CameraProfile, config: StudentConfig
+) -> Float32[jax.Array, "B h w C"]:
     """Depth frames as the encoder's picture.
 
     Args:
@@ -149,7 +155,7 @@ def prepare_depth(
 
 
 def _cut(
-    depth: jax.Array, table: jax.Array, crop_rc: jax.Array | None, profile: CameraProfile, window: Window
+    depth: AnyArray, table: AnyArray, crop_rc: AnyArray | None, profile: CameraProfile, window: Window
 ) -> tuple[jax.Array, jax.Array]:
     """Window of the frames (B, 3, r, c) and the same window of the table's depth (B or 1, r, c)."""
     rows, columns = window
@@ -159,7 +165,7 @@ def _cut(
         return depth[part], table[part][None]
     first = clip_crop(crop_rc, profile) + jnp.array([rows.start, columns.start])
 
-    def cut_one(frames: jax.Array, start: jax.Array) -> jax.Array:
+    def cut_one(frames: AnyArray, start: AnyArray) -> jax.Array:
         size = (frames.shape[0], rows.length, columns.length)
         return jax.lax.dynamic_slice(frames, (0, start[0], start[1]), size)
 
@@ -168,11 +174,11 @@ def _cut(
 
 
 def _resize_masked(
-    relief: jax.Array, depth: jax.Array, valid: jax.Array, window: Window, need_depth: bool
+    relief: AnyArray, depth: AnyArray, valid: AnyArray, window: Window, need_depth: bool
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """resize(x * valid) / resize(valid): what is invalid never bleeds into what is valid."""
 
-    def resize(image: jax.Array) -> jax.Array:
+    def resize(image: AnyArray) -> jax.Array:
         if window.rows.matrix is not None:
             image = jnp.einsum("or,bfrc->bfoc", window.rows.matrix, image)
         if window.columns.matrix is not None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Float32
 
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
@@ -85,7 +86,9 @@ def from_resnet18(
     return made
 
 
-def first_kernel(kernel: np.ndarray, config: StudentConfig) -> np.ndarray:
+def first_kernel(
+    kernel: Float[np.ndarray, "7 7 3 64"], config: StudentConfig
+) -> Float32[np.ndarray, "7 7 C 64"]:
     """(7, 7, 3, 64) over RGB -> (7, 7, 3 * channels, 64) over frames and, faster, their channels."""
     depth = next(name for name in DEPTH_CHANNELS if name in config.picture.channels)
     rows, columns, _, outputs = kernel.shape

@@ -5,9 +5,13 @@ act before the encoder sees anything. The error grows with the object's distance
 hand view's does, and an episode keeps its own.
 """
 
+from typing import Any
+
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ddgrasp.config import StudentConfig
+from ddgrasp.contract import CameraProfile
 from ddgrasp.layout import ACTION, OBSERVATION
 from demos.rollout import Scene
 from student_jax import train
@@ -29,9 +33,9 @@ ACTION_NOISE, NOISE_SHARE = 0.3, 0.15
 
 
 def noisy_seen(
-    observation: np.ndarray,
-    held: np.ndarray,
-    bias: np.ndarray,
+    observation: Float[np.ndarray, "B 40"],
+    held: Float[np.ndarray, " B"] | Bool[np.ndarray, " B"],
+    bias: Float[np.ndarray, "B 5"],
     rng: np.random.Generator,
     config: StudentConfig,
 ) -> Seen:
@@ -61,17 +65,24 @@ class PoseActor:
 
     Args:
       head: parameters of HEAD_PARAMS; None lets the teacher act.
+      count: environments that it acts in.
       teacher_share: probability that an action is the teacher's instead.
     """
 
     def __init__(
-        self, head, config: StudentConfig, profile, rng: np.random.Generator, count: int, teacher_share: float
+        self,
+        head: dict[str, Any] | None,
+        config: StudentConfig,
+        profile: CameraProfile,
+        rng: np.random.Generator,
+        count: int,
+        teacher_share: float,
     ):
         self._head, self._config, self._profile = head, config, profile
         self._rng, self._share = rng, 1.0 if head is None else teacher_share
         self._bias = rng.standard_normal((count, 5))
 
-    def __call__(self, scene: Scene) -> np.ndarray:
+    def __call__(self, scene: Scene) -> Float[np.ndarray, "B 8"]:
         """(B, 8) actions for the scene."""
         rng, action = self._rng, np.array(scene.expert)
         if self._head is not None:

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from jaxtyping import Float, Int, Key, UInt16
 
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.depth import to_metres
@@ -44,6 +46,7 @@ class Batch:
     crop_rc: Array
     """(B, 2) int32."""
     state: Array
+    """(B, 8) joint positions and gripper width."""
     action: Array
     """(B, chunk, 8)."""
     aux: Aux
@@ -51,7 +54,11 @@ class Batch:
 
 
 def make_batch(
-    frames: Frames, index: np.ndarray, rng: np.random.Generator, config: StudentConfig, profile: CameraProfile
+    frames: Frames,
+    index: Int[np.ndarray, " B"],
+    rng: np.random.Generator,
+    config: StudentConfig,
+    profile: CameraProfile,
 ) -> Batch:
     """The samples at `index` (B,), cropped at random."""
     return Batch(
@@ -98,10 +105,10 @@ def diffusion_loss(
     policy: StudentPolicy,
     params: dict,
     seen: Seen,
-    state: Array,
-    action: Array,
-    key: Array,
-) -> Array:
+    state: Float[Array, "B 8"],
+    action: Float[Array, "B chunk 8"],
+    key: Key[Array, ""],
+) -> Float[Array, ""]:
     """mean |eps - eps_theta(a_k, k, s)|^2 (paper Eq. 6) over `noise_draws` noises for each sample."""
     known: Any = policy.apply({"params": params}, seen, state, method="condition")
     draws = config.training.noise_draws
@@ -114,7 +121,7 @@ def diffusion_loss(
     return jnp.mean((eps - predicted) ** 2)
 
 
-def aux_losses(seen: Aux, target: Aux) -> dict[str, Array]:
+def aux_losses(seen: Aux, target: Aux) -> dict[str, Float[Array, ""]]:
     """Position (Huber, network units), yaw (squared), held (cross-entropy)."""
     return {
         "position": jnp.mean(optax.huber_loss(seen.position, target.position, delta=POSITION_DELTA))
@@ -127,7 +134,7 @@ def aux_losses(seen: Aux, target: Aux) -> dict[str, Array]:
 @partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
 def train_step(
     config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, frozen: dict, batch: Batch
-) -> tuple[TrainState, dict[str, Array]]:
+) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
     """One optimiser step on pictures. Pure: noise comes from `step_key`."""
     policy = StudentPolicy(config, profile)
     key, k_noise = jax.random.split(step_key(state))
@@ -157,11 +164,11 @@ def train_step(
 def encode(
     config: StudentConfig,
     profile: CameraProfile,
-    params,
-    depth_mm: Array,
-    state: Array,
-    crop_rc: Array,
-    key: Array | None = None,
+    params: dict,
+    depth_mm: UInt16[AnyArray, "B 3 H W"],
+    state: Float[AnyArray, "B 8"],
+    crop_rc: Int[AnyArray, "B 2"],
+    key: Key[Array, ""] | None = None,
 ) -> Any:
     """`policy.Seen` of a batch; with `key`, under the disparity noise of training."""
     depth_m = to_metres(depth_mm)
@@ -172,9 +179,9 @@ def encode(
 
 @partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
 def head_step(
-    config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, seen: Seen, joints: Array,
-    action: Array,
-) -> tuple[TrainState, dict[str, Array]]:  # fmt: skip
+    config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, seen: Seen,
+    joints: Float[Array, "B 8"], action: Float[Array, "B chunk 8"],
+) -> tuple[TrainState, dict[str, Float[Array, ""]]]:  # fmt: skip
     """One optimiser step on the head's parameters alone; `state.params` is `head_of` all."""
     key = step_key(state)
     policy = StudentPolicy(config, profile)
@@ -188,7 +195,12 @@ def head_step(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def act_on_seen(
-    config: StudentConfig, profile: CameraProfile, params, seen: Seen, joints: Array, noise: Array
-) -> Array:
+    config: StudentConfig,
+    profile: CameraProfile,
+    params: dict,
+    seen: Seen,
+    joints: Float[AnyArray, "B 8"],
+    noise: Float[AnyArray, "B chunk 8"],
+) -> Float[Array, "B chunk 8"]:
     """(B, chunk, 8) actions from what perception reports; needs `head_of` the parameters alone."""
     return sample_from_seen(params, seen, joints, noise, config, profile)

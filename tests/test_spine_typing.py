@@ -12,7 +12,9 @@ from mjx_envs import grasp_math, kinematics, scene
 from ppo.policy import TeacherPolicy
 
 ROOT = Path(__file__).parents[1]
-COMPLETE = ("mjx_envs", "ppo", "demos", "sensors", "rig", "export", "deploy")
+COMPLETE = (
+    "mjx_envs", "learning", "ppo", "demos", "sensors", "rig", "ddg_jax", "student_jax", "export", "deploy",
+)  # fmt: skip
 """Packages whose public functions are all documented and annotated."""
 
 
