@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-TYPED = ("mjx_envs", "ppo", "demos")
+TYPED = ("mjx_envs", "ppo", "demos", "foundation")
 """Packages whose annotations, shapes among them, are checked in every call that a test makes."""
 install_import_hook(TYPED, "typecheck_support.checked")
 
