@@ -12,7 +12,7 @@ from mjx_envs import grasp_math, kinematics, scene
 from ppo.policy import TeacherPolicy
 
 ROOT = Path(__file__).parents[1]
-COMPLETE = ("mjx_envs", "ppo", "demos", "foundation", "evaluation")
+COMPLETE = ("mjx_envs", "ppo", "demos", "foundation", "evaluation", "ddgrasp", "app")
 """Packages whose public functions are all documented and annotated."""
 
 

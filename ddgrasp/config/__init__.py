@@ -83,7 +83,7 @@ class Config(Section):
 
     preset: Text
     seed: Seed = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     world: WorldConfig = field(default_factory=WorldConfig)
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
