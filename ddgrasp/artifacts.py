@@ -53,7 +53,7 @@ class Manifest:
     created: str = ""
     """UTC time."""
     manifest_version: int = upgrades.VERSION
-    """Of the configuration's fields (ddgrasp/upgrades.py). In a Manifest they are always this code's."""
+    """Format of the configuration's fields (ddgrasp/upgrades.py). A Manifest's are always this code's."""
 
     def __post_init__(self):
         if self.origin not in ("trained", "loaded"):

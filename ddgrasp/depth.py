@@ -11,17 +11,18 @@ with).
 
 from collections.abc import Sequence
 from types import ModuleType
-from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Float32, Int, Real, Shaped, UInt16
 
+from ddgrasp.arrays import AnyArray
 from ddgrasp.contract import DEPTH_UNIT_M
 
 MAX_MM = 65535
 """The farthest depth that fits: 65.535 m."""
 
 
-def to_metres(depth_mm: Any) -> Any:
+def to_metres(depth_mm: Int[AnyArray, "*any"]) -> Float32[AnyArray, "*any"]:
     """uint16 millimetres to float32 metres, any shape, NumPy or JAX: float32(mm) * float32(0.001).
 
     The exported graph has the same two operations (export/graph.py), so that all see the same numbers.
@@ -29,7 +30,7 @@ def to_metres(depth_mm: Any) -> Any:
     return depth_mm.astype(np.float32) * np.float32(DEPTH_UNIT_M)
 
 
-def to_millimetres(depth_m: Any, xp: ModuleType = np) -> Any:
+def to_millimetres(depth_m: Float[AnyArray, "*any"], xp: ModuleType = np) -> UInt16[AnyArray, "*any"]:
     """Floating metres to uint16 millimetres, any shape: the nearest, half a millimetre to the even one.
 
     What is no depth, or does not fit, is no reading: 0 for NaN, infinities, negative values and everything
@@ -41,7 +42,7 @@ def to_millimetres(depth_m: Any, xp: ModuleType = np) -> Any:
     return _whole(xp.round(depth_m / DEPTH_UNIT_M), xp)
 
 
-def from_counts(counts: np.ndarray, unit_m: float) -> np.ndarray:
+def from_counts(counts: Real[np.ndarray, "*any"], unit_m: float) -> UInt16[np.ndarray, "*any"]:
     """A device's or a file's numbers, `unit_m` metres each, to uint16 millimetres: a new array of that shape.
 
     Rounded and refused as by `to_millimetres`, in float64.
@@ -51,7 +52,7 @@ def from_counts(counts: np.ndarray, unit_m: float) -> np.ndarray:
     return _whole(np.rint(counts.astype(np.float64) * (unit_m / DEPTH_UNIT_M)), np)
 
 
-def _whole(millimetres: Any, xp: ModuleType) -> Any:
+def _whole(millimetres: AnyArray, xp: ModuleType) -> AnyArray:
     fits = (millimetres >= 0) & (millimetres <= MAX_MM)  # False for NaN
     return xp.where(fits, millimetres, 0).astype(np.uint16)
 
@@ -59,7 +60,9 @@ def _whole(millimetres: Any, xp: ModuleType) -> Any:
 # --- nearest neighbours --------------------------------------------------------------------------
 
 
-def resize_nearest(maps: Any, size: Sequence[int]) -> Any:
+def resize_nearest(
+    maps: Shaped[AnyArray, "*b H W"], size: Sequence[int]
+) -> Shaped[AnyArray, "*b {size[0]} {size[1]}"]:
     """(..., H, W) to (..., *size), NumPy or JAX: each pixel is the one that lies under its centre.
 
     Pixel i of n takes pixel floor((i + 1/2) N / n) of N: centres lie at i + 1/2, as in
@@ -75,7 +78,9 @@ def resize_nearest(maps: Any, size: Sequence[int]) -> Any:
     return maps[..., rows[:, None], columns]
 
 
-def crop_nearest(maps: Any, size: Sequence[int]) -> Any:
+def crop_nearest(
+    maps: Shaped[AnyArray, "*b H W"], size: Sequence[int]
+) -> Shaped[AnyArray, "*b {size[0]} {size[1]}"]:
     """The same after a centred crop to the shape of `size`: both axes are scaled alike."""
     (height, width), (rows, columns) = maps.shape[-2:], size
     had, n = (height, rows) if height * columns <= width * rows else (width, columns)

@@ -9,7 +9,7 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,7 +27,7 @@ T = TypeVar("T")
 class Task:
     """One bar: `advance` it as the work goes on; keyword values are shown beside it."""
 
-    def __init__(self, label: str, total: int, draw):
+    def __init__(self, label: str, total: int, draw: Callable[["Task"], None]):
         self.label = label
         self.total = total
         self.done = 0

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 VERSION = 2
-"""Of the fields that this code writes. 1: flat sections ddg, student, deploy; written without a number."""
+"""Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number."""
 
 VERSION_FIELD = "manifest_version"
 

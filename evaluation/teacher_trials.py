@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Real
 
 from ddgrasp import artifacts, contract
 from ddgrasp.config import WorldConfig
@@ -46,7 +47,10 @@ def summarise(result: Mapping[str, Any], teacher: str, world: WorldConfig, seed:
 
 
 def save(
-    directory: Path, summary: Mapping[str, Any], pictures: Mapping[str, np.ndarray], titles: Sequence[str]
+    directory: Path,
+    summary: Mapping[str, Any],
+    pictures: Mapping[str, Real[np.ndarray, "_ _ _ 3"]],
+    titles: Sequence[str],
 ) -> tuple[Path, Path]:
     """Writes the JSON and the contact sheet into `directory`; returns both files.
 

@@ -2,9 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
+
+PerHead = Float[jax.Array, "B N heads d"]
 
 
-def attend(q: jax.Array, k: jax.Array, v: jax.Array) -> jax.Array:
+def attend(q: PerHead, k: PerHead, v: PerHead) -> PerHead:
     """softmax(q k^T / sqrt d) v per head: (B, N, heads, d) each -> (B, N, heads, d).
 
     The softmax is float32 whatever the inputs are. With heads moved to the front first, XLA on CPU takes half

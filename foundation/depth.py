@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import Float, Float32, UInt8
 
 from ddgrasp.errors import UserError, unknown_name
 from foundation import pictures
@@ -24,7 +25,8 @@ from foundation.temporal import MAX_FRAMES
 from foundation.vit import VisionTransformer
 
 DTYPES = ("float32", "bfloat16")
-Taps = tuple[Array, ...]
+Taps = tuple[Float[Array, "N gh gw width"], ...]
+"""What the head reads: four outputs of the encoder, a token per patch."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class DepthNetwork:
         fine = self._fine.init(key, *maps)
         return {"pretrained": pretrained["params"], self.head: {**coarse["params"], **fine["params"]}}
 
-    def __call__(self, params: dict[str, Any], x: Array) -> Array:
+    def __call__(self, params: dict[str, Any], x: Float[Array, "B *T H W 3"]) -> Float32[Array, "B *T H W"]:
         """Standardised RGB, (B, H, W, 3) or for video (B, T, H, W, 3) -> (B, [T,] H, W) float32 >= 0.
 
         UserError for sides that are no multiples of 14, or more than 32 frames.
@@ -71,7 +73,7 @@ class DepthNetwork:
         frames = x.reshape(-1, *x.shape[2:])
         return self.decode(params, self.encode(params, frames), x.shape[1]).reshape(x.shape[:-1])
 
-    def encode(self, params: dict[str, Any], x: Array) -> Taps:
+    def encode(self, params: dict[str, Any], x: Float[Array, "N H W 3"]) -> Taps:
         """(N, H, W, 3) standardised RGB -> four (N, H/14, W/14, width)."""
         if x.shape[1] % PATCH_PX or x.shape[2] % PATCH_PX:
             raise UserError(
@@ -82,7 +84,7 @@ class DepthNetwork:
             encoder = partial(self._encoder.apply, {"params": params["pretrained"]})
             return _in_parts(encoder, x, self.frames_at_once)
 
-    def decode(self, params: dict[str, Any], taps: Taps, frames: int) -> Array:
+    def decode(self, params: dict[str, Any], taps: Taps, frames: int) -> Float32[Array, "N 14*gh 14*gw"]:
         """Taps of (B * `frames`) pictures, a clip's one after the other -> (B * frames, H, W) float32."""
         if frames > MAX_FRAMES:
             raise UserError(
@@ -126,7 +128,9 @@ def _in_parts(function: Callable[[Any], Any], values: Any, at_once: int) -> Any:
 
 
 @partial(jax.jit, static_argnums=(0, 3))
-def predict(network: DepthNetwork, params: dict[str, Any], rgb: Array, input_size: int) -> Array:
+def predict(
+    network: DepthNetwork, params: dict[str, Any], rgb: UInt8[Array, "B *T H W 3"], input_size: int
+) -> Float32[Array, "B *T H W"]:
     """Pictures as cameras give them to depth at their size, in one program.
 
     Args:
@@ -142,7 +146,9 @@ def predict(network: DepthNetwork, params: dict[str, Any], rgb: Array, input_siz
     return decode_at(network, params, taps, clip, frames.shape[1:3]).reshape(rgb.shape[:-1])
 
 
-def encode_rgb(network: DepthNetwork, params: dict[str, Any], rgb: Array, input_size: int) -> Taps:
+def encode_rgb(
+    network: DepthNetwork, params: dict[str, Any], rgb: UInt8[Array, "N H W 3"], input_size: int
+) -> Taps:
     """(N, H, W, 3) uint8 -> taps, at the network's size for such pictures."""
     size = pictures.network_size(rgb.shape[1], rgb.shape[2], input_size, video=network.video)
     return network.encode(params, pictures.standardise(rgb, size))
@@ -150,7 +156,7 @@ def encode_rgb(network: DepthNetwork, params: dict[str, Any], rgb: Array, input_
 
 def decode_at(
     network: DepthNetwork, params: dict[str, Any], taps: Taps, frames: int, size: tuple[int, ...]
-) -> Array:
+) -> Float32[Array, "N {size[0]} {size[1]}"]:
     """Taps -> (B * frames, *size) float32."""
     depth = network.decode(params, taps, frames)
     return resize_corners(depth[..., None], (size[0], size[1]))[..., 0]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt16
 
 from ddgrasp.contract import D455
 from ddgrasp.depth import to_metres
@@ -26,23 +27,20 @@ EDGE_NEAR_PX = 4
 
 @dataclass(frozen=True)
 class Pool:
-    """Pictures of many devices, device after device.
+    """Pictures of many devices, device after device."""
 
-    clean_mm, stereo_mm (N, H, W) uint16; objects, camera_height_m, camera_pitch_rad (N,).
-    """
-
-    clean_mm: np.ndarray
-    stereo_mm: np.ndarray
-    objects: np.ndarray
-    camera_height_m: np.ndarray
-    camera_pitch_rad: np.ndarray
+    clean_mm: UInt16[np.ndarray, "N H W"]
+    stereo_mm: UInt16[np.ndarray, "N H W"]
+    objects: Int[np.ndarray, " N"]
+    camera_height_m: Float[np.ndarray, " N"]
+    camera_pitch_rad: Float[np.ndarray, " N"]
 
     def __len__(self) -> int:
         return len(self.clean_mm)
 
 
-Treatment = Callable[[Pool, int, np.random.Generator], np.ndarray]
-"""Picture number -> (H, W) float32 metres, 0 = invalid."""
+Treatment = Callable[[Pool, int, np.random.Generator], Float[np.ndarray, "H W"]]
+"""Picture number -> metres, 0 = invalid."""
 
 
 def _clean(pool: Pool, at: int, rng: np.random.Generator) -> np.ndarray:
@@ -126,14 +124,16 @@ MEASURED = (
 
 @dataclass(frozen=True)
 class Batch:
-    """depth_m (B, H, W); family (B,) int; measured (B, len(MEASURED)), not standardised."""
+    """Depth after treatments, and what is asked of it."""
 
-    depth_m: np.ndarray
-    family: np.ndarray
-    measured: np.ndarray
+    depth_m: Float32[np.ndarray, "B H W"]
+    family: Int[np.ndarray, " B"]
+    """Number of the treatment."""
+    measured: Float32[np.ndarray, f"B {len(MEASURED)}"]
+    """Not standardised."""
 
 
-def make_batch(pool: Pool, rows: np.ndarray, rng: np.random.Generator) -> Batch:
+def make_batch(pool: Pool, rows: Int[np.ndarray, " B"], rng: np.random.Generator) -> Batch:
     """Pictures `rows` of the pool, each under a random treatment."""
     family = rng.integers(len(TREATMENTS), size=len(rows))
     treatments = list(TREATMENTS.values())
@@ -144,7 +144,7 @@ def make_batch(pool: Pool, rows: np.ndarray, rng: np.random.Generator) -> Batch:
     return Batch(depth_m, family, measured.astype(np.float32))
 
 
-def measure(pool: Pool, at: int, depth_m: np.ndarray) -> np.ndarray:
+def measure(pool: Pool, at: int, depth_m: Float[np.ndarray, "H W"]) -> Float[np.ndarray, f" {len(MEASURED)}"]:
     """The regression targets of picture `at` after a treatment, in the order of MEASURED."""
     clean_m = to_metres(pool.clean_mm[at])
     inverse = _inverse(clean_m)
@@ -162,7 +162,7 @@ def measure(pool: Pool, at: int, depth_m: np.ndarray) -> np.ndarray:
     ])  # fmt: skip
 
 
-def depth_edges(depth_m: np.ndarray) -> np.ndarray:
+def depth_edges(depth_m: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """(H, W) bool: pixels whose 3 x 3 neighbourhood spans more than EDGE_STEP of their inverse depth.
 
     depth_m: clean, 0 = nothing in range, which counts as infinitely far.

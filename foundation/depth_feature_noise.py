@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Float32
 
 from ddgrasp import contract
 
@@ -40,11 +41,11 @@ class ProceduralConfig:
 
 
 def corrupt(
-    depth_m: np.ndarray,
+    depth_m: Float[np.ndarray, "*B H W"],
     rng: np.random.Generator,
     profile: contract.CameraProfile,
     config: ProceduralConfig = ProceduralConfig(),
-) -> np.ndarray:
+) -> Float32[np.ndarray, "*B H W"]:
     """Noisy copy of clean depth.
 
     Args:

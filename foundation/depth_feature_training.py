@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from jaxtyping import Float, Int
 
 from ddgrasp import artifacts
 from ddgrasp.config import DepthFeatureConfig
@@ -45,7 +46,10 @@ class Heads(nn.Module):
     """Features -> logits of the treatments and the standardised measurements."""
 
     @nn.compact
-    def __call__(self, features: Array) -> tuple[Array, Array]:
+    def __call__(
+        self, features: Float[Array, "B features"]
+    ) -> tuple[Float[Array, "B treatments"], Float[Array, "B measurements"]]:
+        """Logits, in the order of TREATMENTS; measurements, in the order of MEASURED."""
         h = nn.relu(nn.Dense(_HIDDEN)(nn.LayerNorm()(features)))
         return nn.Dense(len(TREATMENTS))(h), nn.Dense(len(MEASURED))(h)
 
@@ -145,7 +149,12 @@ def _outputs(params: Any, depth_m: Array) -> tuple[Array, Array, Array]:
     return features, logits, measured
 
 
-def loss(params: Any, depth_m: Array, family: Array, target: Array) -> Array:
+def loss(
+    params: Any,
+    depth_m: Float[Array, "B H W"],
+    family: Int[Array, " B"],
+    target: Float[Array, "B measurements"],
+) -> Float[Array, ""]:
     """Cross-entropy of the treatment + mean squared error of the standardised measurements."""
     _, logits, measured = _outputs(params, depth_m)
     named = optax.softmax_cross_entropy_with_integer_labels(logits, family).mean()

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Float, Float32
 
 from ddgrasp import artifacts
 from ddgrasp.errors import UserError
@@ -36,7 +37,7 @@ FEATURES = sum(WIDTHS[1:])
 _BATCH = 16
 
 
-def picture(depth_m: Array) -> Array:
+def picture(depth_m: Float[Array, "B H W"]) -> Float[Array, "B H W 3"]:
     """What the network sees of (B, H, W) metres, 0 = invalid: (B, H, W, 3).
 
     Inverse depth in [0, 1], validity, and how far a pixel's inverse depth lies from the mean of the valid
@@ -61,7 +62,7 @@ class Trunk(nn.Module):
     """
 
     @nn.compact
-    def __call__(self, depth_m: Array) -> Array:
+    def __call__(self, depth_m: Float[Array, "B H W"]) -> Float[Array, f"B {FEATURES}"]:
         """(B, H, W) metres -> (B, FEATURES)."""
         x = nn.relu(nn.Conv(WIDTHS[0], (5, 5), 2)(picture(depth_m)))
         levels = []
@@ -82,7 +83,7 @@ class DepthFeatures:
     params: dict[str, Any]
     """`trunk`; `mean` and `std` (FEATURES,) of its features over the training pictures."""
 
-    def __call__(self, depth_m: np.ndarray) -> np.ndarray:
+    def __call__(self, depth_m: Float[np.ndarray, "N H W"]) -> Float32[np.ndarray, f"N {FEATURES}"]:
         """(N, H, W) metres, 0 = invalid -> (N, FEATURES) float32."""
         starts = range(0, len(depth_m), _BATCH)
         return np.concatenate([self._batch(depth_m[at : at + _BATCH]) for at in starts])
@@ -95,13 +96,13 @@ class DepthFeatures:
 
 
 @jax.jit
-def standardised(params: dict[str, Any], depth_m: Array) -> Array:
+def standardised(params: dict[str, Any], depth_m: Float[Array, "B H W"]) -> Float[Array, f"B {FEATURES}"]:
     """(B, H, W) metres -> features with mean 0 and deviation 1 over the training pictures."""
     features: Any = Trunk().apply({"params": params["trunk"]}, depth_m)
     return (features - params["mean"]) / params["std"]
 
 
-def at_width(depth_m: np.ndarray, width_px: int) -> np.ndarray:
+def at_width(depth_m: Float[np.ndarray, "N H W"], width_px: int) -> Float32[np.ndarray, "N rows {width_px}"]:
     """(N, H, W) -> (N, H', width_px) by nearest neighbours, aspect ratio kept: holes stay holes."""
     height, width = depth_m.shape[1:]
     if width == width_px:

@@ -4,10 +4,11 @@
 single frames at the finer resolutions, where memory goes. Both read one tree of parameters.
 """
 
-import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from jax import Array
 from jax.typing import DTypeLike
+from jaxtyping import Float, Float32
 
 from foundation.resample import resize_corners
 from foundation.sizes import PATCH_PX, DepthSize
@@ -37,7 +38,9 @@ class Upscale(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[Array, "B h w c"]
+    ) -> Float[Array, "B {self.factor}*h {self.factor}*w {self.channels}"]:
         """(B, h, w, c) -> (B, factor h, factor w, channels)."""
         batch, height, width, inner = x.shape
         shape = (self.factor, self.factor, inner, self.channels)
@@ -54,7 +57,8 @@ class ResidualConv(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[Array, "B h w C"]) -> Float[Array, "B h w C"]:
+        """(B, h, w, C) -> the same shape."""
         channels = x.shape[-1]
         y = conv3(channels, "conv1", self.dtype)(nn.relu(x))
         return x + conv3(channels, "conv2", self.dtype)(nn.relu(y))
@@ -66,7 +70,9 @@ class Fusion(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array, skip: jax.Array | None, size: tuple[int, int]) -> jax.Array:
+    def __call__(
+        self, x: Float[Array, "B h w C"], skip: Float[Array, "B h w C"] | None, size: tuple[int, int]
+    ) -> Float[Array, "B {size[0]} {size[1]} C"]:
         """(B, h, w, C), finer map of the same shape or None -> (B, *size, C)."""
         if skip is not None:
             x = x + ResidualConv(self.dtype, name="resConfUnit1")(skip)
@@ -83,15 +89,19 @@ class CoarseHead(nn.Module):
 
     @nn.compact
     def __call__(
-        self, taps: tuple[jax.Array, ...], frames: int = 1
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        self, taps: tuple[Float[Array, "N gh gw width"], ...], frames: int = 1
+    ) -> tuple[
+        Float[Array, "N 2*gh 2*gw features"],
+        Float[Array, "N 2*gh 2*gw features"],
+        Float[Array, "N 4*gh 4*gw features"],
+    ]:
         """Four (B * T, gh, gw, width) taps, T = `frames` -> path_3 and the reduced maps 2 and 1.
 
         All (B * T, h, w, features), of sides 2 g, 2 g and 4 g.
         """
         size, dtype = self.size, self.dtype
 
-        def in_time(index: int, x: jax.Array) -> jax.Array:
+        def in_time(index: int, x: Array) -> Array:
             return MotionModule(dtype, name=f"motion_modules.{index}")(x, frames) if self.video else x
 
         maps = [
@@ -122,7 +132,12 @@ class FineHead(nn.Module):
     """0: relative inverse depth. Otherwise metric depth up to this (models trained for it)."""
 
     @nn.compact
-    def __call__(self, path_3: jax.Array, layer_2: jax.Array, layer_1: jax.Array) -> jax.Array:
+    def __call__(
+        self,
+        path_3: Float[Array, "N h w features"],
+        layer_2: Float[Array, "N h w features"],
+        layer_1: Float[Array, "N 2*h 2*w features"],
+    ) -> Float32[Array, "N 7*h 7*w"]:
         """What `CoarseHead` gives -> (N, 14 gh, 14 gw) float32, see `DepthNetwork`."""
         path_2 = Fusion(self.dtype, name="scratch.refinenet2")(path_3, layer_2, _sides(layer_1))
         height, width = _sides(layer_1)
@@ -134,5 +149,5 @@ class FineHead(nn.Module):
         return self.max_depth_m * nn.sigmoid(x) if self.max_depth_m else nn.relu(x)
 
 
-def _sides(x: jax.Array) -> tuple[int, int]:
+def _sides(x: Array) -> tuple[int, int]:
     return x.shape[-3], x.shape[-2]

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float32, UInt8
 
 from foundation import catalog, pictures, store
 from foundation.convert import variable_shapes
@@ -34,7 +35,7 @@ class Extractor:
     """For reports: "built-in", or which weights were used."""
     variables: dict[str, Any]
 
-    def __call__(self, rgb: np.ndarray) -> np.ndarray:
+    def __call__(self, rgb: UInt8[np.ndarray, "N H W 3"]) -> Float32[np.ndarray, "N d"]:
         """(N, H, W, 3) uint8 -> (N, 2048) (FID Inception) or (N, 512) (ResNet-18), float32."""
         function = _inception if self.name == catalog.FID_INCEPTION else _resnet18
         starts = range(0, len(rgb), _BATCH)

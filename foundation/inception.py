@@ -6,10 +6,11 @@ leave padding out, and the last mixed block pools by maximum.
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from jax import Array
 from jax.typing import DTypeLike
+from jaxtyping import Float, Float32
 
 from foundation.resample import resize_half_pixel
 
@@ -20,6 +21,7 @@ NORM_EPSILON = 1e-3
 _BORDER = ((0, 0), (1, 1), (1, 1), (0, 0))
 Step = tuple[str, int, int, int]
 """A convolution: name, channels, kernel rows, kernel columns."""
+Map = Float[Array, "B h w c"]
 
 
 class ConvNorm(nn.Module):
@@ -32,7 +34,8 @@ class ConvNorm(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Map) -> Float[Array, "B rows columns {self.channels}"]:
+        """(B, h, w, c) -> (B, rows, columns, channels)."""
         padding = [(size // 2, size // 2) if self.pad else (0, 0) for size in self.kernel]
         x = nn.Conv(
             self.channels,
@@ -48,16 +51,16 @@ class ConvNorm(nn.Module):
         )
 
 
-def average_pool(x: jax.Array) -> jax.Array:
+def average_pool(x: Map) -> Map:
     """3x3, stride 1, same size: the mean over the pixels that exist."""
 
-    def pooled(values: jax.Array) -> jax.Array:
+    def pooled(values: Array) -> Array:
         return nn.avg_pool(jnp.pad(values, _BORDER), window_shape=(3, 3), strides=(1, 1))
 
     return pooled(x) / pooled(jnp.ones((1, *x.shape[1:3], 1), x.dtype))
 
 
-def max_pool(x: jax.Array, stride: int) -> jax.Array:
+def max_pool(x: Map, stride: int) -> Float[Array, "B rows columns c"]:
     """3x3 of values >= 0; stride 1 keeps the size, stride 2 is not padded."""
     x = jnp.pad(x, _BORDER) if stride == 1 else x
     return nn.max_pool(x, window_shape=(3, 3), strides=(stride, stride))
@@ -68,7 +71,9 @@ class Mixed(nn.Module):
 
     dtype: DTypeLike
 
-    def chain(self, x: jax.Array, steps: Sequence[Step], last_stride: int = 1) -> jax.Array:
+    def chain(
+        self, x: Map, steps: Sequence[Step], last_stride: int = 1
+    ) -> Float[Array, "B rows columns {steps[-1][1]}"]:
         """Convolutions one after the other; only the last one may have stride 2, and then no padding."""
         for index, (name, channels, rows, columns) in enumerate(steps):
             stride = last_stride if index == len(steps) - 1 else 1
@@ -82,7 +87,8 @@ class MixedA(Mixed):
     pool_channels: int
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Map) -> Float[Array, "B h w 224+{self.pool_channels}"]:
+        """The same sides."""
         double = [("branch3x3dbl_1", 64, 1, 1), ("branch3x3dbl_2", 96, 3, 3), ("branch3x3dbl_3", 96, 3, 3)]
         parts = [
             self.chain(x, [("branch1x1", 64, 1, 1)]),
@@ -97,7 +103,8 @@ class MixedB(Mixed):
     """Mixed_6a: halves the sides."""
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Map) -> Float[Array, "B (h-1)//2 (w-1)//2 480+c"]:
+        """(B, h, w, c) -> 480 channels, then the input's, pooled."""
         double = [("branch3x3dbl_1", 64, 1, 1), ("branch3x3dbl_2", 96, 3, 3), ("branch3x3dbl_3", 96, 3, 3)]
         parts = [self.chain(x, [("branch3x3", 384, 3, 3)], 2), self.chain(x, double, 2), max_pool(x, 2)]
         return jnp.concatenate(parts, -1)
@@ -109,7 +116,8 @@ class MixedC(Mixed):
     inner: int
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Map) -> Float[Array, "B h w 768"]:
+        """The same sides."""
         c = self.inner
         single = [("branch7x7_1", c, 1, 1), ("branch7x7_2", c, 1, 7), ("branch7x7_3", 192, 7, 1)]
         double = [
@@ -132,7 +140,8 @@ class MixedD(Mixed):
     """Mixed_7a: halves the sides."""
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Map) -> Float[Array, "B (h-1)//2 (w-1)//2 512+c"]:
+        """(B, h, w, c) -> 512 channels, then the input's, pooled."""
         factored = [
             ("branch7x7x3_1", 192, 1, 1),
             ("branch7x7x3_2", 192, 1, 7),
@@ -149,7 +158,8 @@ class MixedE(Mixed):
     pool_by_maximum: bool
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Map) -> Float[Array, "B h w 2048"]:
+        """The same sides."""
         single = self.chain(x, [("branch3x3_1", 384, 1, 1)])
         double = self.chain(x, [("branch3x3dbl_1", 448, 1, 1), ("branch3x3dbl_2", 384, 3, 3)])
         pooled = max_pool(x, 1) if self.pool_by_maximum else average_pool(x)
@@ -170,7 +180,7 @@ class FidInception(nn.Module):
     dtype: DTypeLike = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[Array, "B H W 3"]) -> Float32[Array, f"B {FEATURES}"]:
         """(B, H, W, 3) of any size, in [0, 1] -> (B, 2048) float32."""
         dtype = self.dtype
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 
 import numpy as np
+from jaxtyping import Float, Float32, Int
 
 WINDOW = 32
 STRIDE = 22
@@ -22,7 +23,7 @@ BLENDED = 8
 """Frames that are cross-faded."""
 
 
-def window_frames(count: int) -> np.ndarray:
+def window_frames(count: int) -> Int[np.ndarray, f"windows {WINDOW}"]:
     """(windows, 32) which frame of a video of `count` each window sees; its last one fills the end."""
     rows = [np.arange(WINDOW)]
     for start in range(STRIDE, count, STRIDE):
@@ -30,7 +31,9 @@ def window_frames(count: int) -> np.ndarray:
     return np.minimum(np.stack(rows), count - 1)
 
 
-def fit_scale_shift(source: np.ndarray, target: np.ndarray) -> tuple[float, float]:
+def fit_scale_shift(
+    source: Float[np.ndarray, "*any"], target: Float[np.ndarray, "*any"]
+) -> tuple[float, float]:
     """(a, b) of least |a source + b - target|^2 over all values; (1, 0) if all of `source` is one value."""
     x, y = source.astype(np.float64).ravel(), target.astype(np.float64).ravel()
     deviation = x - x.mean()
@@ -42,8 +45,8 @@ def fit_scale_shift(source: np.ndarray, target: np.ndarray) -> tuple[float, floa
 
 
 def stitch(
-    windows: Iterable[np.ndarray], count: int | None = None, *, metric: bool = False
-) -> Iterator[np.ndarray]:
+    windows: Iterable[Float[np.ndarray, f"{WINDOW} H W"]], count: int | None = None, *, metric: bool = False
+) -> Iterator[Float32[np.ndarray, "H W"]]:
     """Depth of each frame of the video, in order, from the depth of its windows.
 
     Args:

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import ml_dtypes
 import numpy as np
@@ -172,8 +172,8 @@ _LITERAL = {
 _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
-def _run(file: IO[bytes]) -> Any:
-    """The value that one pickle describes, from the file's current position to just behind its end."""
+def _run(file: Any) -> Any:
+    """The value that one pickle describes, from the binary file's current position to just behind its end."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     argument: Any

@@ -5,7 +5,9 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float32, UInt8
 
+from ddgrasp.arrays import AnyArray
 from ddgrasp.errors import UserError
 from foundation.resample import resize_cubic
 from foundation.sizes import PATCH_PX
@@ -44,7 +46,9 @@ def network_size(height: int, width: int, input_size: int = INPUT_SIZE, *, video
     return side(height), side(width)
 
 
-def standardise(rgb: jax.Array, size: tuple[int, int] | None = None) -> jax.Array:
+def standardise(
+    rgb: UInt8[AnyArray, "B H W 3"], size: tuple[int, int] | None = None
+) -> Float32[jax.Array, "B rows columns 3"]:
     """(B, H, W, 3) uint8 -> float32 of ImageNet's mean 0 and deviation 1, resized bicubically to `size`."""
     x = jnp.asarray(rgb, jnp.float32) / 255
     if size is not None:

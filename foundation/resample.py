@@ -6,32 +6,36 @@ and in whether shrinking blurs first, so each convention is written out here: no
 
 from functools import lru_cache
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float, Float32, Float64
 
 CUBIC_A = -0.75
 """Free parameter of Keys' cubic kernel (Keys 1981, eq. 15), as OpenCV and PyTorch choose it."""
+Images = Float[Array, "*b h w c"]
+Resized = Float[Array, "*b {size[0]} {size[1]} c"]
+"""What functions with an argument `size`, (rows, columns), return."""
 
 
-def corner_positions(size: int, wanted: int) -> np.ndarray:
+def corner_positions(size: int, wanted: int) -> Float64[np.ndarray, " {wanted}"]:
     """Where sample i lies, first and last ones kept: i (size - 1) / (wanted - 1). (wanted,) float64."""
     return np.arange(wanted) * ((size - 1) / max(wanted - 1, 1))
 
 
-def centre_positions(size: int, wanted: int, offset: float = 0.0) -> np.ndarray:
+def centre_positions(size: int, wanted: int, offset: float = 0.0) -> Float64[np.ndarray, " {wanted}"]:
     """Where sample i lies between centres: (i + 1/2) size / (wanted + offset) - 1/2. (wanted,) float64."""
     return (np.arange(wanted) + 0.5) * (size / (wanted + offset)) - 0.5
 
 
-def resize_corners(images: jax.Array, size: tuple[int, int]) -> jax.Array:
+def resize_corners(images: Images, size: tuple[int, int]) -> Resized:
     """Bilinear, corners aligned: (..., h, w, c) -> (..., *size, c)."""
     for axis, wanted in zip((-3, -2), size, strict=True):
         images = _interpolate(images, corner_positions(images.shape[axis], wanted), axis)
     return images
 
 
-def resize_half_pixel(images: jax.Array, size: tuple[int, int]) -> jax.Array:
+def resize_half_pixel(images: Images, size: tuple[int, int]) -> Resized:
     """Bilinear between pixel centres, edges clamped, without blurring first: (..., h, w, c) -> (..., *size,
     c).
     """
@@ -40,7 +44,7 @@ def resize_half_pixel(images: jax.Array, size: tuple[int, int]) -> jax.Array:
     return images
 
 
-def _interpolate(images: jax.Array, positions: np.ndarray, axis: int) -> jax.Array:
+def _interpolate(images: Array, positions: np.ndarray, axis: int) -> Array:
     """Linear between the two neighbours of each position, clamped to the axis."""
     size = images.shape[axis]
     positions = np.clip(positions, 0, size - 1)
@@ -53,7 +57,7 @@ def _interpolate(images: jax.Array, positions: np.ndarray, axis: int) -> jax.Arr
 
 
 @lru_cache(maxsize=256)
-def cubic_matrix(size: int, wanted: int, offset: float = 0.0) -> np.ndarray:
+def cubic_matrix(size: int, wanted: int, offset: float = 0.0) -> Float32[np.ndarray, "{wanted} {size}"]:
     """Bicubic between pixel centres, edges clamped, as a matrix (wanted, size).
 
     `offset` 0 is OpenCV's INTER_CUBIC; DINOv2's position table wants 0.1.
@@ -73,7 +77,7 @@ def _keys_kernel(x: np.ndarray) -> np.ndarray:
     return np.where(x <= 1, near, far)
 
 
-def resize_cubic(images: jax.Array, size: tuple[int, int], offset: float = 0.0) -> jax.Array:
+def resize_cubic(images: Images, size: tuple[int, int], offset: float = 0.0) -> Resized:
     """Bicubic, see `cubic_matrix`: (..., h, w, c) -> (..., *size, c)."""
     rows, columns = (
         jnp.asarray(cubic_matrix(images.shape[axis], wanted, offset), images.dtype)

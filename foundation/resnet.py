@@ -1,9 +1,10 @@
 """ResNet-18 (He et al. 2016) as torchvision publishes it, trained on ImageNet."""
 
-import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from jax import Array
 from jax.typing import DTypeLike
+from jaxtyping import Float, Float32
 
 STAGE_CHANNELS = (64, 128, 256, 512)
 BLOCKS = 2
@@ -31,7 +32,8 @@ class BasicBlock(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[Array, "B h w c"]) -> Float[Array, "B rows columns {self.channels}"]:
+        """(B, h, w, c) -> (B, h / stride, w / stride, channels), rounded up."""
         y = _conv(self.channels, 3, self.stride, "conv1", self.dtype)(x)
         y = nn.relu(_norm("bn1", self.dtype)(y))
         y = _norm("bn2", self.dtype)(_conv(self.channels, 3, 1, "conv2", self.dtype)(y))
@@ -47,7 +49,9 @@ class ResNet18(nn.Module):
     dtype: DTypeLike = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def __call__(
+        self, x: Float[Array, "B H W 3"]
+    ) -> tuple[Float32[Array, "B 512"], Float32[Array, f"B {CLASSES}"]]:
         """(B, H, W, 3) -> features (B, 512), logits (B, 1000), float32."""
         dtype = self.dtype
         x = _conv(STAGE_CHANNELS[0], 7, 2, "conv1", dtype)(x)

@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
+from jax import Array
 from jax.typing import DTypeLike
+from jaxtyping import Float, Float32
 
 from foundation.attention import attend
 from foundation.vit import layer_norm
@@ -20,8 +22,10 @@ LAYER_NORM_EPSILON = 1e-5
 ATTENTIONS = 2
 FEED_FORWARD_RATIO = 4
 
+InTime = Float[Array, "N T C"]
 
-def time_table(channels: int) -> np.ndarray:
+
+def time_table(channels: int) -> Float32[np.ndarray, "1 32 {channels}"]:
     """(1, MAX_FRAMES, channels) sinusoids: sin(t w_j) at channel 2j, cos(t w_j) at 2j+1, w_j = 10000^(-2j/C).
 
     Vaswani et al. 2017, section 3.5.
@@ -36,7 +40,7 @@ class TimeAttention(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: InTime) -> InTime:
         """(N, T, C) normalised -> (N, T, C)."""
         count, frames, channels = x.shape
         table = self.param("pos_encoder.pe", lambda _: jnp.asarray(time_table(channels)))
@@ -56,7 +60,8 @@ class GatedFeedForward(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: InTime) -> InTime:
+        """(N, T, C) -> (N, T, C)."""
         channels = x.shape[-1]
         inner = nn.Dense(2 * FEED_FORWARD_RATIO * channels, dtype=self.dtype, name="net.0.proj")(x)
         value, gate = jnp.split(inner, 2, axis=-1)
@@ -70,7 +75,7 @@ class TimeBlock(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: InTime) -> InTime:
         """(N, T, C) -> (N, T, C)."""
         for index in range(ATTENTIONS):
             y = layer_norm(f"norms.{index}", LAYER_NORM_EPSILON, self.dtype)(x)
@@ -85,7 +90,7 @@ class MotionModule(nn.Module):
     dtype: DTypeLike = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array, frames: int) -> jax.Array:
+    def __call__(self, x: Float[Array, "N h w C"], frames: int) -> Float[Array, "N h w C"]:
         """(B * T, h, w, C), T = `frames` the faster index -> the same shape."""
         count, height, width, channels = x.shape
         y = nn.GroupNorm(

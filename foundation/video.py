@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float32, UInt8
 
 from foundation.depth import DepthNetwork, Taps, decode_at, encode_rgb
 from foundation.long_video import KEPT, STRIDE, WINDOW, stitch
@@ -23,11 +24,11 @@ _decode = jax.jit(decode_at, static_argnums=(0, 3, 4))
 def stream(
     network: DepthNetwork,
     params: dict[str, Any],
-    frames: Iterable[np.ndarray],
+    frames: Iterable[UInt8[np.ndarray, "H W 3"]],
     input_size: int = INPUT_SIZE,
     *,
     metric: bool = False,
-) -> Iterator[np.ndarray]:
+) -> Iterator[Float32[np.ndarray, "H W"]]:
     """Depth of each frame of a video, in order, while the video is being read.
 
     Args:

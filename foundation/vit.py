@@ -8,7 +8,9 @@ that a parameter is found in both under the same name (foundation/convert.py rel
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from jax import Array
 from jax.typing import DTypeLike
+from jaxtyping import Float
 
 from foundation.attention import attend
 from foundation.resample import resize_cubic
@@ -20,6 +22,8 @@ TABLE_OFFSET = 0.1
 """Added to the wanted grid's side where the table is resampled, as DINOv2 was trained and published."""
 NORM_EPSILON = 1e-6
 MLP_RATIO = 4
+
+Tokens = Float[Array, "B N C"]
 
 
 def layer_norm(name: str, epsilon: float, dtype: DTypeLike) -> nn.LayerNorm:
@@ -34,7 +38,7 @@ class Attention(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Tokens) -> Tokens:
         """(B, N, C) -> (B, N, C)."""
         batch, tokens, width = x.shape
         qkv = nn.Dense(3 * width, dtype=self.dtype, name="qkv")(x)
@@ -49,7 +53,8 @@ class Mlp(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Tokens) -> Tokens:
+        """(B, N, C) -> (B, N, C)."""
         width = x.shape[-1]
         x = jax.nn.gelu(nn.Dense(MLP_RATIO * width, dtype=self.dtype, name="fc1")(x), approximate=False)
         return nn.Dense(width, dtype=self.dtype, name="fc2")(x)
@@ -61,7 +66,8 @@ class LayerScale(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Tokens) -> Tokens:
+        """(B, N, C) -> (B, N, C)."""
         gamma = self.param("gamma", nn.initializers.ones, (x.shape[-1],))
         return x * jnp.asarray(gamma, self.dtype)
 
@@ -73,14 +79,17 @@ class Block(nn.Module):
     dtype: DTypeLike
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Tokens) -> Tokens:
+        """(B, N, C) -> (B, N, C)."""
         y = layer_norm("norm1", NORM_EPSILON, self.dtype)(x)
         x = x + LayerScale(self.dtype, name="ls1")(Attention(self.heads, self.dtype, name="attn")(y))
         y = layer_norm("norm2", NORM_EPSILON, self.dtype)(x)
         return x + LayerScale(self.dtype, name="ls2")(Mlp(self.dtype, name="mlp")(y))
 
 
-def resize_positions(table: jax.Array, grid: tuple[int, int]) -> jax.Array:
+def resize_positions(
+    table: Float[Array, "1 1370 C"], grid: tuple[int, int]
+) -> Float[Array, "1 1+{grid[0]}*{grid[1]} C"]:
     """(1, 1 + 37*37, C) position embeddings -> (1, 1 + rows*columns, C) for a `grid` of (rows, columns)
     patches.
 
@@ -101,7 +110,9 @@ class VisionTransformer(nn.Module):
     dtype: DTypeLike = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> tuple[jax.Array, ...]:
+    def __call__(
+        self, x: Float[Array, "B H W 3"]
+    ) -> tuple[Float[Array, "B H//14 W//14 {self.size.width}"], ...]:
         """(B, 14 gh, 14 gw, 3) standardised RGB -> four (B, gh, gw, width), shallowest tap first."""
         size, dtype = self.size, self.dtype
         patches = nn.Conv(

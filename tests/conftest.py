@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-TYPED = ("mjx_envs", "learning", "ppo", "demos", "sensors", "rig", "ddg_jax", "export", "deploy")
+TYPED = (
+    "mjx_envs", "learning", "ppo", "demos", "sensors", "rig", "foundation", "ddg_jax", "export", "deploy",
+)  # fmt: skip
 """Packages whose annotations, shapes among them, are checked in every call that a test makes."""
 install_import_hook(TYPED, "typecheck_support.checked")
 

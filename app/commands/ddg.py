@@ -43,7 +43,7 @@ class DDGSample:
     count: Count = 4
     """Frames to draw."""
     seed: Seed = 0
-    """Of the noise."""
+    """Seed of the noise."""
 
     def run(self) -> None:
         """Writes samples.png and prints where it is."""
@@ -77,6 +77,7 @@ class DDGDistil:
     """Continue what is there."""
 
     def run(self) -> None:
+        """Distils the model into the run's folder ddg."""
         check_data("--data", self.data)
         fitted = artifacts.read_artifact(self.model)
         config = artifacts.config_from_json(fitted.manifest.config)
@@ -103,7 +104,7 @@ class DDGGenerate:
     out: Path
     """Directory of a run; the depth goes to its folder noisy."""
     seed: Seed = 0
-    """Of the noise."""
+    """Seed of the noise."""
     resume: bool = False
     """Continue what is there."""
 
@@ -134,7 +135,7 @@ class DDGThresholds:
     count: Count = 180
     """Frames."""
     seed: Seed = 1
-    """Of the noise."""
+    """Seed of the noise."""
 
     def run(self) -> None:
         """Prints the table and writes thresholds.json and thresholds.png."""

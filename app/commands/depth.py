@@ -112,7 +112,7 @@ class SensorsCompare:
     frames: Annotated[int, Range(2, 1_000_000)] = 6
     """Frames per scene, at least 2: noise over time needs them."""
     seed: Seed = 0
-    """Of the scenes."""
+    """Seed of the scenes."""
 
     def run(self) -> None:
         """Prints both cameras' figures side by side and writes sensors.json and sensors.png."""

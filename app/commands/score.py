@@ -31,7 +31,7 @@ class Scoring:
     run_dir: Path | None = None
     """Run whose teacher and generator to use; none takes --out."""
     seed: Seed = 0
-    """Of trajectories, noise and resampling."""
+    """Seed of trajectories, noise and resampling."""
     resume: bool = False
     """Continue what is there."""
 

@@ -30,7 +30,7 @@ class StudentEval:
     trials: Count = 200
     """Episodes per kind of depth."""
     seed: Seed = 1
-    """Of the episodes."""
+    """Seed of the episodes."""
 
     def run(self) -> None:
         """Prints success on clean and on generated depth, with Wilson intervals."""

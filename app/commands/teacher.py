@@ -48,7 +48,7 @@ class TeacherEval:
     watched: Count = 8
     """How many of them are drawn, to count the object's visible pixels."""
     seed: Seed = 0
-    """Of the episodes."""
+    """Seed of the episodes."""
     out: Path | None = None
     """Where trials.json and pictures/episodes.png go; by default beside the teacher, for the report."""
 
@@ -84,9 +84,10 @@ class TeacherCompare:
     trials: Count | None = None
     """Episodes per backend; by default 1000, on jax 200 (without a GPU it compiles for minutes)."""
     seed: Seed = 0
-    """Of the episodes."""
+    """Seed of the episodes."""
 
     def run(self) -> None:
+        """Measures every backend, printing and keeping each result as it comes."""
         from evaluation import backends as measured
         from evaluation import wilson
         from ppo.backends import evaluate_backends

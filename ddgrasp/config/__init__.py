@@ -84,7 +84,7 @@ class Config(Section):
     preset: Text
     """Name of the preset that the values started from."""
     seed: Seed = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     world: WorldConfig = field(default_factory=WorldConfig)
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)

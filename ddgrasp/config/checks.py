@@ -74,14 +74,14 @@ Pixels = Annotated[int, Range(1, 4096)]
 Share = Annotated[float, Range(0, 1)]
 """A share or a probability."""
 Decay = Annotated[float, Range(0, 0.999999)]
-"""Of a running average: 0 keeps the newest value alone."""
+"""Decay of a running average: 0 keeps the newest value alone."""
 LearningRate = Annotated[float, Range(0, 1, above=True)]
 """An optimiser's step size."""
 WeightDecay = Annotated[float, Range(0, 1)]
 Weight = Annotated[float, Range(0, 1_000_000)]
-"""Of a term in a sum."""
+"""Weight of a term in a sum."""
 Seed = Annotated[int, Range(0, 2**31 - 1)]
-"""Of random numbers."""
+"""Seed of random numbers."""
 
 
 class Section:

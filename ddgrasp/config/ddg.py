@@ -35,7 +35,7 @@ Sampler = Literal["dpm_solver", "ddim", "ddpm", "progressive"]
 DPM_SOLVER, DDIM, DDPM, PROGRESSIVE = SAMPLERS = get_args(Sampler)
 Spacing = Literal["leading", "trailing", "linspace", "quadratic"]
 SPACINGS: tuple[Spacing, ...] = get_args(Spacing)
-"""Of the diffusion steps that a sampler visits: learning/diffusion.py, timesteps."""
+"""Spacing of the diffusion steps that a sampler visits: learning/diffusion.py, timesteps."""
 
 _Metres = Annotated[float, Range(0, 1000, above=True)]
 _Evaluations = Annotated[int, Range(1, 10_000)]

@@ -11,7 +11,7 @@ class DepthFeatureConfig(Section, name="features"):
     """Training of the depth feature extractor (foundation/depth_feature_training.py)."""
 
     seed: Seed = 0
-    """Of rooms, cameras, corruptions and initial weights."""
+    """Seed of rooms, cameras, corruptions and initial weights."""
     devices: Annotated[int, Range(2, 100000)] = 96
     """Random cameras; the last eighth of them is kept for testing."""
     pictures: Count = 24

@@ -27,8 +27,8 @@ from evaluation.depth_score.episodes import Load, collect, score_episodes
 from evaluation.depth_score.resampling import Sample
 
 if TYPE_CHECKING:
-    from ddg_jax.data import Frames
-    from ddg_jax.sample import Generator
+    import ddg_jax.data
+    import ddg_jax.sample
 
 JSON = "curve.json"
 POINT = "point.json"
@@ -82,7 +82,7 @@ def rows(points: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
 
 
 def _point(
-    config: Config, size: int, frames: "Frames", common: dict[str, Sample],
+    config: Config, size: int, frames: "ddg_jax.data.Frames", common: dict[str, Sample],
     extractor: score_features.FeatureExtractor, loads: Sequence[Load], directory: Path, progress: Progress,
 ) -> dict[str, Any]:  # fmt: skip
     """One point: read if it was finished, else fitted and scored."""
@@ -105,7 +105,9 @@ def _point(
     return to_json(point)
 
 
-def _fitted(config: Config, frames: "Frames", folder: Path, progress: Progress) -> "Generator":
+def _fitted(
+    config: Config, frames: "ddg_jax.data.Frames", folder: Path, progress: Progress
+) -> "ddg_jax.sample.Generator":
     """A generator fitted on `frames`, from its checkpoints if there are any."""
     from ddg_jax.prior import make_prior
     from ddg_jax.sample import DPM_SOLVER
@@ -123,7 +125,7 @@ def _fitted(config: Config, frames: "Frames", folder: Path, progress: Progress) 
 
 def _frames(
     config: Config, parents: Mapping[str, Artifact], count: int, extra: Path, progress: Progress
-) -> "Frames":
+) -> "ddg_jax.data.Frames":
     """Frames of `count` trajectories: the run's, then more from the same teacher, recorded into `extra`."""
     from ddg_jax.data import Frames, load_frames
     from ddg_jax.prior import make_prior

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8, UInt16
 
 from ddgrasp import depth
 from ddgrasp.config import Config
@@ -21,8 +22,8 @@ from ddgrasp.progress import Progress
 from sensors.recordings.recording import Recording, find_recordings
 
 if TYPE_CHECKING:
-    from rig.camera import RigCamera
-    from rig.world import RigWorld
+    import rig.camera
+    import rig.world
 
 REAL, SIM = SIDES = ("real", "sim")
 SEED_OFFSET = 1_000_000
@@ -34,21 +35,19 @@ resampled together."""
 
 @dataclass(frozen=True)
 class Episode:
-    """Consecutive frames of one trajectory. Depth (T, H, W) uint16 millimetres, 0 = invalid / nothing there.
-
-    repeats_mm (K, H, W): the first frame sensed again and again, or K = 0.
-    """
+    """Consecutive frames of one trajectory. Depth in millimetres, 0 = invalid / nothing there."""
 
     side: str
     number: int
     """Unique among both sides."""
     group: int
     """Episodes that show the same scene share it: they are never told apart from each other."""
-    sensed_mm: np.ndarray
-    clean_mm: np.ndarray
-    repeats_mm: np.ndarray
-    rgb: np.ndarray | None
-    """(T, h, w, 3) uint8, if some method needs colour."""
+    sensed_mm: UInt16[np.ndarray, "T H W"]
+    clean_mm: UInt16[np.ndarray, "T H W"]
+    repeats_mm: UInt16[np.ndarray, "K H W"]
+    """The first frame sensed again and again, or K = 0."""
+    rgb: UInt8[np.ndarray, "T h w 3"] | None
+    """If some method needs colour."""
     focal_px: float
     baseline_m: float
 
@@ -96,7 +95,7 @@ def _rig_recorder(config: Config, teacher: Path, with_rgb: bool) -> Callable[[st
 
 
 def _record(
-    config: Config, side: str, number: int, world: "RigWorld", camera: "RigCamera",
+    config: Config, side: str, number: int, world: "rig.world.RigWorld", camera: "rig.camera.RigCamera",
     policy: Callable[[np.ndarray], np.ndarray], with_rgb: bool,
 ) -> Episode:  # fmt: skip
     from rig.camera import jittered_pose
@@ -126,7 +125,9 @@ def _record(
     )  # fmt: skip
 
 
-def _clean_mm(world: "RigWorld", camera: "RigCamera", T_world_cam: np.ndarray) -> np.ndarray:
+def _clean_mm(
+    world: "rig.world.RigWorld", camera: "rig.camera.RigCamera", T_world_cam: np.ndarray
+) -> np.ndarray:
     """The simulator's own depth from the place of the left imager."""
     from mjx_envs.render.raycast_numpy import render_depth
     from rig.camera import FAR_M
@@ -156,11 +157,12 @@ def load_episode(file: Path) -> Episode:
 
 @dataclass(frozen=True)
 class RealFrames:
-    """The last frames of a camera, in time order. depth_mm (N, H, W); rgb (N, h, w, 3); total: all frames."""
+    """The last frames of a camera, in time order."""
 
     total: int
-    depth_mm: np.ndarray
-    rgb: np.ndarray
+    """How many frames it has."""
+    depth_mm: UInt16[np.ndarray, "N H W"]
+    rgb: UInt8[np.ndarray, "N h w 3"]
     focal_px: float
     baseline_m: float
 

@@ -7,14 +7,17 @@ Both are meant for features of foundation/features.py; the extractor's name belo
 from collections.abc import Iterator
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from ddgrasp.errors import UserError
 
 KID_SEED = 2020
 """torch-fidelity's."""
+Features = Float[np.ndarray, "n d"]
+Others = Float[np.ndarray, "m d"]
 
 
-def fid(x: np.ndarray, y: np.ndarray) -> float:
+def fid(x: Features, y: Others) -> float:
     """Frechet distance of the Gaussians fitted to two sets of features (Heusel et al. 2017, eq. 6).
 
     |m1 - m2|^2 + tr(S1 + S2) - 2 tr (S1 S2)^(1/2), covariances with n - 1. The trace of the root is the sum
@@ -33,12 +36,12 @@ def fid(x: np.ndarray, y: np.ndarray) -> float:
     return float(difference @ difference + np.sum(a * a) + np.sum(b * b) - 2 * root)
 
 
-def kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(m, d), (n, d) -> (m, n): the cubic kernel of KID, (x.y / d + 1)^3."""
+def kernel(x: Features, y: Others) -> Float[np.ndarray, "n m"]:
+    """(n, d), (m, d) -> (n, m): the cubic kernel of KID, (x.y / d + 1)^3."""
     return (x @ y.T / x.shape[1] + 1) ** 3
 
 
-def mmd2(x: np.ndarray, y: np.ndarray) -> float:
+def mmd2(x: Features, y: Others) -> float:
     """Unbiased squared maximum mean discrepancy (Gretton et al. 2012, lemma 6) under `kernel`.
 
     x and y (m, d) of one length. It can be negative.
@@ -54,7 +57,7 @@ def mmd2(x: np.ndarray, y: np.ndarray) -> float:
 
 def kid_subsets(
     count_x: int, count_y: int, subsets: int, size: int
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+) -> Iterator[tuple[Int[np.ndarray, " size"], Int[np.ndarray, " size"]]]:
     """Rows of x and of y, `size` each without replacement, that torch-fidelity draws for every subset."""
     rng = np.random.RandomState(KID_SEED)
     for _ in range(subsets):
@@ -62,7 +65,7 @@ def kid_subsets(
         yield rows, rng.choice(count_y, size, replace=False)
 
 
-def kid(x: np.ndarray, y: np.ndarray, subsets: int = 100, size: int = 1000) -> tuple[float, float]:
+def kid(x: Features, y: Others, subsets: int = 100, size: int = 1000) -> tuple[float, float]:
     """Mean and (population) standard deviation of `mmd2` over random subsets (Binkowski et al. 2018).
 
     UserError if a set has fewer than `size` vectors.

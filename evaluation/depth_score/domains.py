@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from jaxtyping import UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import DextrahConfig, ScoreConfig
@@ -18,8 +19,11 @@ from ddgrasp.depth import to_metres, to_millimetres
 from evaluation.depth_score.data import REAL, SIM, Episode
 
 if TYPE_CHECKING:
-    from ddg_jax.prior import Prior
-    from ddg_jax.sample import Generator
+    import ddg_jax.prior
+    import ddg_jax.sample
+
+Maps = dict[str, UInt16[np.ndarray, "_ _ _"]]
+"""Domain -> (T, H, W) millimetres."""
 
 RAW = "real_raw"
 FLOOR = "sim_sensed"
@@ -37,10 +41,10 @@ class Methods:
 
     config: ScoreConfig
     seed: int
-    generator: "Generator"
+    generator: "ddg_jax.sample.Generator"
 
     @cached_property
-    def monocular(self) -> "Prior | None":
+    def monocular(self) -> "ddg_jax.prior.Prior | None":
         """The monocular network; None if no folder was named and the usual one is not there."""
         from ddg_jax.network_prior import weights_folder
         from ddg_jax.prior import make_prior
@@ -65,7 +69,7 @@ class Methods:
         return wanted or self.generator.prior.needs_sim_rgb
 
 
-def sense(methods: Methods, episode: Episode, names: Sequence[str]) -> dict[str, np.ndarray]:
+def sense(methods: Methods, episode: Episode, names: Sequence[str]) -> Maps:
     """Domain -> (T, H, W) uint16 millimetres, of those `names` that belong to the episode's side."""
     made: dict[str, np.ndarray] = {}
     for name in names:
@@ -75,7 +79,7 @@ def sense(methods: Methods, episode: Episode, names: Sequence[str]) -> dict[str,
     return {name: made[name] for name in names if name in made}
 
 
-def sense_repeats(methods: Methods, episode: Episode, names: Sequence[str]) -> dict[str, np.ndarray]:
+def sense_repeats(methods: Methods, episode: Episode, names: Sequence[str]) -> Maps:
     """The same for the episode's first scene, sensed again and again; {} if it was not."""
     if not len(episode.repeats_mm):
         return {}
@@ -92,15 +96,15 @@ class Domain:
 
     title: str
     side: str
-    make: Callable[[Methods, Episode], dict[str, np.ndarray]]
+    make: Callable[[Methods, Episode], Maps]
 
 
-def _graft_limit(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
+def _graft_limit(methods: Methods, episode: Episode) -> Maps:
     del methods
     return {LIMIT: np.where(episode.sensed_mm > 0, episode.clean_mm, 0)}
 
 
-def _rand_noise(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
+def _rand_noise(methods: Methods, episode: Episode) -> Maps:
     """DextrAH-G's published noise."""
     import jax
 
@@ -120,7 +124,7 @@ def _dextrah(profile: contract.CameraProfile) -> Callable[..., Any]:
     return jax.jit(dextrah(DextrahConfig(), profile))
 
 
-def inpainted(depth_mm: np.ndarray, radius_px: float) -> np.ndarray:
+def inpainted(depth_mm: UInt16[np.ndarray, "T H W"], radius_px: float) -> UInt16[np.ndarray, "T H W"]:
     """(T, H, W) with every hole filled by OpenCV (Telea 2004); the paper names OpenCV and no method."""
     filled = [
         cv2.inpaint(frame, (frame == 0).astype(np.uint8), radius_px, cv2.INPAINT_TELEA) for frame in depth_mm
@@ -128,8 +132,8 @@ def inpainted(depth_mm: np.ndarray, radius_px: float) -> np.ndarray:
     return np.stack(filled)
 
 
-def _monocular(name: str) -> Callable[[Methods, Episode], dict[str, np.ndarray]]:
-    def make(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
+def _monocular(name: str) -> Callable[[Methods, Episode], Maps]:
+    def make(methods: Methods, episode: Episode) -> Maps:
         """Relative depth from colour, made metric by the depth of its own side."""
         from ddg_jax.network_prior import metric_depth
 
@@ -143,7 +147,7 @@ def _monocular(name: str) -> Callable[[Methods, Episode], dict[str, np.ndarray]]
     return make
 
 
-def _generated(methods: Methods, episode: Episode) -> dict[str, np.ndarray]:
+def _generated(methods: Methods, episode: Episode) -> Maps:
     import jax
 
     from ddg_jax.sample import generate

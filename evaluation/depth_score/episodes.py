@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt16
 
 from ddgrasp.depth import to_metres
 from ddgrasp.errors import UserError
@@ -34,7 +35,7 @@ class Scored:
     features: dict[str, dict[str, Sample]] = field(default_factory=dict)
     sums: dict[str, list[holes.Sums]] = field(default_factory=dict)
     groups: dict[str, list[int]] = field(default_factory=dict)
-    examples: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    examples: dict[str, list[UInt16[np.ndarray, "H W"]]] = field(default_factory=dict)
 
 
 def score_episodes(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Float32, UInt8
 
 from ddgrasp.config import SCORE_FEATURES
 from ddgrasp.errors import unknown_name
@@ -21,9 +22,10 @@ class FeatureExtractor:
     name: str
     source: Any
     """Which weights: goes into reports."""
-    function: Callable[[np.ndarray], np.ndarray]
+    function: Callable[[Float[np.ndarray, "N H W"]], Float32[np.ndarray, "N d"]]
 
-    def __call__(self, depth_m: np.ndarray) -> np.ndarray:
+    def __call__(self, depth_m: Float[np.ndarray, "N H W"]) -> Float32[np.ndarray, "N d"]:
+        """(N, H, W) metres, 0 = invalid -> (N, d)."""
         return self.function(depth_m)
 
 
@@ -41,7 +43,7 @@ def load(name: str, weights_dir: Path = Path("weights")) -> FeatureExtractor:
     return FeatureExtractor(name, network.source, lambda depth_m: network(as_pictures(depth_m)))
 
 
-def as_pictures(depth_m: np.ndarray) -> np.ndarray:
+def as_pictures(depth_m: Float[np.ndarray, "N H W"]) -> UInt8[np.ndarray, "N H W 3"]:
     """(N, H, W) metres -> (N, H, W, 3) uint8 grey: inverse depth, holes black, on one fixed scale."""
     inverse = np.divide(1, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)
     level = (inverse - 1 / FAR_M) / (1 / NEAR_M - 1 / FAR_M)

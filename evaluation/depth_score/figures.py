@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from evaluation.depth_score import holes
@@ -70,7 +71,9 @@ def _places(name: str, count: int) -> np.ndarray:
     return np.where(np.isfinite(edges[1:]), (edges[:-1] + edges[1:]) / 2, edges[:-1])
 
 
-def draw_embedding(flat: Mapping[str, np.ndarray], table: Mapping[str, Any], floor: float) -> bytes:
+def draw_embedding(
+    flat: Mapping[str, Float[np.ndarray, "_ 2"]], table: Mapping[str, Any], floor: float
+) -> bytes:
     """PNG: the t-SNE, one panel per column: recorded depth in blue, the method's in orange (the paper's t-SNE
     figure, with its letters).
 

@@ -9,7 +9,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Float32, Real
 
+from ddgrasp.arrays import AnyArray
 from foundation.depth_feature_data import depth_edges
 from sensors.statistics import stats
 
@@ -25,13 +27,15 @@ SIZE_EDGES_PX = (*(2**b for b in range(17)), np.inf)
 OUTLIER_M = 0.05
 """A valid pixel farther than this from the clean depth is an outlier."""
 
-Sums = dict[str, np.ndarray]
+Sums = dict[str, Real[AnyArray, "..."]]
+"""Numbers (NumPy scalars once added up), and counts per bin."""
+Depth = Float[np.ndarray, "H W"]
 
 
 # --- geometry ------------------------------------------------------------------------------------
 
 
-def geometry(clean_m: np.ndarray, focal_px: float) -> dict[str, np.ndarray]:
+def geometry(clean_m: Depth, focal_px: float) -> dict[str, Depth]:
     """The quantities of BINS per pixel of (H, W) clean depth in metres."""
     return {
         "depth_m": clean_m,
@@ -40,7 +44,7 @@ def geometry(clean_m: np.ndarray, focal_px: float) -> dict[str, np.ndarray]:
     }
 
 
-def edge_distance_px(clean_m: np.ndarray) -> np.ndarray:
+def edge_distance_px(clean_m: Depth) -> Float32[np.ndarray, "H W"]:
     """(H, W) pixels to the nearest depth edge; 0 on one, the diagonal where there is none."""
     edges = depth_edges(clean_m)
     if not edges.any():
@@ -48,7 +52,7 @@ def edge_distance_px(clean_m: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform((~edges).astype(np.uint8), cv2.DIST_L2, 5)
 
 
-def incidence_deg(clean_m: np.ndarray, focal_px: float) -> np.ndarray:
+def incidence_deg(clean_m: Depth, focal_px: float) -> Depth:
     """(H, W) degrees between the line of sight and the surface normal, from the depth of neighbours.
 
     The principal point is the picture's centre.
@@ -67,7 +71,11 @@ def incidence_deg(clean_m: np.ndarray, focal_px: float) -> np.ndarray:
 # --- sums over an episode --------------------------------------------------------------------------
 
 
-def episode_sums(depth_m: np.ndarray, clean_m: np.ndarray, places: Sequence[Mapping[str, Any]]) -> Sums:
+def episode_sums(
+    depth_m: Float[np.ndarray, "T H W"],
+    clean_m: Float[np.ndarray, "T H W"],
+    places: Sequence[Mapping[str, Any]],
+) -> Sums:
     """Hole sums of maps (T, H, W) in time order over the clean geometry they show.
 
     `places` is the `geometry` of each frame. Counts are taken where the clean geometry has a surface.
@@ -92,7 +100,7 @@ def episode_sums(depth_m: np.ndarray, clean_m: np.ndarray, places: Sequence[Mapp
     return sums
 
 
-def repeat_sums(depth_m: np.ndarray) -> Sums:
+def repeat_sums(depth_m: Float[np.ndarray, "K H W"]) -> Sums:
     """Hole sums of one motionless scene sensed again and again, (K, H, W) metres."""
     holes = depth_m <= 0
     overlaps = [
@@ -139,7 +147,7 @@ def figures(total: Sums) -> dict[str, float]:
     }
 
 
-def curves(total: Sums) -> dict[str, np.ndarray]:
+def curves(total: Sums) -> dict[str, Float[np.ndarray, " _"]]:
     """Hole rate per bin of BINS (nan where no pixel fell), and hole regions per frame by size."""
     with np.errstate(invalid="ignore", divide="ignore"):
         rates = {name: total[f"{name}_holes"] / total[f"{name}_pixels"] for name in BINS}

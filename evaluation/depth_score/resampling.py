@@ -4,24 +4,30 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 
 LEVEL = 0.95
+Drawn = Sequence[tuple[Int[np.ndarray, " _"], Int[np.ndarray, " _"]]]
+"""Groups of real and of simulated maps, per draw."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Features (N, d) of one domain and the group (N,) each map belongs to."""
+    """Features of one domain's maps."""
 
-    features: np.ndarray
-    groups: np.ndarray
+    features: Float[np.ndarray, "N d"]
+    groups: Int[np.ndarray, " N"]
+    """What each map belongs to."""
 
-    def rows(self, drawn: np.ndarray) -> np.ndarray:
+    def rows(self, drawn: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " rows"]:
         """Row numbers of the drawn groups, one after the other, as often as they were drawn."""
         members = {group: np.flatnonzero(self.groups == group) for group in np.unique(drawn)}
         return np.concatenate([members[group] for group in drawn])
 
 
-def draws(groups: np.ndarray, count: int, rng: np.random.Generator) -> list[np.ndarray]:
+def draws(
+    groups: Int[np.ndarray, " N"], count: int, rng: np.random.Generator
+) -> list[Int[np.ndarray, " groups"]]:
     """`count` times as many groups as there are, with replacement."""
     names = np.unique(groups)
     return [rng.choice(names, len(names)) for _ in range(count)]
@@ -50,7 +56,7 @@ def intervals(
 
 
 def bootstrap_pairs(
-    real: Sample, sim: Sample, drawn: Sequence[tuple[np.ndarray, np.ndarray]],
+    real: Sample, sim: Sample, drawn: Drawn,
     statistic: Callable[[np.ndarray, np.ndarray], float],
 ) -> list[float]:  # fmt: skip
     """statistic(real rows, sim rows) for every (real groups, sim groups) drawn."""

@@ -27,7 +27,7 @@ from evaluation.depth_score.domains import FLOOR, RAW, REFERENCES, Methods
 from evaluation.depth_score.episodes import Load, Scored, collect, score_episodes
 
 if TYPE_CHECKING:
-    from ddg_jax.sample import Generator
+    import ddg_jax.sample
 
 JSON = "samplers.json"
 REFERENCE = ("ddim", 50)
@@ -70,7 +70,7 @@ def run(job: Job) -> Artifact:
     return job.finish({"samplers": table(rows, floor), "targets": [_target(rows)]})
 
 
-def _generators(directory: Path) -> Iterator[tuple[str, "Generator"]]:
+def _generators(directory: Path) -> Iterator[tuple[str, "ddg_jax.sample.Generator"]]:
     """Name -> the fitted generator with that sampler; distilled ones as far as they were made."""
     from ddg_jax.sample import Generator
 
@@ -90,7 +90,7 @@ def _row(figures: dict[str, Any], scored: Scored, domain: str) -> dict[str, Any]
     return {**plain, "holes": holes.figures(holes.added(scored.sums[domain]))}
 
 
-def _frames_per_s(generator: "Generator", loads: Sequence[Load]) -> float:
+def _frames_per_s(generator: "ddg_jax.sample.Generator", loads: Sequence[Load]) -> float:
     """Speed of `ddg_jax.sample.generate` on TIMED_FRAMES frames, compiled before."""
     import jax
 

@@ -1,21 +1,20 @@
 """How well two sets of features can be told apart: distances, a classifier's AUC, mixing of neighbours."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ddgrasp.config import ScoreConfig
 from evaluation.depth_score import distances
-from evaluation.depth_score.resampling import Sample, bootstrap_pairs, interval
+from evaluation.depth_score.resampling import Drawn, Sample, bootstrap_pairs, interval
 
 FOLDS = 5
 KID_SCALE = 100.0
 """KID is printed times 100, as in the paper."""
 AUC_MAPS = 4000
 """Largest number of maps a classifier is trained on."""
-
-Drawn = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
 def compare(real: Sample, sim: Sample, config: ScoreConfig, drawn: Drawn) -> dict[str, Any]:
@@ -142,7 +141,7 @@ def neighbour_mixing(real: Sample, sim: Sample, neighbours: int, drawn: Drawn) -
 # --- embedding ---------------------------------------------------------------------------------------
 
 
-def embed(features: Mapping[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
+def embed(features: Mapping[str, Float[np.ndarray, "_ d"]], seed: int) -> dict[str, Float[np.ndarray, "_ 2"]]:
     """(n, 2) t-SNE coordinates of every domain, all embedded together (van der Maaten & Hinton 2008).
 
     Features are reduced to their 50 strongest principal components first, as is customary.

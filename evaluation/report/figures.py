@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
+from jaxtyping import Float, Float32, Real
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -20,13 +21,13 @@ MAX_FRAMES = 8
 """Most frames in one film strip."""
 
 
-def depth_to_metres(depth: np.ndarray) -> np.ndarray:
+def depth_to_metres(depth: Real[np.ndarray, "*any"]) -> Float32[np.ndarray, "*any"]:
     """Depth as float32 metres, 0 = invalid; integer input is millimetres, float input metres."""
     metres = to_metres(depth) if np.issubdtype(depth.dtype, np.integer) else depth
     return np.where(np.isfinite(metres), metres, 0.0).astype(np.float32)
 
 
-def depth_range_m(depths: Sequence[np.ndarray]) -> tuple[float, float]:
+def depth_range_m(depths: Sequence[Float[np.ndarray, "..."]]) -> tuple[float, float]:
     """(near, far) that shows most valid pixels of all `depths` (metres): 1st and 99th percentile."""
     valid = np.concatenate([depth[depth > 0].ravel() for depth in depths]) if depths else np.empty(0)
     if valid.size == 0:
@@ -35,7 +36,9 @@ def depth_range_m(depths: Sequence[np.ndarray]) -> tuple[float, float]:
     return float(near), float(max(far, near + 0.01))
 
 
-def color_depth(depth_m: np.ndarray, near_m: float, far_m: float) -> np.ndarray:
+def color_depth(
+    depth_m: Float[np.ndarray, "*b H W"], near_m: float, far_m: float
+) -> Float[np.ndarray, "*b H W 3"]:
     """(..., H, W) metres to (..., H, W, 3) RGB in [0, 1]; invalid pixels take INVALID_RGB."""
     scaled = np.clip((depth_m - near_m) / (far_m - near_m), 0.0, 1.0)
     rgb = matplotlib.colormaps[DEPTH_COLORS](scaled)[..., :3]
@@ -43,7 +46,7 @@ def color_depth(depth_m: np.ndarray, near_m: float, far_m: float) -> np.ndarray:
     return rgb
 
 
-def draw_panels(panels: Mapping[str, np.ndarray]) -> bytes:
+def draw_panels(panels: Mapping[str, Real[np.ndarray, "..."]]) -> bytes:
     """PNG of images side by side, all depth on one scale; see `Progress.picture` for what a panel may be."""
     frames = {title: _as_frames(panel) for title, panel in panels.items()}
     depths = [depth_to_metres(frame) for frame in frames.values() if frame.ndim == 3]
@@ -63,7 +66,7 @@ def draw_panels(panels: Mapping[str, np.ndarray]) -> bytes:
     return to_png(figure)
 
 
-def draw_sheet(rows: Mapping[str, Sequence[np.ndarray]], titles: Sequence[str]) -> bytes:
+def draw_sheet(rows: Mapping[str, Sequence[Real[np.ndarray, "_ _ 3"]]], titles: Sequence[str]) -> bytes:
     """PNG of colour pictures (H, W, 3), uint8 or in [0, 1], one named row each; `titles` of the columns."""
     return to_png(_grid([list(_to_rgb(np.stack(row))) for row in rows.values()], list(titles), list(rows)))
 
