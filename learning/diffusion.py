@@ -33,7 +33,7 @@ PREDICTED, CONSISTENT = "predicted", "consistent"
 
 
 class Schedule(NamedTuple):
-    """Of K steps; NumPy, so that they are constants of jitted functions."""
+    """A noise schedule of K steps; NumPy, so that its numbers are constants of jitted functions."""
 
     betas: Float32[np.ndarray, " K"]
     alpha_bars: Float32[np.ndarray, " K"]

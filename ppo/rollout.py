@@ -25,7 +25,7 @@ class Rollout:
     """N episodes of T control steps, NumPy."""
 
     params: ModelParams
-    """Of each environment, (N, ...)."""
+    """Parameters of each environment, (N, ...)."""
     object_index: np.ndarray
     """(N,)"""
     success: np.ndarray

@@ -26,7 +26,7 @@ class Trials:
     """N episodes of T control steps, NumPy. A state is the one at the beginning of a step."""
 
     params: ModelParams
-    """Of each environment, (N, ...)."""
+    """Parameters of each environment, (N, ...)."""
     qpos: Float[np.ndarray, "T N 16"]
     touched: Bool[np.ndarray, "T N"]
     """Whether a finger pad touches the object or has touched it."""
@@ -34,7 +34,7 @@ class Trials:
     """Whether the episode was still going on."""
     action: Float[np.ndarray, "T N 8"]
     velocity_rad_s: Float[np.ndarray, "T N 7"]
-    """Of the joints at the end of each step."""
+    """Velocities of the joints at the end of each step."""
     success: Bool[np.ndarray, " N"]
 
 

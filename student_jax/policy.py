@@ -38,7 +38,7 @@ AUX_BESIDE = Layout(position=3, yaw=2, held=1, beside=3, near=1)
 BESIDE_SCALE = 0.25
 """Network units per unit of that offset: 5 cm."""
 TERMINAL_TIME = 0.98
-"""Of the action diffusion's schedule, see `learning.diffusion.cosine_betas`."""
+"""End of the action diffusion's schedule, see `learning.diffusion.cosine_betas`."""
 HEAD_PARAMS = ("state_stream", "denoiser")
 """The parameters that act; all others see."""
 PARAMS_FILE = "params.msgpack"

@@ -63,7 +63,7 @@ class _HostBatch:
     def step(
         self, params: ModelParams, state: PhysicsState, ctrl: Float[np.ndarray, "n 9"], substeps: int
     ) -> PhysicsState:
-        """Of all n environments: everything has n rows."""
+        """One control step of all n environments: everything has n rows."""
         self._write_params(params)
         self._qpos[:], self._qvel[:] = state.qpos, state.qvel
         self._warmstart[:], self._ctrl[:] = state.warmstart, ctrl
