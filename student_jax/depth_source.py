@@ -19,8 +19,8 @@ from ddg_jax.generate import Clip, noisy_episodes
 from ddg_jax.prior import Prior
 from ddg_jax.sample import Generator, generate
 from ddg_jax.sensor import BY_COLOUR, make_sensor
-from ddgrasp import contract
 from ddgrasp.config import Config, SensorConfig
+from ddgrasp.depth import to_metres, to_millimetres
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
 from sensors.models.sense import Sense
@@ -96,8 +96,8 @@ class GeneratorSource:
     ) -> UInt16[np.ndarray, "B H W"]:
         """See `DepthSource`."""
         rgb = rgb if self.needs_rgb else None
-        noisy = generate(self.key, self.generator, _metres(depth_mm), rgb, episode=episode, frame=frame)
-        return _millimetres(noisy.depth_m)
+        noisy = generate(self.key, self.generator, to_metres(depth_mm), rgb, episode=episode, frame=frame)
+        return to_millimetres(noisy.depth_m)
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class SenseSource:
         for start in range(0, len(depth_mm), _BATCH):
             now = slice(start, start + _BATCH)
             batch = (
-                _metres(depth_mm[now]),
+                to_metres(depth_mm[now]),
                 None if colour is None else colour[now],
                 episode[now],
                 frame[now],
@@ -138,7 +138,7 @@ class SenseSource:
             count = len(batch[0])
             sensed = _sensed(self.sense, self.key, *jax.tree.map(_filled_up, batch))
             parts.append(np.asarray(sensed)[:count])
-        return _millimetres(np.concatenate(parts))
+        return to_millimetres(np.concatenate(parts))
 
 
 def make_source(config: Config, ddg: Path) -> DepthSource:
@@ -184,12 +184,3 @@ def _sensed(sense: Sense, key, depth_m, rgb, episode, frame):
 def _filled_up(values: np.ndarray) -> np.ndarray:
     """`values` (n <= _BATCH, ...) with zeros behind them."""
     return np.concatenate([values, np.zeros((_BATCH - len(values), *values.shape[1:]), values.dtype)])
-
-
-def _metres(depth_mm: np.ndarray) -> np.ndarray:
-    return depth_mm.astype(np.float32) * np.float32(contract.DEPTH_UNIT_M)
-
-
-def _millimetres(depth_m: np.ndarray) -> np.ndarray:
-    counts = np.minimum(depth_m / contract.DEPTH_UNIT_M, np.iinfo(np.uint16).max)
-    return np.round(counts).astype(np.uint16)
