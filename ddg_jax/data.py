@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from jaxtyping import Float, Float16, Float32, Int
+from jaxtyping import Bool, Float, Float16, Float32, Int
 
 from ddg_jax.inverse_depth import invert
 from ddg_jax.piecewise import piecewise_smooth
@@ -44,7 +44,7 @@ class Frames:
     def __len__(self) -> int:
         return len(self.depth_m)
 
-    def part(self, chosen: slice | Int[np.ndarray, " n"]) -> "Frames":
+    def part(self, chosen: slice | Int[np.ndarray, " n"] | Bool[np.ndarray, " N"]) -> "Frames":
         """The chosen frames."""
         return replace(
             self,

@@ -1,6 +1,7 @@
 """The ONNX file computes what JAX computes, for every option, unit, batch size and kind of bad pixel."""
 
 from dataclasses import replace
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from ddgrasp.config import (
     PictureConfig,
     StudentConfig,
 )
+from ddgrasp.config.student import Conditioning
 from ddgrasp.errors import UserError
 from export import graph, parity
 from learning.diffusion import q_sample
@@ -59,6 +61,11 @@ OPTIONS = {
         ),
         ExportConfig(depth_dtype="uint16_mm"),
     ),
+    **{
+        f"conditioning {name}": (replace(SMALL, head=replace(SMALL.head, conditioning=name)), ExportConfig())
+        for name in get_args(Conditioning)
+        if name not in ("film", "concat")  # above
+    },
 }
 
 
