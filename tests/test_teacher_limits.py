@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 import pytest
 
 from config_support import unchecked
 from ddgrasp.config import Config, EvalConfig, RewardConfig, TeacherConfig, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from learning.checkpoints import Checkpoints
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import health, memory, stage
 from ppo import train as ppo_train
@@ -33,8 +33,8 @@ def compiles_quickly():
     jax.config.update("jax_disable_most_optimizations", False)
 
 
-def _checkpoints(directory) -> ocp.CheckpointManager:
-    return ocp.CheckpointManager((directory / ppo_train.CHECKPOINTS).absolute())
+def _checkpoints(directory) -> Checkpoints:
+    return Checkpoints(directory / ppo_train.CHECKPOINTS)
 
 
 def test_an_absurd_learning_rate_stops_before_the_broken_state_is_saved(tmp_path):
@@ -49,7 +49,7 @@ def test_an_absurd_learning_rate_stops_before_the_broken_state_is_saved(tmp_path
     assert "lower teacher.learning_rate" in message
     env = AutoReset(GraspEnv(ppo_train.training_world(config)))
     with _checkpoints(tmp_path) as manager:
-        assert manager.latest_step() == 2
+        assert manager.latest == 2
         kept = ppo_train.restore(config, env, manager)
     for leaf in jax.tree.leaves(kept):
         assert np.all(np.isfinite(np.asarray(leaf)))
@@ -63,7 +63,7 @@ def test_a_reward_beyond_all_numbers_is_named_and_nothing_is_saved(tmp_path):
         ppo_train.train(dataclasses.replace(CONFIG, world=world), tmp_path, Progress(quiet=True))
     assert "lower the weight of that term under world.reward" in str(error.value)
     with _checkpoints(tmp_path) as manager:
-        assert manager.latest_step() is None
+        assert manager.latest is None
 
 
 def test_the_cause_is_named_before_what_it_spoils():
