@@ -47,9 +47,10 @@ def network_size(height: int, width: int, input_size: int = INPUT_SIZE, *, video
 
 
 def standardise(
-    rgb: UInt8[AnyArray, "B H W 3"], size: tuple[int, int] | None = None
-) -> Float32[jax.Array, "B rows columns 3"]:
-    """(B, H, W, 3) uint8 -> float32 of ImageNet's mean 0 and deviation 1, resized bicubically to `size`."""
+    rgb: UInt8[AnyArray, "*batch H W 3"], size: tuple[int, int] | None = None
+) -> Float32[jax.Array, "*batch rows columns 3"]:
+    """(..., H, W, 3) uint8 -> float32 of ImageNet's mean 0 and deviation 1, resized bicubically to `size`
+    (which takes pictures with one leading axis alone)."""
     x = jnp.asarray(rgb, jnp.float32) / 255
     if size is not None:
         with jax.default_matmul_precision("highest"):
