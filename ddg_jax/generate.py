@@ -23,7 +23,6 @@ from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from demos.store import EpisodeStore
 
-STAGE = "noisy"
 STORE = "depth.zarr"
 """`data/depth_mm` with artefacts; episodes and steps of the demo store."""
 
