@@ -78,7 +78,7 @@ CPU = Sizes(
     scenes=2,
     teacher={
         "total_steps": 64, "num_envs": 8, "unroll_steps": 4, "minibatches": 2, "epochs": 1, "eval_every": 1,
-        "clone_rounds": 0, "critic_warmup": 0, "hidden": (8,),
+        "start": "nothing", "critic_warmup": 0, "hidden": (8,),
     },
     slack=5.0,
 )  # fmt: skip

@@ -170,9 +170,9 @@ def config_hash(config: Config, stage: str) -> str:
     return _hash(_relevant(to_json(config), stage))
 
 
-def config_hash_of_version_1(config: Config, stage: str) -> str:
-    """`config_hash` as it was before version 2: recorded by what was begun then."""
-    return _hash(_relevant(upgrades.as_version_1(to_json(config)), stage))
+def config_hash_of_version(version: int, config: Config, stage: str) -> str:
+    """`config_hash` as an earlier version of the fields had it: recorded by what was begun then."""
+    return _hash(_relevant(upgrades.downgraded(to_json(config), version), stage))
 
 
 def check_config(artifact: Artifact, config: Config) -> None:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from ddgrasp.config import (
+    PAPER_REWARD,
     Config,
     DaggerConfig,
     DDGConfig,
@@ -44,7 +45,7 @@ _PAPER_DDG = DDGConfig(
 DEBUG = Config(
     preset="debug",
     teacher=TeacherConfig(
-        init_from="pretrained/teacher",
+        start="pretrained/teacher",
         total_steps=160,
         num_envs=8,
         unroll_steps=10,
@@ -120,6 +121,32 @@ LAPTOP = Config(
 """Everything trained from nothing on two cores (73 minutes of stage time on two AMD EPYC cores
 that two to four other jobs shared, 2026-11-21)."""
 
+_FROM_NOTHING = TeacherConfig(
+    start="nothing",
+    total_steps=5_000_000,
+    num_envs=1024,
+    minibatches=16,
+    learning_rate=3e-4,
+    target_kl=0.02,
+    critic_learning_rate=1e-3,
+    action_std=0.3,
+    gripper_std=0.5,
+    min_std=0.2,
+    entropy_cost=2e-3,
+    hidden=(256, 256, 128),
+    pregrasp_share=0.5,
+    critic_warmup=0,
+    eval_every=12,
+    checkpoint_every=24,
+    stop_at=0.99,
+)
+
+PPO = replace(LAPTOP, preset="ppo", teacher=_FROM_NOTHING)
+"""`laptop` with a teacher by PPO alone (docs/teacher.md)."""
+
+PPO_PAPER = replace(PPO, preset="ppo_paper", world=replace(PPO.world, reward=PAPER_REWARD))
+"""`ppo` on the paper's reward."""
+
 CAMERA = replace(
     LAPTOP,
     preset="camera",
@@ -139,7 +166,7 @@ CAMERA = replace(
 PAPER = Config(
     preset="paper",
     world=WorldConfig(backend="jax", camera_scale=0.5),
-    teacher=TeacherConfig(total_steps=100_000_000, num_envs=8192, minibatches=32),
+    teacher=replace(_FROM_NOTHING, total_steps=100_000_000, num_envs=8192, minibatches=32),
     demos=DemosConfig(episodes=1200, parallel=256),
     record=RecordConfig(trajectories=80),
     ddg=_PAPER_DDG,
@@ -158,7 +185,7 @@ PAPER = Config(
 """The paper's sizes, for one GPU. Not run yet. The paper's picture is the crop window, 225 x 290 pixels at
 this scale. The encoder needs multiples of 4: 224 x 288 trims a row and two columns and resamples nothing."""
 
-PRESETS = {config.preset: config for config in (DEBUG, DEMO, LAPTOP, CAMERA, PAPER)}
+PRESETS = {config.preset: config for config in (DEBUG, DEMO, LAPTOP, PPO, PPO_PAPER, CAMERA, PAPER)}
 
 
 def get_preset(name: str) -> Config:

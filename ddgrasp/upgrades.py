@@ -5,11 +5,12 @@ version of its fields. Whoever changes a field raises VERSION and adds what move
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 2
-"""Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number."""
+VERSION = 3
+"""Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
+that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing."""
 
 VERSION_FIELD = "manifest_version"
 
@@ -82,6 +83,19 @@ _ADDED_AFTER_1 = {"student.depth_source": "learned"}
 """Fields that version 1 lacked, with what it did."""
 
 
+_ADDED_AFTER_2 = {
+    "world.reward.distance": "funnel",
+    "world.reward.grasp_switch": "touch",
+    "teacher.target_kl": 0.0,
+    "teacher.gripper_std": 0.15,
+    "teacher.min_std": 0.01,
+}
+"""Fields that version 2 lacked, with what it did."""
+
+_CLONE_ROUNDS = 8
+"""What stands in a configuration that does not clone: version 2 wrote 0."""
+
+
 def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     """The JSON of a configuration of an earlier version with the fields of this one.
 
@@ -89,33 +103,65 @@ def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     """
     made = copy.deepcopy(dict(config))
     if version < 2:
-        for name in _DROPPED_AFTER_1:
-            section, field = _section_of(made, name)
-            section.pop(field, None)
-        for name, value in _ADDED_AFTER_1.items():
-            section, field = _section_of(made, name)
-            section.setdefault(field, value)
+        _drop(made, _DROPPED_AFTER_1)
+        _add(made, _ADDED_AFTER_1)
         for section, groups in _GROUPS_OF_2.items():
             if section in made:
                 made[section] = _grouped(made[section], groups)
         _trim_picture(made.get("student", {}).get("picture", {}))
+    if version < 3:
+        _add(made, _ADDED_AFTER_2)
+        if "teacher" in made:
+            _name_start(made["teacher"])
     return made
 
 
-def as_version_1(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The JSON of a configuration of this version with the fields of version 1: what its hashes were over."""
+def downgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
+    """The JSON of a configuration of this version with the fields of an earlier one: what its hashes were
+    over. Values of fields that it lacked are lost."""
     made = copy.deepcopy(dict(config))
+    if version < 3:
+        _drop(made, _ADDED_AFTER_2)
+        teacher = made["teacher"]
+        start = teacher.pop("start")
+        teacher["init_from"] = "" if start in ("nothing", "guide") else start
+        if start == "nothing":
+            teacher["clone_rounds"] = 0
+    if version < 2:
+        _flatten(made)
+    return made
+
+
+def _name_start(teacher: dict[str, Any]) -> None:
+    """Version 2 said by two fields what a policy starts from."""
+    source, rounds = teacher.pop("init_from", ""), teacher.get("clone_rounds", _CLONE_ROUNDS)
+    teacher["start"] = source or ("guide" if rounds else "nothing")
+    if not rounds:
+        teacher["clone_rounds"] = _CLONE_ROUNDS
+
+
+def _add(config: dict[str, Any], added: Mapping[str, Any]) -> None:
+    for name, value in added.items():
+        section, field = _section_of(config, name)
+        section.setdefault(field, value)
+
+
+def _drop(config: dict[str, Any], names: Iterable[str]) -> None:
+    for name in names:
+        section, field = _section_of(config, name)
+        section.pop(field, None)
+
+
+def _flatten(made: dict[str, Any]) -> None:
+    """Fields of version 2 as version 1 had them."""
     for name, value in _DROPPED_AFTER_1.items():
         section, field = _section_of(made, name)
         section[field] = value
-    for name in _ADDED_AFTER_1:
-        section, field = _section_of(made, name)
-        section.pop(field, None)
+    _drop(made, _ADDED_AFTER_1)
     for section, groups in _GROUPS_OF_2.items():
         taken = {group: made[section].pop(group) for group in groups}
         for group, fields in groups.items():
             made[section] |= {old: taken[group][new] for new, old in fields.items()}
-    return made
 
 
 def _grouped(flat: Mapping[str, Any], groups: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:

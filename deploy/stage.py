@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts, contract
+from ddgrasp import artifacts, contract, upgrades
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
@@ -29,8 +29,11 @@ def run(job: Job) -> Artifact:
     config, directory, progress = job.config, job.directory, job.progress
     policy_path = job.parents["export"].directory / POLICY_FILE
     header = _header(config, policy_path)
-    earlier = header | {"config_hash": artifacts.config_hash_of_version_1(config, STAGE)}
-    log = TrialLog(directory / TRIALS_FILE, header, [earlier])
+    earlier = [
+        header | {"config_hash": artifacts.config_hash_of_version(version, config, STAGE)}
+        for version in range(1, upgrades.VERSION)
+    ]
+    log = TrialLog(directory / TRIALS_FILE, header, earlier)
     trials = plan(config)
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(log.results))

@@ -61,6 +61,8 @@ class Episode:
     """() consecutive steps with the object at the target."""
     grasped: jax.Array
     """() bool."""
+    total_reward: jax.Array
+    """() sum over the steps so far."""
     latency: Latency | None = None
     """None unless configured."""
 
@@ -99,11 +101,12 @@ class GraspEnv(mjx_env.MjxEnv):
             steps=jnp.zeros((), jnp.int32),
             hold_count=jnp.zeros((), jnp.int32),
             grasped=jnp.zeros((), bool),
+            total_reward=jnp.zeros(()),
             latency=self._latency(rng, qpos),
         )
         obs = self._get_obs(state, episode)
         metrics = {f"reward/{name}": jnp.zeros(()) for name in rewards.TERMS}
-        metrics |= {"success": jnp.zeros(()), "saturated": jnp.zeros(())}
+        metrics |= {name: jnp.zeros(()) for name in ("success", "saturated", "return", "length")}
         info = {"episode": episode, "rng": k_next, "truncation": jnp.zeros(())}
         return mjx_env.State(state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
 
@@ -124,7 +127,9 @@ class GraspEnv(mjx_env.MjxEnv):
 
         distances = self._distances(new.qpos, episode.variant, episode.branch)
         object_pos = new.qpos[QPOS.object_pos]
-        grasped = jnp.all(new.touch > TOUCH_N) & closes(action)
+        touching, closing = jnp.all(new.touch > TOUCH_N), closes(action)
+        grasped = touching & closing
+        rewarded = rewards.grasped(self.config.reward, touching, closing, distances.grip_to_object)
         held = jnp.linalg.norm(object_pos - jnp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
         hold_count = jnp.where(held & grasped, episode.hold_count + 1, 0)
         terms = rewards.terms(
@@ -132,10 +137,11 @@ class GraspEnv(mjx_env.MjxEnv):
             rewards.Transition(
                 before=episode.distances, after=distances, action=action, last_action=episode.action,
                 acceleration=(new.qvel[QVEL.arm] - old.qvel[QVEL.arm]) / contract.CONTROL_DT_S,
-                grasped=grasped, lifted=grasped & (object_pos[2] > episode.rest_height + LIFTED_M),
+                grasped=rewarded, lifted=rewarded & (object_pos[2] > episode.rest_height + LIFTED_M),
                 hold_count=hold_count,
             ),
         )  # fmt: skip
+        reward = jnp.sum(jnp.stack(list(terms.values())))
         steps = episode.steps + 1
         center = jnp.asarray(contract.WORKSPACE_CENTER_M)
         lost = jnp.linalg.norm(object_pos[:2] - center) > OUT_OF_REACH_M
@@ -143,17 +149,18 @@ class GraspEnv(mjx_env.MjxEnv):
         over = steps >= self.config.episode_steps
         episode = replace(
             episode, distances=distances, action=action, steps=steps, hold_count=hold_count, grasped=grasped,
-            latency=latency,
+            total_reward=episode.total_reward + reward, latency=latency,
         )  # fmt: skip
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jnp.float32)
+        metrics |= {"return": episode.total_reward, "length": steps.astype(jnp.float32)}
         metrics["saturated"] = jnp.mean(jnp.abs(action[ACTION.arm]) > 0.95)
         info = state.info | {"episode": episode, "truncation": (over & ~lost).astype(jnp.float32)}
         return replace(
             state,
             data=new,
             obs=self._get_obs(new, episode),
-            reward=jnp.sum(jnp.stack(list(terms.values()))),
+            reward=reward,
             done=(over | lost).astype(jnp.float32),
             metrics=metrics,
             info=info,
@@ -168,7 +175,8 @@ class GraspEnv(mjx_env.MjxEnv):
 
     def _distances(self, qpos, variant, branch) -> rewards.Distances:
         grasp_pos, grasp_quat = self._grasp_pose(qpos, variant, branch)
-        return rewards.distances(qpos, grasp_pos, grasp_quat, kinematics.grip_pose(qpos[QPOS.arm], jnp))
+        grip_pose = kinematics.grip_pose(qpos[QPOS.arm], jnp)
+        return rewards.distances(self.config.reward, qpos, grasp_pos, grasp_quat, grip_pose)
 
     def _latency(self, rng, qpos) -> Latency | None:
         """At the start: the robot holds its pose, gripper open."""

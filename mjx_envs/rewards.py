@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ddgrasp import contract
 from ddgrasp.config import RewardConfig
@@ -16,6 +16,9 @@ FUNNEL_HEIGHT_M = 0.07
 FUNNEL_SLOPE = 0.7
 """Below 1, so that moving sideways towards the object always shortens the way."""
 FUNNEL_FREE_M = 0.01
+NEAR_M = 0.03
+"""Within this of the object's centre a closing gripper counts as a grasp, where `RewardConfig.grasp_switch`
+is near. The paper says "close proximity"; the pads are 2.1 cm wide."""
 MAX_DISTANCE_M = 0.5
 """Bounds what a knocked-away object costs. Bounding the change per step instead was exploited: away
 in one big step, back in small ones."""
@@ -26,7 +29,10 @@ class Distances:
     """How far from done; rewards are their decreases."""
 
     hand: jax.Array
-    """() m, grip site to the grasp, by way of a point above it (see `approach_distance`)."""
+    """() m, grip site to the grasp, by way of a point above it (see `approach_distance`), or to the object's
+    centre: as `RewardConfig.distance` says."""
+    grip_to_object: jax.Array
+    """() m, grip site to the object's centre."""
     object: jax.Array
     """() m, object to the lift target."""
     grasp_angle: jax.Array
@@ -46,11 +52,13 @@ class Transition:
     acceleration: jax.Array
     """(7,) rad/s^2 of the arm's joints, from velocities one control step apart."""
     grasped: jax.Array
+    """() bool, by `grasped`."""
     lifted: jax.Array
     hold_count: jax.Array
 
 
 def distances(
+    weights: RewardConfig,
     qpos: Float[Array, "16"],
     grasp_pos: Float[Array, "3"],
     grasp_quat: Float[Array, "4"],
@@ -58,8 +66,12 @@ def distances(
 ) -> Distances:
     """`Distances` in the configuration qpos (16,)."""
     grip_pos, grip_quat = grip_pose
+    grip_to_object = jnp.linalg.norm(grip_pos - qpos[QPOS.object_pos] + 1e-6)
+    funnel = weights.distance == "funnel"
+    hand = approach_distance(grip_pos, grasp_pos) if funnel else grip_to_object
     return Distances(
-        hand=jnp.minimum(approach_distance(grip_pos, grasp_pos), MAX_DISTANCE_M),
+        hand=jnp.minimum(hand, MAX_DISTANCE_M),
+        grip_to_object=grip_to_object,
         object=jnp.minimum(
             jnp.linalg.norm(qpos[QPOS.object_pos] - jnp.asarray(contract.LIFT_TARGET_M)), MAX_DISTANCE_M
         ),
@@ -78,6 +90,22 @@ def approach_distance(grip_pos: Float[Array, "3"], grasp_pos: Float[Array, "3"])
     above = jnp.minimum(FUNNEL_HEIGHT_M, FUNNEL_SLOPE * jnp.maximum(lateral - FUNNEL_FREE_M, 0.0))
     height = grip_pos[2] - (grasp_pos[2] + above)
     return lateral + jnp.abs(height)
+
+
+def grasped(
+    weights: RewardConfig,
+    touching: Bool[Array, ""],
+    closing: Bool[Array, ""],
+    grip_to_object: Float[Array, ""],
+) -> Bool[Array, ""]:
+    """() whether the reward takes the object for grasped, by `weights.grasp_switch`.
+
+    Args:
+      touching: both pads press on the object.
+      closing: the gripper's command.
+      grip_to_object: m.
+    """
+    return closing & (touching if weights.grasp_switch == "touch" else grip_to_object < NEAR_M)
 
 
 def terms(weights: RewardConfig, t: Transition) -> dict[str, Float[Array, ""]]:

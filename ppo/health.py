@@ -53,7 +53,7 @@ def check(iteration: int, watched: Mapping[str, jax.Array], saved: int | None, d
         )
     raise UserError(
         f"PPO diverged at iteration {iteration}: {first} is {wrong[first]}. {kept}. For a new run, {remedy}; "
-        f"--teacher.init-from {directory} starts it from the best policy so far."
+        f"--teacher.start {directory} starts it from the best policy so far."
     )
 
 

@@ -20,21 +20,26 @@ from brax.training import acting, distribution
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo.optimizer import adaptive_kl_learning_rate
 from flax import linen, struct
 from jax.sharding import Mesh
 
 from ddgrasp import contract
-from ddgrasp.config import TeacherConfig
+from ddgrasp.config import NOTHING, TeacherConfig
 from ddgrasp.errors import UserError
-from mjx_envs import devices
+from mjx_envs import devices, scene
 from mjx_envs.grasp_env import AutoReset
-from ppo import health
+from ppo import diagnostics, health
 
 # The pyright ignores below are for annotations of Brax and optax: Brax's dataclasses get their decorator
 # through `import flax`, which types do not follow; optax has no type for "any pytree".
 
 OBSERVATION_STD_MIN = 0.01
 """Bounds the normalised size of components that hardly ever move, such as an upright object's tilt."""
+
+STEERED_RATE_MIN = 1e-4
+"""Least step size that `target_kl` steers to: at 3e-5, which Brax's own 1e-5 allows, PPO from nothing stayed
+with the object in the hand and did not learn to lift it."""
 
 
 @struct.dataclass
@@ -75,8 +80,8 @@ def shardings(mesh: Mesh) -> LearnerState:
 def make_networks(config: TeacherConfig) -> ppo_networks.PPONetworks:
     """Brax's PPO networks: tanh-squashed normal policy and value MLPs on normalised observations.
 
-    `config.action_std` scales the exploration noise: at Brax's own 0.7 the hand jumps centimetres a
-    step and lets go of whatever it found.
+    `config.action_std` and `config.gripper_std` scale the exploration noise: at Brax's own 0.7 the hand jumps
+    centimetres a step and lets go of whatever it found.
     """
     networks = ppo_networks.make_ppo_networks(
         contract.OBSERVATION_SIZE,
@@ -86,11 +91,12 @@ def make_networks(config: TeacherConfig) -> ppo_networks.PPONetworks:
         value_hidden_layer_sizes=config.hidden,
         activation=linen.elu,
     )
-    scale = config.action_std / math.log(2.0)  # softplus(0) = log 2
+    std = np.array([config.action_std] * scene.N_ARM + [config.gripper_std])
+    scale = jnp.asarray(std / math.log(2.0), jnp.float32)  # softplus(0) = log 2
     noise = distribution.NormalTanhDistribution(
         contract.ACTION_SIZE,
-        min_std=0.01,
-        var_scale=scale,  # pyright: ignore[reportArgumentType]  # declared int, used as a factor
+        min_std=config.min_std,
+        var_scale=scale,  # pyright: ignore[reportArgumentType]  # declared int, used as a factor, of each component here
     )
     return networks.replace(parametric_action_distribution=noise)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -106,16 +112,20 @@ def iterations(config: TeacherConfig) -> int:
 
 
 def make_optimizer(config: TeacherConfig) -> optax.GradientTransformation:
-    """Adam with linearly decaying step size and clipped gradients, for actor and critic apart."""
+    """Adam with clipped gradients, for actor and critic apart; step sizes decay linearly, or the actor's is a
+    part of the state that `_steered` sets."""
     updates = iterations(config) * config.epochs * config.minibatches
 
-    def adam(rate: float) -> optax.GradientTransformation:
-        schedule = optax.linear_schedule(rate, 0.1 * rate, updates)
-        return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule))
+    def clipped(adam: optax.GradientTransformation) -> optax.GradientTransformation:
+        return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
 
+    def decaying(rate: float) -> optax.GradientTransformation:
+        return clipped(optax.adam(optax.linear_schedule(rate, 0.1 * rate, updates)))
+
+    steered = clipped(optax.inject_hyperparams(optax.adam)(learning_rate=config.learning_rate))
     parts: dict[Hashable, optax.GradientTransformation] = {
-        "policy": adam(config.learning_rate),
-        "value": adam(config.critic_learning_rate),
+        "policy": steered if config.target_kl else decaying(config.learning_rate),
+        "value": decaying(config.critic_learning_rate),
     }
     return optax.multi_transform(parts, network_params("policy", "value"))
 
@@ -124,7 +134,10 @@ def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
     """A fresh learner and its environments."""
     k_policy, k_value, k_env, k_next = jax.random.split(key, 4)
     networks = make_networks(config)
-    params = network_params(networks.policy_network.init(k_policy), networks.value_network.init(k_value))
+    policy = networks.policy_network.init(k_policy)
+    if config.start == NOTHING:
+        policy = _with_small_output(policy)
+    params = network_params(policy, networks.value_network.init(k_value))
     normalizer = running_statistics.init_state(
         specs.Array((contract.OBSERVATION_SIZE,), jnp.dtype("float32"))
     )
@@ -139,12 +152,21 @@ def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
     )
 
 
+def _with_small_output(policy: Any) -> Any:
+    """Brax's freshly drawn policy parameters with the last layer's weights a hundredth: at the start the arm
+    stands still but for the noise, whatever it observes (Andrychowicz et al. 2021, section 3.2)."""
+    layers = policy["params"]
+    last = f"hidden_{len(layers) - 1}"
+    small = layers[last] | {"kernel": 0.01 * layers[last]["kernel"]}
+    return {"params": layers | {last: small}}
+
+
 def warm_start(state: LearnerState, saved: dict) -> LearnerState:
     """`state` with the policy and normaliser of `ppo.policy.load_state`; the value network stays fresh."""
     policy = {"params": saved["layers"]}
     if jax.tree.map(jnp.shape, policy) != jax.tree.map(jnp.shape, state.params.policy):
         raise UserError(
-            "The teacher of teacher.init_from has other layers than teacher.hidden asks for: use the same."
+            "The teacher of teacher.start has other layers than teacher.hidden asks for: use the same."
         )
     normalizer = replace(state.normalizer, mean=saved["mean"], std=saved["std"])
     return with_policy(state, policy, normalizer)
@@ -179,13 +201,15 @@ def iteration(
     env_state, data, outcome = _unroll(env, env_state, policy, k_unroll, config.unroll_steps)
     data = jax.lax.with_sharding_constraint(data, devices.over_envs(env.mesh))
     normalizer = state.normalizer
-    if not (
-        config.clone_rounds or config.init_from
-    ):  # a policy that acts already would be put off by new scales
+    (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state, env.mesh)
+    losses |= diagnostics.of_update(config, networks, normalizer, data, state.params.value, params.policy)
+    if config.target_kl:
+        losses["policy/learning_rate"] = optax.tree_utils.tree_get(opt_state, "learning_rate")
+    if config.start == NOTHING:  # a policy that acts already would be put off by new scales
+        # After the update: its probabilities are relative to those that the old scales gave.
         normalizer = running_statistics.update(
             normalizer, data.observation, std_min_value=OBSERVATION_STD_MIN
         )
-    (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state, env.mesh)
     new = replace(
         state, params=params, normalizer=normalizer, opt_state=opt_state, env_state=env_state,
         iteration=state.iteration + 1,
@@ -206,8 +230,19 @@ def _unroll(env, env_state, policy, key, length):
     (env_state, _), (data, done, metrics) = jax.lax.scan(step, (env_state, key), None, length)
     episodes = jnp.maximum(done.sum(), 1.0)
     outcome = {"success": metrics["success"].sum() / episodes, "saturated": metrics["saturated"].mean()}
+    outcome |= {f"episode/{k}": (metrics[k] * done).sum() / episodes for k in ("return", "length")}
     outcome |= {k: v.mean() for k, v in metrics.items() if k.startswith("reward/")}
     return env_state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data), outcome
+
+
+def _steered(opt_state: Any, kl: jax.Array, target_kl: float) -> Any:
+    """`opt_state` with the actor's step size lowered where `kl` () is twice its target, raised where it is
+    half of it."""
+    actor = opt_state.inner_states["policy"]
+    chain, _ = adaptive_kl_learning_rate(actor.inner_state, kl, target_kl, STEERED_RATE_MIN)
+    return opt_state._replace(
+        inner_states=opt_state.inner_states | {"policy": actor._replace(inner_state=chain)}
+    )
 
 
 def _improve(config, networks, normalizer, data, key, state, mesh):
@@ -232,6 +267,8 @@ def _improve(config, networks, normalizer, data, key, state, mesh):
         policy_grads = jax.tree.map(lambda g: jnp.where(learns, g, 0.0), grads.policy)
         grads = network_params(policy_grads, grads.value)
         updates, opt_state = optimizer.update(grads, opt_state, params)
+        if config.target_kl:
+            opt_state = _steered(opt_state, terms["kl_mean"], config.target_kl)
         params = cast(ppo_losses.PPONetworkParams, optax.apply_updates(params, updates))
         return (params, opt_state), terms
 

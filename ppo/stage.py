@@ -27,7 +27,7 @@ def check(config: Config) -> None:
 
 
 def run(job: Job) -> Artifact:
-    """Trains a teacher (or loads one, `config.teacher.init_from`) and evaluates it, in every process."""
+    """Trains a teacher (or loads one, `config.teacher.start`) and evaluates it, in every process."""
     config, directory = job.config, job.directory
     path = directory / teacher_policy.PARAMS_FILE
     hosts.wait_for_all("teacher begins")
@@ -35,7 +35,7 @@ def run(job: Job) -> Artifact:
         train(config, directory, job.progress)
     elif hosts.leads():
         with atomic_path(path) as temporary:
-            shutil.copyfile(teacher_policy.find(config.teacher.init_from), temporary)
+            shutil.copyfile(teacher_policy.find(config.teacher.start), temporary)
     hosts.wait_for_all("teacher is written")
     policy = teacher_policy.load(directory)
     metrics = evaluate(GraspEnv(config.world), policy, config.evaluation.teacher_trials, _TEST_SEED)
@@ -46,4 +46,4 @@ def run(job: Job) -> Artifact:
 
 
 def _loads(config: Config) -> bool:
-    return bool(config.teacher.init_from) and config.teacher.total_steps == 0
+    return config.teacher.starts_from_file and config.teacher.total_steps == 0

@@ -1,13 +1,14 @@
 """Training loop: iterations, evaluations, checkpoints, curves."""
 
 import dataclasses
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import jax
 
-from ddgrasp.config import Config, WorldConfig
+from ddgrasp.config import GUIDE, Config, WorldConfig
 from ddgrasp.files import atomic_write_json, read_json
 from ddgrasp.progress import Progress
 from learning.checkpoints import Checkpoints
@@ -50,11 +51,12 @@ def _train(
         best.offer(_evaluate(test_env, state, config, 0, progress), state)
     with progress.task("PPO", total) as task:
         task.start_at(int(state.iteration))
+        clock = _Clock(teacher.num_envs * teacher.unroll_steps)
         for i in range(int(state.iteration) + 1, total + 1):
             state, metrics, watched = iterate(state)
             health.check(i, watched, saved.latest, directory)
             if i % LOG_EVERY == 0 or i == total:
-                _log(i, metrics, progress, task)
+                _log(i, metrics | clock.rate(i), progress, task)
             task.advance()
             if i % teacher.eval_every == 0:
                 rate = _evaluate(test_env, state, config, i, progress)
@@ -122,6 +124,23 @@ class _Best:
             atomic_write_json(self._directory / BEST_RATE, rate)
 
 
+class _Clock:
+    """How fast training goes."""
+
+    def __init__(self, steps_per_iteration: int):
+        self._steps = steps_per_iteration
+        self._last: tuple[int, float] | None = None
+
+    def rate(self, iteration: int) -> dict[str, float]:
+        """{"steps_per_s": control steps per second since it was asked last, evaluations included}; nothing the
+        first time."""
+        now, before = (iteration, time.monotonic()), self._last
+        self._last = now
+        if before is None:
+            return {}
+        return {"steps_per_s": (now[0] - before[0]) * self._steps / max(now[1] - before[1], 1e-9)}
+
+
 def training_world(config: Config) -> WorldConfig:
     """The world with the exploring starts that only training has."""
     random = dataclasses.replace(config.world.random, pregrasp_share=config.teacher.pregrasp_share)
@@ -134,13 +153,13 @@ def policy_of(state: learner.LearnerState) -> TeacherPolicy:
 
 
 def _start(config: Config, env: AutoReset, saved: Checkpoints, progress: Progress) -> learner.LearnerState:
-    """The newest checkpoint; else a fresh learner, with the guide cloned if asked for."""
+    """The newest checkpoint; else what `config.teacher.start` says."""
     if saved.latest is not None:
         return restore(config, env, saved)
     state, places = initial(config, env)(), learner.shardings(env.mesh)
-    if config.teacher.init_from:
-        return jax.device_put(learner.warm_start(state, load_state(config.teacher.init_from)), places)
-    if config.teacher.clone_rounds:
+    if config.teacher.starts_from_file:
+        return jax.device_put(learner.warm_start(state, load_state(config.teacher.start)), places)
+    if config.teacher.start == GUIDE:
         cloned = clone_guide(config.teacher, GraspEnv(config.world), state, config.seed, progress)
         state = jax.device_put(learner.with_policy(state, *hosts.from_leader(cloned)), places)
         saved.save(0, state)
@@ -157,7 +176,10 @@ def _evaluate(env: GraspEnv, state, config: Config, i: int, progress: Progress) 
     result = evaluate(env, policy_of(state), min(256, config.evaluation.teacher_trials), _EVAL_SEED)
     rate = result["success"]["successes"] / result["success"]["n"]
     steps = i * config.teacher.num_envs * config.teacher.unroll_steps
-    progress.scalars(i, eval_success=rate, eval_saturated=result["saturated_actions"])
+    progress.scalars(
+        i, control_steps=steps, minutes=progress.seconds / 60, eval_success=rate,
+        eval_saturated=result["saturated_actions"],
+    )  # fmt: skip
     objects = "  ".join(f"{k} {v['successes']}/{v['n']}" for k, v in result["objects"].items())
     progress.note(f"after {steps / 1e6:.2f} M steps: success {rate:.3f} ({objects})")
     return rate

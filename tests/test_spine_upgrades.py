@@ -15,7 +15,7 @@ from deploy.stage import STAGE, TrialLog
 
 ROOT = Path(__file__).parents[1]
 CONFIG = PRESETS["camera"]
-FLAT = upgrades.as_version_1(to_json(CONFIG))
+FLAT = upgrades.downgraded(to_json(CONFIG), 1)
 ALL_STAGES = [stage.name for stage in (*STAGES, *ON_REQUEST)]
 
 
@@ -31,7 +31,7 @@ def write_version_1(directory: Path, stage: str, config=FLAT) -> None:
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_version_1_and_back_loses_nothing(name):
     value = json.loads(json.dumps(to_json(PRESETS[name])))
-    flat = json.loads(json.dumps(upgrades.as_version_1(value)))
+    flat = json.loads(json.dumps(upgrades.downgraded(value, 1)))
     assert {"train_steps", "widths", "prior", "sample_batch"} <= flat["ddg"].keys()
     assert {"input_height_px", "head_batch_size", "dagger_teacher_share"} <= flat["student"].keys()
     assert flat["deploy"]["franka_host"] == "172.16.0.2" and flat["world"]["random"]["crop_px"] == 24
@@ -58,7 +58,7 @@ def test_fields_named_by_hand_arrive_where_they_belong():
 
 
 def test_the_paper_presets_picture_of_version_1_becomes_one_that_an_encoder_takes():
-    flat = upgrades.as_version_1(to_json(PRESETS["paper"]))
+    flat = upgrades.downgraded(to_json(PRESETS["paper"]), 1)
     flat["student"] |= {"input_height_px": 225, "input_width_px": 290}
     assert artifacts.config_from_json(upgrades.upgraded(flat, 1)) == PRESETS["paper"]
 
@@ -94,7 +94,7 @@ def test_a_stage_begun_by_version_1_goes_on(tmp_path):
 
 def test_a_trial_log_of_version_1_goes_on(tmp_path):
     policy = {"policy_sha256": "a"}
-    old = policy | {"config_hash": artifacts.config_hash_of_version_1(CONFIG, STAGE)}
+    old = policy | {"config_hash": artifacts.config_hash_of_version(1, CONFIG, STAGE)}
     new = policy | {"config_hash": artifacts.config_hash(CONFIG, STAGE)}
     path = tmp_path / "trials.jsonl"
     TrialLog(path, old)
@@ -107,7 +107,7 @@ def test_the_hash_of_version_1_is_the_one_that_version_recorded():
     """The pretrained teacher's manifest holds it; nothing of what a teacher depends on was added since."""
     manifest = read_json(ROOT / "pretrained" / "teacher" / artifacts.MANIFEST)
     config = artifacts.config_from_json(upgrades.upgraded(manifest["config"], 1))
-    assert artifacts.config_hash_of_version_1(config, "teacher") == manifest["config_hash"]
+    assert artifacts.config_hash_of_version(1, config, "teacher") == manifest["config_hash"]
 
 
 @pytest.mark.parametrize("stage", ["teacher", "student"])
@@ -124,5 +124,5 @@ def test_a_manifest_of_a_later_version_is_refused_by_its_number(tmp_path):
     artifacts.finish(tmp_path / "export", "export", CONFIG, seconds=1.0, metrics={})
     path = tmp_path / "export" / artifacts.MANIFEST
     path.write_text(json.dumps(read_json(path) | {"manifest_version": 99}))
-    with pytest.raises(UserError, match="is of version 99, this code reads up to 2"):
+    with pytest.raises(UserError, match="is of version 99, this code reads up to 3"):
         artifacts.read_manifest(tmp_path / "export")

@@ -186,7 +186,7 @@ def test_the_rigs_camera_looks_at_clean_depth_in_colour(demos, tmp_path):
 
 
 def test_students_from_before_there_was_a_choice_were_trained_on_learned_depth():
-    flat = upgrades.as_version_1(artifacts.to_json(with_source("dextrah")))
+    flat = upgrades.downgraded(artifacts.to_json(with_source("dextrah")), 1)
     assert "depth_source" not in flat["student"]
     assert upgrades.upgraded(flat, 1)["student"]["depth_source"] == "learned"
 

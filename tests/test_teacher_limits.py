@@ -19,7 +19,7 @@ from ppo import train as ppo_train
 
 TEACHER = TeacherConfig(
     total_steps=6 * 8 * 2, num_envs=8, unroll_steps=2, minibatches=2, epochs=1, hidden=(16,), eval_every=100,
-    checkpoint_every=1, pregrasp_share=0.0, clone_rounds=0, critic_warmup=0,
+    checkpoint_every=1, pregrasp_share=0.0, start="nothing", critic_warmup=0,
 )  # fmt: skip
 CONFIG = Config(
     "test", world=WorldConfig(episode_steps=3), teacher=TEACHER, evaluation=EvalConfig(teacher_trials=2)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import pytest
 
-from ddgrasp.config import RewardConfig
+from ddgrasp.config import PAPER_REWARD, RewardConfig
 from mjx_envs import rewards
 
 W = RewardConfig(
@@ -12,10 +12,14 @@ W = RewardConfig(
 )  # fmt: skip
 
 
+def distances(**values):
+    return rewards.Distances(**{name: jnp.array(value) for name, value in values.items()})
+
+
 def transition(**changes):
     values = {
-        "before": rewards.Distances(jnp.array(0.5), jnp.array(0.4), jnp.array(0.3), jnp.array(0.2)),
-        "after": rewards.Distances(jnp.array(0.4), jnp.array(0.1), jnp.array(0.1), jnp.array(0.0)),
+        "before": distances(hand=0.5, grip_to_object=0.5, object=0.4, grasp_angle=0.3, upright_angle=0.2),
+        "after": distances(hand=0.4, grip_to_object=0.4, object=0.1, grasp_angle=0.1, upright_angle=0.0),
         "action": jnp.zeros(8).at[7].set(1.0),
         "last_action": jnp.zeros(8).at[7].set(1.0),
         "acceleration": jnp.array([1.0, 2.0, 0, 0, 0, 0, 0]),
@@ -70,3 +74,35 @@ def test_every_sideways_step_towards_the_object_shortens_the_way():
     ]
     assert near == sorted(near, reverse=True)
     assert float(rewards.approach_distance(grasp, grasp)) < 1e-4
+
+
+def nonzero_terms(t):
+    return {name for name, value in rewards.terms(PAPER_REWARD, t).items() if float(value) != 0.0}
+
+
+def test_the_papers_reward_has_five_terms_and_no_more():
+    action = jnp.ones(8).at[7].set(-1.0)  # saturated, and the gripper's command changes
+    yes = jnp.array(True)
+    held = transition(action=action, grasped=yes, lifted=yes, hold_count=jnp.array(2))
+    assert nonzero_terms(held) == {"lift", "orient", "bonus", "accel"}
+    assert nonzero_terms(transition(action=action)) == {"reach", "accel"}
+
+
+def test_the_papers_distance_is_from_gripper_to_object_and_ours_goes_by_way_of_a_point_above():
+    qpos = jnp.zeros(16).at[9:12].set(jnp.array([0.5, 0.1, 0.03])).at[12].set(1.0)
+    grasp = jnp.array([0.5, 0.1, 0.03]), jnp.array([0.0, 1.0, 0.0, 0.0])
+    beside = jnp.array([0.5, 0.0, 0.03]), jnp.array([0.0, 1.0, 0.0, 0.0])
+    plain = rewards.distances(PAPER_REWARD, qpos, *grasp, beside)
+    funnel = rewards.distances(RewardConfig(), qpos, *grasp, beside)
+    assert float(plain.hand) == pytest.approx(0.1, abs=1e-4)
+    assert float(funnel.hand) == pytest.approx(0.1 + 0.7 * 0.09, abs=1e-4)
+    assert float(funnel.grip_to_object) == pytest.approx(0.1, abs=1e-4)
+
+
+@pytest.mark.parametrize("metres", [0.02, 0.04])
+@pytest.mark.parametrize("closing", [0, 1])
+@pytest.mark.parametrize("touching", [0, 1])
+def test_what_counts_as_grasped(touching, closing, metres):
+    state = jnp.array(bool(touching)), jnp.array(bool(closing)), jnp.array(metres)
+    assert bool(rewards.grasped(RewardConfig(), *state)) == (touching and closing)
+    assert bool(rewards.grasped(PAPER_REWARD, *state)) == (closing and metres < rewards.NEAR_M)

@@ -15,8 +15,8 @@ from ddgrasp.config.checks import Range, check_value, kinds
 from ddgrasp.errors import UserError
 
 CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
-"""File that `<stage>.init_from` must hold, itself or in a folder named after the stage. Named here too, since
-the stages' own modules import JAX."""
+"""File that a folder a stage starts from must hold, itself or in a folder named after the stage. Named here
+too, since the stages' own modules import JAX."""
 
 
 def check_options(command: Any) -> None:
@@ -43,8 +43,10 @@ def check_config_values(config: Config) -> Config:
     from student_jax.depth_source import check_source
 
     check_objects(config.world)
-    for stage, file in CHECKPOINTS.items():
-        _check_start(stage, getattr(config, stage).init_from, file)
+    for stage in ("ddg", "student"):
+        _check_start(stage, f"{stage}.init_from", getattr(config, stage).init_from)
+    if config.teacher.starts_from_file:
+        _check_start("teacher", "teacher.start", config.teacher.start, "nothing, guide, or ")
     check_source(config, make_prior(config.ddg))
     if config.student.encoder.weights:
         from student_jax import pretrained_encoder
@@ -86,14 +88,16 @@ def check_devices(config: Config, run_dir: Path) -> None:
         check(config)
 
 
-def _check_start(stage: str, init_from: str, file: str) -> None:
-    """UserError unless `init_from` is empty or holds the checkpoint `file`."""
-    source = Path(init_from)
-    if not init_from or any(path.is_file() for path in (source / file, source / stage / file)):
+def _check_start(stage: str, option: str, folder: str, others: str = "") -> None:
+    """UserError unless `folder` is empty or holds the stage's checkpoint; `others` might be given instead."""
+    source, file = Path(folder), CHECKPOINTS[stage]
+    if not folder or any(path.is_file() for path in (source / file, source / stage / file)):
         return
     pretrained = source.parts[:1] == ("pretrained",)
     remedy = (
-        "run it from the repository root" if pretrained else "give a run or pretrained folder, or nothing"
+        "run it from the repository root"
+        if pretrained
+        else f"give {others}a run or pretrained folder" + ("" if others else ", or nothing")
     )
     trouble = f"holds no {file}" if source.exists() else "does not exist"
-    raise UserError(f"{stage}.init_from is {init_from!r}, which {trouble}: {remedy}.")
+    raise UserError(f"{option} is {folder!r}, which {trouble}: {remedy}.")

@@ -72,8 +72,18 @@ from ddgrasp.config.student import (
     StudentConfig,
     StudentTrainingConfig,
 )
-from ddgrasp.config.teacher import HostsConfig, TeacherConfig
-from ddgrasp.config.world import BACKENDS, Backend, CameraScale, RandomConfig, RewardConfig, WorldConfig
+from ddgrasp.config.teacher import GUIDE, NOTHING, HostsConfig, TeacherConfig
+from ddgrasp.config.world import (
+    BACKENDS,
+    PAPER_REWARD,
+    Backend,
+    CameraScale,
+    GraspSwitch,
+    RandomConfig,
+    RewardConfig,
+    RewardDistance,
+    WorldConfig,
+)
 from ddgrasp.errors import UserError
 
 
@@ -157,15 +167,19 @@ __all__ = [
     "ExportConfig",
     "FILTERED",
     "FrankaConfig",
+    "GUIDE",
     "GROUP_CHANNELS",
     "GraftConfig",
+    "GraspSwitch",
     "HOLE_LOSSES",
     "HandViewConfig",
     "HeadConfig",
     "HostsConfig",
     "KinectConfig",
     "LOSS_WEIGHTS",
+    "NOTHING",
     "NoiseSchedule",
+    "PAPER_REWARD",
     "PIECEWISE",
     "PROGRESSIVE",
     "PictureConfig",
@@ -178,6 +192,7 @@ __all__ = [
     "RealSenseConfig",
     "RecordConfig",
     "RewardConfig",
+    "RewardDistance",
     "SAMPLERS",
     "SCORE_COLUMNS",
     "SCORE_FEATURES",

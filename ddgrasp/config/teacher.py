@@ -16,11 +16,18 @@ from ddgrasp.config.checks import (
 )
 from ddgrasp.errors import UserError
 
+NOTHING, GUIDE = "nothing", "guide"
+"""Values of `TeacherConfig.start` that are no folder."""
+
 
 @dataclass(frozen=True)
 class TeacherConfig(Section, name="teacher"):
     """PPO on the privileged state."""
 
+    start: Text = "guide"
+    """What the policy starts from: nothing (PPO alone, on the reward), guide (a scripted controller,
+    ppo/guide.py, is cloned into it first), or a run directory or pretrained folder whose policy goes on (with
+    total_steps 0 it is used as it is)."""
     total_steps: Annotated[int, Range(0, 10**12)] = 2_000_000
     """Control steps of experience, over all environments together."""
     num_envs: Annotated[int, Range(1, 2**31 - 1)] = 512
@@ -32,8 +39,11 @@ class TeacherConfig(Section, name="teacher"):
     epochs: Annotated[int, Range(1, 1000)] = 4
     """Passes over each batch of experience."""
     learning_rate: LearningRate = 2e-5
-    """Adam's step size for the policy at the start; decays linearly to a tenth. Keep it small when the policy
-    starts from a cloned one (clone_rounds): a large step undoes it."""
+    """Adam's step size for the policy at the start; decays linearly to a tenth, unless target_kl steers it.
+    Keep it small for a policy that acts well already (start): a large step undoes it."""
+    target_kl: Annotated[float, Range(0, 10)] = 0.0
+    """Above 0 the step size is raised and lowered so that an update changes the policy by about this KL
+    divergence (as rsl_rl does by its desired_kl); 0 lets it decay linearly."""
     critic_learning_rate: LearningRate = 5e-4
     """The same for the value network."""
     discount: Share = 0.97
@@ -41,7 +51,12 @@ class TeacherConfig(Section, name="teacher"):
     gae_lambda: Share = 0.95
     """Generalised advantage estimation: 0 trusts the value network, 1 the rewards that were seen."""
     action_std: Annotated[float, Range(0, 10, above=True)] = 0.15
-    """Standard deviation of the exploration noise at the start, before the tanh."""
+    """Standard deviation of the exploration noise of the arm's joints at the start, before the tanh."""
+    gripper_std: Annotated[float, Range(0, 10, above=True)] = 0.15
+    """The same for the gripper's command, which counts by its sign alone."""
+    min_std: Annotated[float, Range(0, 10)] = 0.01
+    """Floor of the noise: 0.2 keeps it above 0.2 / log 2 = 29 % of action_std and gripper_std (and adds as
+    much to both at the start)."""
     entropy_cost: Annotated[float, Range(0, 10)] = 1e-3
     """Weight of the reward for acting at random: more keeps exploring for longer."""
     clip: Share = 0.2
@@ -54,9 +69,8 @@ class TeacherConfig(Section, name="teacher"):
     """Layers of policy and value networks."""
     pregrasp_share: Share = 0.2
     """Share of training episodes that start with the hand above the object (exploring starts)."""
-    clone_rounds: CountOrNone = 8
-    """DAgger rounds in which the policy network learns the guide (ppo/guide.py) before PPO; 0 starts
-    PPO from nothing."""
+    clone_rounds: Count = 8
+    """DAgger rounds in which the policy network learns the guide before PPO; for start guide alone."""
     clone_envs: Count = 192
     """Episodes per such round."""
     clone_steps: StepsOrNone = 500
@@ -69,8 +83,11 @@ class TeacherConfig(Section, name="teacher"):
     """Updates between whole-state checkpoints."""
     stop_at: Share = 1.0
     """End early once two evaluations in a row reach this success rate."""
-    init_from: Text = ""
-    """Run directory or pretrained folder whose policy to start from; total_steps 0 uses it as it is."""
+
+    @property
+    def starts_from_file(self) -> bool:
+        """Whether `start` names a run or a pretrained folder."""
+        return self.start not in (NOTHING, GUIDE)
 
     def check(self) -> None:
         """See `Section.check`."""
@@ -78,6 +95,12 @@ class TeacherConfig(Section, name="teacher"):
             raise UserError(
                 f"teacher.num_envs {self.num_envs} is no multiple of teacher.minibatches {self.minibatches}: "
                 "change one of them."
+            )
+        if not self.start:
+            raise self.error("start", "nothing, guide, or a run directory or pretrained folder")
+        if self.total_steps == 0 and not self.starts_from_file:
+            raise self.error(
+                "total_steps", f"at least 1: a teacher that starts from {self.start} has to learn"
             )
 
 

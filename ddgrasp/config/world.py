@@ -9,6 +9,8 @@ from ddgrasp.config.checks import Range, Section, Share, Text, Weight
 
 Backend = Literal["cpu", "jax", "warp"]
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
+RewardDistance = Literal["funnel", "plain"]
+GraspSwitch = Literal["touch", "near"]
 CameraScale = Annotated[float, Range(0.1, 1)]
 _Relative = Annotated[float, Range(0, 0.9)]
 """Half-range as a share of the nominal value."""
@@ -16,7 +18,10 @@ _Relative = Annotated[float, Range(0, 0.9)]
 
 @dataclass(frozen=True)
 class RewardConfig(Section, name="world.reward"):
-    """Weights of the reward terms (paper Eq. 2 and its terms; `ours` marks what the paper lacks)."""
+    """Weights of the reward terms (paper Eq. 2 and its terms; `ours` marks what the paper lacks).
+
+    `PAPER_REWARD` is the paper's own five terms.
+    """
 
     reach: Weight = 10.0
     """w1: for a hand near the object, per metre."""
@@ -41,6 +46,18 @@ class RewardConfig(Section, name="world.reward"):
     toggle: Weight = 0.005
     """Ours: penalty on each change of the gripper's command. Keep it small: ten times as much teaches the
     policy never to close the gripper."""
+    distance: RewardDistance = "funnel"
+    """What w1 counts: funnel (ours: by way of a point above the grasp, so that the hand comes from above) or
+    plain (the paper's: gripper centre to object centre)."""
+    grasp_switch: GraspSwitch = "touch"
+    """What counts as grasped: touch (ours: both pads press on the object, gripper closing) or near (the
+    paper's: gripper closing, its centre within 3 cm of the object's)."""
+
+
+PAPER_REWARD = RewardConfig(
+    align=0.0, saturation=0.0, grasp=0.0, toggle=0.0, distance="plain", grasp_switch="near"
+)
+"""The paper's reward: its five terms, its distance, its grasp. It prints no weights: these are ours."""
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,8 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         if entry is None:
             rows.append((stage.name, "", "", "not run"))
             continue
-        start = report["config"].get(stage.name, {}).get("init_from", "")
+        section = report["config"].get(stage.name, {})
+        start = section.get("start") or section.get("init_from", "")
         origin = "loaded" if entry["loaded"] else "this run" + (f", from {start}" if start else "")
         results = _results(stage.name, report) or [stage.makes]
         rows.append((stage.name, origin, _duration(entry["seconds"]), results[0]))
