@@ -123,7 +123,7 @@ that two to four other jobs shared, 2026-11-21)."""
 
 _FROM_NOTHING = TeacherConfig(
     start="nothing",
-    total_steps=5_000_000,
+    total_steps=6_000_000,
     num_envs=1024,
     minibatches=16,
     learning_rate=3e-4,
@@ -138,7 +138,6 @@ _FROM_NOTHING = TeacherConfig(
     critic_warmup=0,
     eval_every=12,
     checkpoint_every=24,
-    stop_at=0.99,
 )
 
 PPO = replace(LAPTOP, preset="ppo", teacher=_FROM_NOTHING)
