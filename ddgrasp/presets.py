@@ -118,7 +118,7 @@ LAPTOP = Config(
     ),
     evaluation=EvalConfig(student_trials=60, rig_trials=60),
 )
-"""Everything trained from nothing on two cores (73 minutes of stage time on two AMD EPYC cores
+"""Everything trained here on two cores, the teacher from the guide (73 minutes of stage time on two AMD EPYC cores
 that two to four other jobs shared, 2026-11-21)."""
 
 _FROM_NOTHING = TeacherConfig(
