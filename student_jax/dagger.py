@@ -21,6 +21,7 @@ from demos.rollout import Roller
 from demos.store import EpisodeStore
 from learning.loop import Metrics, run_steps
 from learning.params import load_params, save_params
+from learning.prefetch import Prefetched
 from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
 from student_jax import frames_io, head, pretrained_encoder, train
@@ -51,7 +52,7 @@ class Trainer:
         self._config, self._student, self._profile = config, config.student, config.world.profile
         self._teacher, self._source = teacher, source
         self._directory, self._progress = directory, progress
-        self._store = EpisodeStore(directory / frames_io.CACHE, create=True)
+        self._store = EpisodeStore(directory / frames_io.CACHE, create=True, compressed=False)
         self._done: list[str] = []
         self.history: list[dict[str, Any]] = []
         self.params: dict = {}
@@ -127,13 +128,14 @@ class Trainer:
             rng = np.random.default_rng([self._config.seed, _DAGGER_SEED, number])
             camera = SourceCamera(self._source, first)
             actor = StudentActor(
-                self.params, student, self._profile, camera, rng, self._config.deploy.noise, share
-            )
+                self.params, student, self._profile, camera, rng, self._config.deploy.noise, share,
+                keep=self._directory,
+            )  # fmt: skip
             roller = Roller(self._config, self._teacher, wanted - first, self._source.needs_rgb)
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
                 key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
                 episodes = roller.run(key, actor, lambda _: task.advance())
-            frames_io.add_rollouts(self._store, episodes, actor.seen_mm)
+            frames_io.add_rollouts(self._store, episodes, actor.seen)
             measured["rollout_success"] = rate = float(episodes.success.mean())
             self._progress.note(f"round {number}: {rate:.0%} success with the teacher taking {share:.0%}")
         return measured | self._fit(f"dagger-{number}", student.dagger.steps)
@@ -147,23 +149,27 @@ class Trainer:
         trained, frozen = train.split(student, self.params)
         number = _phase_number(phase)
 
-        def step_once(state: TrainState, step: int) -> tuple[TrainState, Metrics]:
+        def batch_of(step: int) -> train.Batch:
             rng = np.random.default_rng([self._config.seed, number, step])
             index = frames.draw(rng, student.training.batch_size, student.training.held_weight)
-            batch = train.make_batch(frames, index, rng, student, profile)
-            return train.train_step(student, profile, steps, state, frozen, batch)
+            return train.make_batch(frames, index, rng, student, profile)
 
-        state, terms = run_steps(
-            train.init_state(student, steps, self._config.seed, trained),
-            steps,
-            step_once,
-            self._directory / CHECKPOINTS / phase,
-            label=f"student, {phase}",
-            progress=self._progress,
-            first_point=number * _POINTS_PER_PHASE,
-            log_every=LOG_EVERY,
-            shown=("position_error_mm", "yaw", "held"),
-        )
+        with Prefetched(batch_of, steps) as batches:
+
+            def step_once(state: TrainState, step: int) -> tuple[TrainState, Metrics]:
+                return train.train_step(student, profile, steps, state, frozen, batches(step))
+
+            state, terms = run_steps(
+                train.init_state(student, steps, self._config.seed, trained),
+                steps,
+                step_once,
+                self._directory / CHECKPOINTS / phase,
+                label=f"student, {phase}",
+                progress=self._progress,
+                first_point=number * _POINTS_PER_PHASE,
+                log_every=LOG_EVERY,
+                shown=("position_error_mm", "yaw", "held"),
+            )
         self.params = frozen | jax.tree.map(np.asarray, state.ema)
         return terms
 

@@ -1,20 +1,23 @@
 """Demos and DAgger episodes as the student sees them, on disk, so that a resumed stage finds them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, UInt16
+from jaxtyping import Bool
 
 from ddg_jax.generate import Clip
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
 from demos.rollout import Episodes
+from demos.spool import Spool
 from demos.store import EpisodeStore
 from student_jax.data import Frames, make_frames
 from student_jax.depth_source import DepthSource, check_colour
 
 CACHE = "frames.zarr"
-_FIELDS = ("depth_mm", "state", "action", "observation", "held")
+_COLUMNS = ("state", "action", "observation", "held")
+_FIELDS = ("depth_mm", *_COLUMNS)
 
 
 def add_noisy_demos(
@@ -55,16 +58,13 @@ def useful_steps(held: Bool[np.ndarray, " T"], held_steps: int) -> int:
     return int(enough[0]) + 1 if len(enough) else len(held)
 
 
-def add_rollouts(
-    frames: EpisodeStore, episodes: Episodes, seen_mm: list[UInt16[np.ndarray, "B H W"]]
-) -> None:
+def add_rollouts(frames: EpisodeStore, episodes: Episodes, seen: Spool) -> None:
     """Adds DAgger episodes with the depth that the student saw."""
-    seen = np.stack(seen_mm, axis=1)
     for i, length in enumerate(episodes.length):
-        n = min(int(length), seen.shape[1])
+        n = min(int(length), len(seen))
         frames.append(
             {
-                "depth_mm": seen[i, :n],
+                "depth_mm": seen.episode(i, n),
                 "state": episodes.state[i, :n].astype(np.float32),
                 "action": episodes.action[i, :n].astype(np.float32),
                 "observation": episodes.observation[i, :n].astype(np.float32),
@@ -75,10 +75,8 @@ def add_rollouts(
 
 
 def load(path: Path) -> Frames:
-    """All episodes of a frame store, in memory."""
+    """All episodes of a frame store; depth stays on disk."""
     store = EpisodeStore(path)
-    ends = np.concatenate([[0], store.ends])
-    columns = {name: np.split(store.steps(name), ends[1:-1]) for name in _FIELDS}
-    return make_frames(
-        columns["depth_mm"], columns["state"], columns["action"], columns["observation"], columns["held"]
-    )
+    bounds = store.ends[:-1]
+    columns = (np.split(store.steps(name), bounds) for name in _COLUMNS)
+    return replace(make_frames([], *columns), depth_mm=store.reader("depth_mm"))
