@@ -78,7 +78,7 @@ _GROUPS_OF_2: dict[str, dict[str, dict[str, str]]] = {
 _DROPPED_AFTER_1 = {"world.random.crop_px": 24}
 """Fields of version 1 that version 2 lacks, with the value that they had."""
 
-_ADDED_AFTER_1 = {"student.depth_source": "learned"}
+_ADDED_AFTER_1 = {"student.depth_source": "learned", "scale": 1.0, "world.renderer": "jax"}
 """Fields that version 1 lacked, with what it did."""
 
 

@@ -81,7 +81,7 @@ class Roller:
         keep: Path | None = None,
     ):
         self.env = GraspEnv(config.world)
-        self.viewer = Viewer(config.world.profile, self.env.table.layout)
+        self.viewer = Viewer(config.world.profile, self.env.table.layout, config.world.renderer)
         self.count, self.steps = count, config.world.episode_steps
         self._teacher, self._random, self._with_rgb = teacher, config.world.random, with_rgb
         self._with_depth, self._keep = with_depth, keep

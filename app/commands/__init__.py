@@ -21,7 +21,9 @@ from app.commands.parsing import parsed
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
+from ddgrasp.config import Config
 from ddgrasp.presets import get_preset
+from ddgrasp.scaling import scaled
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def parse(name: str, args: Sequence[str]) -> Command:
     cls = COMMANDS[name]
     options: dict[str, Any] = {}
     if issubclass(cls, FromPreset):
-        preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
+        preset = _scaled(get_preset(_option(args, "--preset") or DEFAULT_PRESET), _option(args, "--scale"))
         options["default"] = cls(config=preset, out=Path("runs") / preset.preset)
     elif issubclass(cls, Scoring):
         preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
@@ -96,6 +98,15 @@ def parse(name: str, args: Sequence[str]) -> Command:
     return command
 
 
+def _scaled(preset: Config, scale: str | None) -> Config:
+    """`preset` at the `scale` of the command line; what is no scale is left to the parser to refuse."""
+    try:
+        factor = float(scale or 1)
+    except ValueError:
+        return preset
+    return scaled(replace(preset, scale=factor), factor)
+
+
 def describe_commands(group: str = "") -> str:
     """The list that `ddgrasp --help` (or `ddgrasp teacher`) prints."""
     names = [name for name in COMMANDS if not group or name.split()[0] == group]
@@ -108,7 +119,8 @@ def describe_commands(group: str = "") -> str:
 _PRESET_HELP = (
     "Presets (--preset): debug (tests), demo (23 minutes on two cores), laptop (all from nothing, 73 minutes",
     "on two busy cores), camera (laptop, the generator for short recordings of a real camera), paper (one",
-    "GPU). Any value of a preset can be given, for example --teacher.num-envs 64.",
+    "GPU). Any value of a preset can be given, for example --teacher.num-envs 64. --scale 0.001 makes all of",
+    "its counts that much smaller, never its networks or pictures: a trial run, whose figures mean nothing.",
 )
 
 

@@ -79,7 +79,10 @@ def check_data(option: str, path: Path) -> None:
 
 
 def check_devices(config: Config, run_dir: Path) -> None:
-    """UserError if the teacher, unless it is finished, cannot be trained on the devices present."""
+    """UserError if pictures cannot be drawn here, or the teacher, unless it is finished, not be trained."""
+    from mjx_envs.render.batch_render import check_renderer
+
+    check_renderer(config.world.renderer)
     if not artifacts.is_finished(run_dir / "teacher"):
         from ppo.stage import check
 

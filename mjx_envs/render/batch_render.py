@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
+from ddgrasp.config import RENDERERS
 from ddgrasp.errors import unknown_name
 from mjx_envs.camera import Camera
 from mjx_envs.physics.mjx_warp import require_gpu
 from mjx_envs.render import raycast
 from mjx_envs.render.raycast import Geoms
 from mjx_envs.render.visible_geoms import AMBIENT, BACKGROUND_RGB, LIGHT_DIRECTION_W
-
-RENDERERS = ("jax", "warp")
 
 
 class Pictures(NamedTuple):
@@ -44,12 +43,17 @@ def make_renderer(name: str, camera: Camera, *, depth_only: bool = False, far_m:
 
     UserError for an unknown name, or for "warp" without a GPU.
     """
-    if name == "jax":
-        return jax_renderer(camera, depth_only=depth_only, far_m=far_m)
+    check_renderer(name)
+    make = warp_renderer if name == "warp" else jax_renderer
+    return make(camera, depth_only=depth_only, far_m=far_m)
+
+
+def check_renderer(name: str) -> None:
+    """UserError unless the named renderer is there and can run here."""
+    if name not in RENDERERS:
+        raise unknown_name("renderer", name, RENDERERS)
     if name == "warp":
-        require_gpu()
-        return warp_renderer(camera, depth_only=depth_only, far_m=far_m)
-    raise unknown_name("renderer", name, RENDERERS)
+        require_gpu("renderer")
 
 
 def jax_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0) -> Renderer:
