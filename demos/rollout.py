@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -123,6 +124,21 @@ class Roller:
             object_index=np.asarray(state.info["episode"].object_index),
             T_world_cam=np.asarray(cameras),
         )
+
+    def programs(self) -> dict[str, tuple[Any, tuple[Any, ...]]]:
+        """Its compiled pieces, each with the shapes of its arguments: to look at without running them."""
+        key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+        state, cameras = jax.eval_shape(self._begin, key)
+        geoms = jax.eval_shape(self._pose, state)
+        action = jax.ShapeDtypeStruct((self.count, contract.ACTION_SIZE), jnp.float32)
+        return {
+            "begin": (self._begin, (key,)),
+            "look": (self._look, (state,)),
+            "pose": (self._pose, (state,)),
+            "depth": (self._draw_depth, (geoms, cameras)),
+            "rgb": (self._draw_rgb, (geoms, cameras)),
+            "advance": (self._advance, (state, action)),
+        }
 
     def _spools(self) -> dict[str, Spool]:
         """An empty spool for each kind of picture that is kept."""

@@ -13,7 +13,7 @@ import tyro
 
 from app import pipeline
 from app.commands.base import DEFAULT_PRESET, Command, FromPreset
-from app.commands.checks import check_config_values, check_devices, check_options
+from app.commands.checks import check_config_values, check_devices, check_memory, check_options
 from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
@@ -31,11 +31,12 @@ class Run(FromPreset):
     """The whole flow: teacher, demos, record, ddg, student, export, deploy, report."""
 
     def run(self) -> None:
-        """Makes every stage that is not finished and prints the table."""
+        """Says what memory the stages will take, makes those that are not finished, prints the table."""
         from evaluation.report.summary import print_summary
 
         check_config_values(self.config)
         check_devices(self.config, self.out)
+        print(*check_memory(self.config, self.out), sep="\n", flush=True)
         report = pipeline.run(self.config, self.out, resume=self.resume)
         print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
         print_summary(report)

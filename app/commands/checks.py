@@ -89,6 +89,23 @@ def check_devices(config: Config, run_dir: Path) -> None:
         check(config)
 
 
+def check_memory(config: Config, run_dir: Path) -> list[str]:
+    """What each unfinished stage that trains on pictures will take, a line for each; UserError if too much.
+
+    Traces a training step of each, which the stages do as well.
+    """
+    from ddg_jax import memory as ddg_memory
+    from learning import memory
+    from student_jax import memory as student_memory
+
+    lines = []
+    for stage, need_of in (("ddg", ddg_memory.need), ("student", student_memory.need)):
+        if not artifacts.is_finished(run_dir / stage):
+            memory.check(need := need_of(config), run_dir)
+            lines.append(str(need))
+    return lines
+
+
 def _check_start(stage: str, init_from: str, file: str) -> None:
     """UserError unless `init_from` is empty or holds the checkpoint `file`."""
     source = Path(init_from)

@@ -96,7 +96,7 @@ class Config(Section):
     seed: Seed = 0
     """Seed of all random numbers."""
     scale: Annotated[float, Range(0, 1, above=True)] = 1.0
-    """Factor on the preset's counts (steps, episodes, environments, trials, rounds, batches), never on sizes of
+    """Factor on the counts of the preset (steps, episodes, environments, trials, rounds), never on sizes of
     networks or pictures: below 1 a trial run, whose figures mean nothing. Counts given on their own stay."""
     world: WorldConfig = field(default_factory=WorldConfig)
     teacher: TeacherConfig = field(default_factory=TeacherConfig)

@@ -57,7 +57,10 @@ def check_renderer(name: str) -> None:
 
 
 def jax_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0) -> Renderer:
-    """The JAX ray caster: on a GPU all scenes at once, on processors one after another, which is faster."""
+    """The JAX ray caster: on accelerators all scenes at once, on processors one after another (faster there).
+
+    Which of the two is decided when a program is lowered for its device.
+    """
 
     def draw(scene):
         geoms, T_world_cam = scene
@@ -67,9 +70,17 @@ def jax_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0
         seen = raycast.render(geoms, seen_from, far_m=far_m)
         return Pictures(seen.depth_m, seen.rgb, seen.segmentation)
 
-    if any(device.platform == "gpu" for device in jax.devices()):
-        return lambda geoms, T_world_cam: jax.vmap(draw)((geoms, T_world_cam))
-    return lambda geoms, T_world_cam: jax.lax.map(draw, (geoms, T_world_cam))
+    def one_after_another(geoms: Geoms, T_world_cam: jax.Array) -> Pictures:
+        return jax.lax.map(draw, (geoms, T_world_cam))
+
+    def at_once(geoms: Geoms, T_world_cam: jax.Array) -> Pictures:
+        return jax.vmap(draw)((geoms, T_world_cam))
+
+    def render(geoms: Geoms, T_world_cam: jax.Array) -> Pictures:
+        T = jnp.asarray(T_world_cam)
+        return jax.lax.platform_dependent(geoms, T, cpu=one_after_another, default=at_once)
+
+    return render
 
 
 def warp_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0) -> Renderer:
