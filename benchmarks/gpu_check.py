@@ -5,10 +5,10 @@
 Conformance of the physics backends, pictures against MuJoCo's OpenGL renderer, frames/s, environment
 steps/s, training steps/s and frames/s of generator and student at the sizes of preset paper, and the time a
 teacher takes to 95 % success: PPO from the guide (cloned first), and PPO from nothing. Each section is a
-process of its own with a deadline; what it has measured so far is on disk after every figure, so that a section cut off, or the
-whole command, leaves its results. A section that fails, is cut off, or finds a limit exceeded is
-recorded under "errors", and the command ends with status 1. `--device cpu` runs the same sections at
-sizes that mean nothing, to test the command where there is no GPU.
+process of its own with a deadline; what it has measured so far is on disk after every figure, so that a
+section cut off, or the whole command, leaves its results. A section that fails, is cut off, or finds a limit
+exceeded is recorded under "errors", and the command ends with status 1. `--device cpu` runs the same
+sections at sizes that mean nothing, to test the command where there is no GPU.
 """
 
 import argparse

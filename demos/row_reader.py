@@ -29,6 +29,11 @@ class RowReader:
         self._chunk = array.chunks[0]
         self._plain = not array.compressors and array.shards is None and array.dtype.byteorder != ">"
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(N, ...)."""
+        return self._array.shape
+
     def read(self, index: Int[np.ndarray, " n"]) -> Shaped[np.ndarray, "n ..."]:
         """Rows `index` (n,) in that order; UserError if a file of them is gone or cut short."""
         made = np.empty((len(index), *self._array.shape[1:]), self._array.dtype)

@@ -26,6 +26,7 @@ from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
 from student_jax import frames_io, head, pretrained_encoder, train
 from student_jax.act import SourceCamera, StudentActor
+from student_jax.data import Window
 from student_jax.depth_source import DepthSource
 from student_jax.policy import PARAMS_FILE, init_params
 
@@ -53,6 +54,7 @@ class Trainer:
         self._teacher, self._source = teacher, source
         self._directory, self._progress = directory, progress
         self._store = EpisodeStore(directory / frames_io.CACHE, create=True, compressed=False)
+        self._window = Window.seen(self._profile, self._student.training.crop_shift_px)
         self._done: list[str] = []
         self.history: list[dict[str, Any]] = []
         self.params: dict = {}
@@ -61,7 +63,9 @@ class Trainer:
         """Every phase that is not finished; `params` is then the student."""
         self._restore()
         self._phase("poses", self._fit_on_poses)
-        frames_io.add_noisy_demos(demos, self._store, self._source, self._config, self._progress)
+        frames_io.add_noisy_demos(
+            demos, self._store, self._source, self._config, self._progress, self._window
+        )
         self._phase("demos", lambda: self._fit("demos", self._student.training.steps))
         for i in range(1, self._student.dagger.rounds + 1):
             self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))
@@ -111,7 +115,7 @@ class Trainer:
     def _fit_on_perception(self) -> dict[str, float]:
         if self._student.head.train_steps == 0:
             return {}
-        frames = frames_io.load(self._directory / frames_io.CACHE)
+        frames = frames_io.load(self._directory / frames_io.CACHE, self._window)
         self.params, measured = head.fit_on_perception(
             self._config, self.params, frames, self._directory, self._progress
         )
@@ -135,7 +139,7 @@ class Trainer:
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
                 key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
                 episodes = roller.run(key, actor, lambda _: task.advance())
-            frames_io.add_rollouts(self._store, episodes, actor.seen)
+            frames_io.add_rollouts(self._store, episodes, actor.seen, self._window)
             measured["rollout_success"] = rate = float(episodes.success.mean())
             self._progress.note(f"round {number}: {rate:.0%} success with the teacher taking {share:.0%}")
         return measured | self._fit(f"dagger-{number}", student.dagger.steps)
@@ -145,7 +149,7 @@ class Trainer:
         if steps == 0:
             return {}
         student, profile = self._student, self._profile
-        frames = frames_io.load(self._directory / frames_io.CACHE)
+        frames = frames_io.load(self._directory / frames_io.CACHE, self._window)
         trained, frozen = train.split(student, self.params)
         number = _phase_number(phase)
 

@@ -35,6 +35,49 @@ class DepthInMemory:
         return self.depth_mm[index]
 
 
+@dataclass(frozen=True)
+class Window:
+    """The part of a camera's picture that a student can see, wherever its crop window is shifted to."""
+
+    rows: slice
+    columns: slice
+    height_px: int
+    """Of the whole picture."""
+    width_px: int
+    """Of the whole picture."""
+
+    @classmethod
+    def seen(cls, profile: contract.CameraProfile, shift_px: int) -> "Window":
+        """The crop window of `profile`, and `shift_px` pixels around it."""
+        top, left = profile.crop_origin_px
+        rows = slice(top - shift_px, top + profile.crop_height_px + shift_px)
+        columns = slice(left - shift_px, left + profile.crop_width_px + shift_px)
+        return cls(rows, columns, profile.height_px, profile.width_px)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Its rows and columns."""
+        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+    def cut(self, depth_mm: UInt16[np.ndarray, "*n H W"]) -> UInt16[np.ndarray, "*n h w"]:
+        """The window of whole pictures."""
+        return depth_mm[..., self.rows, self.columns]
+
+
+@dataclass(frozen=True)
+class DepthInWindow:
+    """Pictures of which a window is kept; around it they are invalid."""
+
+    kept: DepthRows
+    window: Window
+
+    def read(self, index: Int[np.ndarray, " n"]) -> UInt16[np.ndarray, "n H W"]:
+        """See `DepthRows`."""
+        depth = np.zeros((len(index), self.window.height_px, self.window.width_px), np.uint16)
+        self.window.cut(depth)[:] = self.kept.read(index)
+        return depth
+
+
 @dataclass
 class Frames:
     """N control steps of many episodes, one after another."""

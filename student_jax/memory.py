@@ -10,6 +10,7 @@ from ddgrasp.config import Config
 from learning.memory import Need, traced_bytes
 from learning.prefetch import AHEAD
 from student_jax import train
+from student_jax.data import Window
 from student_jax.policy import Aux, param_shapes
 
 _ROW_BYTES = 4 * (8 + 8 + 40 + 1) + 16
@@ -25,7 +26,8 @@ def need(config: Config) -> Need:
     batch = student.training.batch_size * contract.DEPTH_FRAMES * picture
     acting = max(student.dagger.episodes, config.evaluation.student_trials)
     host = (AHEAD + 2) * batch + frames * _ROW_BYTES + acting * (contract.DEPTH_FRAMES + 3) * picture
-    disk = (frames + acting * config.world.episode_steps) * picture
+    height, width = Window.seen(profile, student.training.crop_shift_px).shape
+    disk = frames * 2 * height * width + acting * config.world.episode_steps * picture
     remedy = "student.training.batch_size, student.dagger.episodes or world.camera_scale"
     return Need("student", training_bytes(config), host, disk, remedy)
 

@@ -54,10 +54,10 @@ def test_the_stages_needs_are_those_of_their_programs():
 
 def test_frames_of_the_paper_need_a_disk_not_memory():
     paper = PRESETS["paper"]
-    frames = (1200 + 6 * 512 + 512) * 60
+    frames, window = (1200 + 6 * 512) * 60, (225 + 2 * 12) * (290 + 2 * 12)
     need = student_memory.need(paper)
-    assert need.disk == frames * 360 * 640 * 2
-    assert need.host < need.disk / 20
+    assert need.disk == 2 * (frames * window + 512 * 60 * 360 * 640)  # 54 GB
+    assert need.host < need.disk / 15
 
 
 def test_more_than_there_is_is_refused_with_the_remedy(tmp_path):

@@ -1,22 +1,32 @@
 """Frames that stay on disk: the same batches as from memory, bounded memory, damaged files."""
 
+import dataclasses
 import subprocess
 import sys
 import textwrap
 import threading
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from ddgrasp import contract
-from ddgrasp.config import StudentConfig
+from ddgrasp.config import (
+    EncoderConfig,
+    HandViewConfig,
+    PictureConfig,
+    StudentConfig,
+    StudentTrainingConfig,
+)
 from ddgrasp.errors import UserError
 from demos.spool import Spool
 from demos.store import EpisodeStore
 from learning.prefetch import AHEAD, Prefetched
 from student_jax import frames_io, train
-from student_jax.data import make_frames
+from student_jax.data import Window, make_frames
+from student_jax.policy import init_params
 
 PROFILE = contract.D455.scaled(0.1)
 LENGTHS = (21, 1, 30, 2, 13)
@@ -150,3 +160,36 @@ def test_memory_does_not_grow_with_the_frames_on_disk(tmp_path):
         [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=True
     )
     assert float(done.stdout) < 100
+
+
+def test_what_the_student_cannot_see_is_not_kept_and_changes_nothing(tmp_path):
+    """Training steps on frames cut to the window are those on whole frames, to the last bit."""
+    shift = 3
+    config = StudentConfig(
+        picture=PictureConfig(height_px=44, width_px=56),
+        encoder=EncoderConfig(width=8, keypoints=4, stage_blocks=(1, 1), features=16),
+        training=StudentTrainingConfig(batch_size=4, noise_draws=2, crop_shift_px=shift),
+        hand_view=HandViewConfig(size_px=8, width=8, blocks=1, channels=2, features=8),
+    )
+    window = Window.seen(PROFILE, shift)
+    whole = stored(tmp_path / "whole.zarr", compressed=False)
+    store = EpisodeStore(tmp_path / "cut.zarr", create=True, compressed=False)
+    for episode in whole:
+        store.append(episode | {"depth_mm": window.cut(episode["depth_mm"])}, {"from_demo": np.bool_(True)})
+    assert store.reader("depth_mm").shape[1:] == window.shape != (PROFILE.height_px, PROFILE.width_px)
+    params = init_params(jax.random.key(0), config, PROFILE)
+    trained, frozen = train.split(config, params)
+    ends = []
+    for name in ("whole.zarr", "cut.zarr"):
+        frames = frames_io.load(tmp_path / name, window)
+        state = train.init_state(config, 3, 0, trained)
+        for step in range(3):
+            rng = np.random.default_rng([1, step])
+            batch = train.make_batch(frames, frames.draw(rng, 4, 0.4), rng, config, PROFILE)
+            corner = [(-shift, -shift), (shift, shift), (-shift, shift), (shift, -shift)]
+            crops = (np.array(PROFILE.crop_origin_px) + corner).astype(np.int32)
+            batch = dataclasses.replace(batch, crop_rc=jnp.asarray(crops))
+            state, _ = train.train_step(config, PROFILE, 3, state, frozen, batch)
+        ends.append(jax.tree.leaves(state.params))
+    for a, b in zip(*ends, strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
