@@ -3,13 +3,14 @@
     python -m benchmarks.costs [--preset paper] [--share 0.4] [--compile]
 
 A row per kind of step: how often a run takes it, floating-point operations and bytes of one, and the time of
-all on an NVIDIA H100 at 40 % of its peak, of arithmetic or of memory traffic, whichever takes longer. The sum
-is the plan for a run, to be checked against the first GPU: none has run it.
+all on an NVIDIA H100 at 40 % of its peaks, of arithmetic and of memory traffic. The sums are the plan for a
+run, to be checked against the first GPU: none has run it.
 
-XLA counts the body of a loop once; where its length is known (substeps, steps of a sampler) it is multiplied
-in. The contact solver's loops are not: physics costs more than this says. Bytes are counted before operations
-are fused, far more than a GPU moves; with --compile they are those of the program compiled for this machine's
-CPU, which takes minutes. Both are upper bounds of sorts, so they are shown beside the time, not hidden in it.
+XLA counts the body of a loop once; where its length is known (substeps, steps of a sampler, chunks of a
+picture) it is multiplied in. The contact solver's loops are not: physics costs more than this says. Bytes are
+counted before operations are fused, far more than a GPU moves; with --compile networks' are those of the
+program compiled for this machine's CPU, which takes minutes. So the time by memory is an upper bound, and
+stands in a column of its own.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from benchmarks.programs import PROGRAMS, lower
 from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.presets import get_preset
+from mjx_envs.render import raycast
 
 TENSOR_FLOPS = 494.7e12
 """H100 SXM, TF32 without sparsity: what XLA uses for float32 products and convolutions by default (NVIDIA's
@@ -69,10 +71,11 @@ def rows(config: Config) -> Iterator[Row]:
     yield Row("teacher", "control step", teacher.total_steps / teacher.num_envs, substeps, tensor=False)
 
     steps = math.ceil(demos.episodes / demos.parallel) * length
+    chunks = raycast.chunk_count(config.world.profile.height_px * config.world.profile.width_px)
     yield Row("demos", "demo rollout: advance", steps, substeps, tensor=False)
-    yield Row("demos", "rendering: depth", steps, tensor=False)
+    yield Row("demos", "rendering: depth", steps, chunks, tensor=False)
     if demos.rgb:
-        yield Row("demos", "rendering: colour", steps, tensor=False)
+        yield Row("demos", "rendering: colour", steps, chunks, tensor=False)
 
     yield Row("ddg", "generator: train step", ddg.training.steps)
     drawn = demos.episodes * (1 - student.training.clean_share)
@@ -81,7 +84,7 @@ def rows(config: Config) -> Iterator[Row]:
     yield Row("student", f"sampler: {ddg.sampling.sampler}", batches, ddg.sampling.steps)
 
     rendered = student.dagger.rounds * student.dagger.episodes + 2 * config.evaluation.student_trials
-    yield Row("student", "rendering: depth", rendered * length / demos.parallel, tensor=False)
+    yield Row("student", "rendering: depth", rendered * length / demos.parallel, chunks, tensor=False)
     fitted = student.training.steps + student.dagger.rounds * student.dagger.steps
     yield Row("student", "student: train step", fitted)
     frames = (demos.episodes + student.dagger.rounds * student.dagger.episodes) * length
@@ -92,10 +95,11 @@ def rows(config: Config) -> Iterator[Row]:
 
 
 def price(config: Config, row: Row, compiled: bool) -> Cost:
-    """XLA's count for one call of the row's program."""
-    lowered = lower(PROGRAMS[row.program](config), jax.default_backend())
-    counted = lowered.cost_analysis() or {}
-    moved = (lowered.compile().cost_analysis() or {}) if compiled else counted
+    """XLA's count for one call of the row's program, as it is lowered for NVIDIA GPUs."""
+    program = PROGRAMS[row.program](config)
+    counted = moved = lower(program, "cuda").cost_analysis() or {}
+    if compiled and row.tensor:
+        moved = lower(program, jax.default_backend()).compile().cost_analysis() or {}
     return Cost(row.loops * counted.get("flops", 0.0), row.loops * moved.get("bytes accessed", 0.0))
 
 
