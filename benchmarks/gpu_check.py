@@ -3,11 +3,12 @@
     python -m benchmarks.gpu_check [--out runs/gpu_check.json] [--sections NAME ...] [--device cpu]
 
 Conformance of the physics backends, pictures against MuJoCo's OpenGL renderer, frames/s, environment
-steps/s, and the time a teacher takes to 95 % success. Each section is a process of its own with a
-deadline; what it has measured so far is on disk after every figure, so that a section cut off, or the
-whole command, leaves its results. A section that fails, is cut off, or finds a limit exceeded is
-recorded under "errors", and the command ends with status 1. `--device cpu` runs the same sections at
-sizes that mean nothing, to test the command where there is no GPU.
+steps/s, training steps/s and frames/s of generator and student at the sizes of preset paper, and the time a
+teacher takes to 95 % success: PPO from the guide (cloned first), and PPO from nothing. Each section is a
+process of its own with a deadline; what it has measured so far is on disk after every figure, so that a
+section cut off, or the whole command, leaves its results. A section that fails, is cut off, or finds a limit
+exceeded is recorded under "errors", and the command ends with status 1. `--device cpu` runs the same
+sections at sizes that mean nothing, to test the command where there is no GPU.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp import artifacts, contract
-from ddgrasp.config import Backend
+from ddgrasp.config import Backend, TeacherConfig
 from ddgrasp.files import atomic_write_json, read_json
 from ddgrasp.progress import Progress
 
@@ -50,7 +51,11 @@ class Sizes:
     scenes: int
     """Compared with OpenGL."""
     teacher: dict[str, Any]
-    """Fields of TeacherConfig that differ from preset laptop's."""
+    """Fields of TeacherConfig that differ from the presets'."""
+    preset: str
+    """Whose generator and student are timed."""
+    training_steps: int
+    """Timed, of each."""
     slack: float
     """Deadlines are longer by this factor."""
 
@@ -65,6 +70,8 @@ GPU = Sizes(
     frame_pixels=2**26,
     scenes=48,
     teacher={"total_steps": 20_000_000, "num_envs": 4096, "minibatches": 16, "eval_every": 2},
+    preset="paper",
+    training_steps=50,
     slack=1.0,
 )
 CPU = Sizes(
@@ -78,8 +85,10 @@ CPU = Sizes(
     scenes=2,
     teacher={
         "total_steps": 64, "num_envs": 8, "unroll_steps": 4, "minibatches": 2, "epochs": 1, "eval_every": 1,
-        "start": "nothing", "critic_warmup": 0, "hidden": (8,),
+        "critic_warmup": 0, "hidden": (8,), "clone_envs": 4, "clone_steps": 2,
     },
+    preset="debug",
+    training_steps=3,
     slack=5.0,
 )  # fmt: skip
 SIZES = {"gpu": GPU, "cpu": CPU}
@@ -195,14 +204,41 @@ def env_steps(sizes: Sizes, save: Save) -> Iterator[str]:
     yield from ()
 
 
-def teacher(sizes: Sizes, save: Save) -> Iterator[str]:
-    """Trains a teacher from nothing until an evaluation reaches SUCCESS_AIM; wall time, compilation too."""
+def training(sizes: Sizes, save: Save) -> Iterator[str]:
+    """Training steps/s and frames/s of generator and student, batches on the device."""
+    from benchmarks import training_speed
+    from ddgrasp.presets import get_preset
+
+    config = get_preset(sizes.preset)
+    for name, measure in (("student", training_speed.student), ("generator", training_speed.generator)):
+        save(preset=sizes.preset, **{name: measure(config, sizes.training_steps)})
+    yield from ()
+
+
+def ppo_from_guide(sizes: Sizes, save: Save) -> Iterator[str]:
+    """PPO of a policy that was cloned from the scripted guide first, as preset laptop does it."""
+    from ddgrasp.presets import LAPTOP
+
+    rounds = {} if sizes is GPU else {"clone_rounds": 1}
+    yield from _teacher(sizes, save, replace(LAPTOP.teacher, **sizes.teacher | rounds))
+
+
+def ppo_from_nothing(sizes: Sizes, save: Save) -> Iterator[str]:
+    """PPO of a policy that starts at random: no guide, no checkpoint; otherwise as in preset paper."""
+    from ddgrasp.presets import PAPER
+
+    yield from _teacher(sizes, save, replace(PAPER.teacher, **sizes.teacher))
+
+
+def _teacher(sizes: Sizes, save: Save, teacher: TeacherConfig) -> Iterator[str]:
+    """Trains until an evaluation reaches SUCCESS_AIM; wall time, cloning and compilation too."""
     from ddgrasp.config import WorldConfig
     from ddgrasp.presets import LAPTOP
     from ppo.train import train
 
     world = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics)
-    config = replace(LAPTOP, world=world, teacher=replace(LAPTOP.teacher, **sizes.teacher))
+    config = replace(LAPTOP, world=world, teacher=teacher)
+    save(start=teacher.start, num_envs=teacher.num_envs)
     evaluations: list[dict[str, float]] = []
     start = time.monotonic()
 
@@ -214,7 +250,7 @@ def teacher(sizes: Sizes, save: Save) -> Iterator[str]:
                 return
             seconds = time.monotonic() - start
             evaluations.append({"iteration": step, "success": values["eval_success"], "seconds": seconds})
-            save(num_envs=config.teacher.num_envs, evaluations=evaluations)
+            save(evaluations=evaluations)
             if values["eval_success"] >= SUCCESS_AIM:
                 save(seconds_to_95_percent=seconds)
                 raise _Reached
@@ -229,7 +265,7 @@ def teacher(sizes: Sizes, save: Save) -> Iterator[str]:
 
 
 class _Reached(Exception):
-    """The aim of section `teacher`."""
+    """The aim of the sections that train a teacher."""
 
 
 SECTIONS: dict[str, tuple[Callable[[Sizes, Save], Iterator[str]], float]] = {
@@ -238,7 +274,9 @@ SECTIONS: dict[str, tuple[Callable[[Sizes, Save], Iterator[str]], float]] = {
     "pictures": (pictures, 60.0),
     "frames": (frames, 60.0),
     "env_steps": (env_steps, 80.0),
-    "teacher": (teacher, 300.0),
+    "training": (training, 90.0),
+    "ppo_from_guide": (ppo_from_guide, 120.0),
+    "ppo_from_nothing": (ppo_from_nothing, 300.0),
 }
 """Name -> (function, seconds it may take). What a section leaves is the next one's; the sum is cut at
 TOTAL_S."""

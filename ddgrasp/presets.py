@@ -181,8 +181,25 @@ PAPER = Config(
     evaluation=EvalConfig(rig_trials=300),
     score=ScoreConfig(trajectories=160, kid_subset_size=1000),
 )
-"""The paper's sizes, for one GPU. Not run yet. The paper's picture is the crop window, 225 x 290 pixels at
-this scale. The encoder needs multiples of 4: 224 x 288 trims a row and two columns and resamples nothing."""
+"""The paper's sizes, for one GPU. No GPU has run it; `--scale 0.001` passes through it on a CPU, and
+docs/accelerators.md says what is known of it. Not the paper's:
+
+camera: 640 x 360, half of its 1280 x 720 per side, in which the crop window of 450 x 580 is 225 x 290 pixels.
+    What the network sees is about what ResNet-18 was made for, and frames, which are read again and again,
+    have a quarter of the bytes. The encoder needs multiples of 4: 224 x 288 trims a row and two columns and
+    resamples nothing.
+generator: at 320 x 180 (the paper does not say), drawing holes and deviations from the surface instead of
+    depth itself (--ddg.depth.representation depth is the paper's; docs/generator.md compares them).
+prior: inverse depth, holes filled, where the paper has Video Depth Anything: its weights are not part of this
+    repository (--ddg.prior.source video_depth_anything, once they are converted).
+sampler: DPM-Solver with 10 evaluations, where the paper goes through all K steps: 100 times the time.
+encoder: ResNet-18 from random numbers, where the paper's starts from ImageNet's weights, for the same reason
+    (--student.encoder.weights weights/resnet18); its last stage keeps stride 16, and keypoints pool it.
+student: sees relief over the table instead of depth, and has a hand view, privileged losses and DAgger, which
+    the paper has not: perception to 5 mm is what decides whether it grasps (docs/student.md).
+crops: shifted by up to 12 pixels around the window's place, since the camera's place is known here.
+teacher: networks, number of environments and steps are not in the paper; ours for its 95 %.
+"""
 
 PRESETS = {config.preset: config for config in (DEBUG, DEMO, LAPTOP, PPO, PPO_PAPER, CAMERA, PAPER)}
 

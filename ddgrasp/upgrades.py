@@ -84,6 +84,8 @@ _ADDED_AFTER_1 = {"student.depth_source": "learned"}
 
 
 _ADDED_AFTER_2 = {
+    "scale": 1.0,
+    "world.renderer": "jax",
     "world.reward.distance": "funnel",
     "world.reward.grasp_switch": "touch",
     "teacher.target_kl": 0.0,

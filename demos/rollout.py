@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.layout import ACTION, QPOS
+from demos.spool import Spool
 from mjx_envs import randomize
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.render.visual import Viewer
@@ -42,7 +45,6 @@ class Scene:
 class Episodes:
     """B episodes of equal allotted length T; `length` says how many steps of each count."""
 
-    depth_mm: UInt16[np.ndarray, "B T H W"]
     state: Float[np.ndarray, "B T 8"]
     action: Float[np.ndarray, "B T 8"]
     """The teacher's labels."""
@@ -52,7 +54,10 @@ class Episodes:
     success: Bool[np.ndarray, " B"]
     object_index: Int[np.ndarray, " B"]
     T_world_cam: Float[np.ndarray, "B 4 4"]
-    rgb: UInt8[np.ndarray, "B T H W 3"] | None = None
+    depth_mm: Spool | None = None
+    """Clean, (B, H, W) uint16 a step; None unless kept."""
+    rgb: Spool | None = None
+    """(B, H, W, 3) uint8 a step; None unless drawn and kept."""
 
 
 class Roller:
@@ -64,6 +69,7 @@ class Roller:
       count: environments in lock-step.
       with_rgb: draw colour as well (slow).
       with_depth: draw depth; without, pictures have no pixels.
+      keep: folder for a scratch file with the pictures of `Episodes`; None shows them to the actor alone.
     """
 
     def __init__(
@@ -73,12 +79,13 @@ class Roller:
         count: int,
         with_rgb: bool = False,
         with_depth: bool = True,
+        keep: Path | None = None,
     ):
         self.env = GraspEnv(config.world)
-        self.viewer = Viewer(config.world.profile, self.env.table.layout)
+        self.viewer = Viewer(config.world.profile, self.env.table.layout, config.world.renderer)
         self.count, self.steps = count, config.world.episode_steps
         self._teacher, self._random, self._with_rgb = teacher, config.world.random, with_rgb
-        self._with_depth = with_depth
+        self._with_depth, self._keep = with_depth, keep
         self._begin = jax.jit(self._begin_batch)
         self._look = jax.jit(self._look_batch)
         self._pose = jax.jit(self._pose_batch)
@@ -92,10 +99,14 @@ class Roller:
         alive = np.ones(self.count, bool)
         length = np.zeros(self.count, int)
         success = np.zeros(self.count, bool)
-        scenes = []
+        columns: dict[str, list[np.ndarray]] = {"state": [], "expert": [], "observation": [], "held": []}
+        pictures = self._spools()
         for t in range(self.steps):
             scene = self._scene(state, cameras, t)
-            scenes.append(scene)
+            for name, values in columns.items():
+                values.append(getattr(scene, name))
+            for name, spool in pictures.items():
+                spool.add(getattr(scene, name))
             length += alive
             state = self._advance(state, jnp.asarray(actor(scene), jnp.float32))
             success |= alive & (np.asarray(state.metrics["success"]) > 0)
@@ -104,14 +115,36 @@ class Roller:
             if not alive.any():
                 break
 
-        def stack(name):
-            return np.stack([getattr(s, name) for s in scenes], axis=1)
-
+        columns["action"] = columns.pop("expert")
         return Episodes(
-            stack("depth_mm"), stack("state"), stack("expert"), stack("observation"), stack("held"),
-            length, success, np.asarray(state.info["episode"].object_index), np.asarray(cameras),
-            stack("rgb") if self._with_rgb else None,
-        )  # fmt: skip
+            **{name: np.stack(values, axis=1) for name, values in columns.items()},
+            **pictures,
+            length=length,
+            success=success,
+            object_index=np.asarray(state.info["episode"].object_index),
+            T_world_cam=np.asarray(cameras),
+        )
+
+    def programs(self) -> dict[str, tuple[Any, tuple[Any, ...]]]:
+        """Its compiled pieces, each with the shapes of its arguments: to look at without running them."""
+        key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+        state, cameras = jax.eval_shape(self._begin, key)
+        geoms = jax.eval_shape(self._pose, state)
+        action = jax.ShapeDtypeStruct((self.count, contract.ACTION_SIZE), jnp.float32)
+        return {
+            "begin": (self._begin, (key,)),
+            "look": (self._look, (state,)),
+            "pose": (self._pose, (state,)),
+            "depth": (self._draw_depth, (geoms, cameras)),
+            "rgb": (self._draw_rgb, (geoms, cameras)),
+            "advance": (self._advance, (state, action)),
+        }
+
+    def _spools(self) -> dict[str, Spool]:
+        """An empty spool for each kind of picture that is kept."""
+        if self._keep is None:
+            return {}
+        return {name: Spool(self._keep) for name in ("depth_mm", *["rgb"] * self._with_rgb)}
 
     def _scene(self, state, cameras, t: int) -> Scene:
         seen = jax.tree.map(np.asarray, self._look(state))
@@ -171,18 +204,22 @@ def noisy_teacher(rng: np.random.Generator, count: int, noise: float, share: flo
 
 
 def successful(episodes: Episodes) -> Iterator[tuple[dict[str, np.ndarray], dict[str, np.ndarray]]]:
-    """(per-step arrays, per-episode arrays) of each successful episode, for `EpisodeStore.append`."""
+    """(per-step arrays, per-episode arrays) of each successful episode, for `EpisodeStore.append`.
+
+    The roller must have kept the pictures.
+    """
+    assert episodes.depth_mm is not None
     for i in np.flatnonzero(episodes.success):
         n = int(episodes.length[i])
         steps = {
-            "depth_mm": episodes.depth_mm[i, :n],
+            "depth_mm": episodes.depth_mm.episode(int(i), n),
             "state": episodes.state[i, :n].astype(np.float32),
             "action": episodes.action[i, :n].astype(np.float32),
             "observation": episodes.observation[i, :n].astype(np.float32),
             "held": episodes.held[i, :n],
         }
         if episodes.rgb is not None:
-            steps["rgb"] = episodes.rgb[i, :n]
+            steps["rgb"] = episodes.rgb.episode(int(i), n)
         yield (
             steps,
             {

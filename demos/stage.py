@@ -35,7 +35,7 @@ def collect(config: Config, teacher: TeacherPolicy, store: EpisodeStore, progres
     tried = 0
     with progress.task("demos", demos.episodes) as task:
         task.start_at(len(store))
-        roller = Roller(config, teacher, demos.parallel, with_rgb=demos.rgb)
+        roller = Roller(config, teacher, demos.parallel, with_rgb=demos.rgb, keep=store.path.parent)
         while (have := len(store)) < demos.episodes:
             # Keyed by what is there, so that a resumed collection does not repeat episodes.
             key = jax.random.fold_in(jax.random.PRNGKey(_SEED + config.seed), have)

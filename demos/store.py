@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from zarr.codecs import BloscCodec
 
 from ddgrasp.errors import UserError
+from demos.row_reader import RowReader
 
 _CODEC = BloscCodec(cname="zstd", clevel=3)
 _IMAGE_CHUNK = 16
@@ -21,10 +22,16 @@ _ROW_CHUNK = 4096
 
 
 class EpisodeStore:
-    """Append-only list of episodes; a folder."""
+    """Append-only list of episodes; a folder.
 
-    def __init__(self, path: Path | str, *, create: bool = False):
+    Args:
+      create: make it if it is not there, and allow `append`.
+      compressed: what `append` writes; without, `reader` is quick, and pictures take up to 20 times the disk.
+    """
+
+    def __init__(self, path: Path | str, *, create: bool = False, compressed: bool = True):
         path = Path(path)
+        self._codecs = [_CODEC] if compressed else None
         if not create and not (path / "zarr.json").exists():
             raise UserError(f"{path} is no episode store: collect one with `ddgrasp demos collect`.")
         try:
@@ -63,6 +70,10 @@ class EpisodeStore:
         """Per-episode array."""
         return self._read("meta", field, 0, len(self))
 
+    def reader(self, field: str) -> RowReader:
+        """Rows of a per-step array at random; holds none of them."""
+        return RowReader(self.path / "data" / field, _array(self._data, field))
+
     def _read(self, group: str, field: str, first: int, last: int) -> np.ndarray:
         try:
             rows = _array(_group(self._root, group), field)
@@ -79,6 +90,8 @@ class EpisodeStore:
         ends = self.ends
         start, length = (int(ends[-1]) if len(ends) else 0), len(next(iter(steps.values())))
         for name, value in steps.items():
+            if name not in self._data:
+                _create(self._data, name, value, self._codecs)
             _put(self._data, name, start, value)
         for name, value in episode.items():
             _put(self._meta, name, len(ends), np.asarray(value)[None])
@@ -108,14 +121,17 @@ def _check_chunks(path: Path, rows: zarr.Array, first: int, last: int) -> None:
             raise ValueError(f"its file {name} is missing")
 
 
+def _create(group: zarr.Group, name: str, rows: np.ndarray, codecs: list[BloscCodec] | None) -> None:
+    """An empty array for rows like these."""
+    image = rows.ndim >= 3
+    chunks = (_IMAGE_CHUNK if image else _ROW_CHUNK, *rows.shape[1:])
+    group.create_array(name, shape=(0, *rows.shape[1:]), chunks=chunks, dtype=rows.dtype, compressors=codecs)
+
+
 def _put(group: zarr.Group, name: str, start: int, rows: np.ndarray) -> None:
     """Writes rows at `start`, cutting off whatever an interrupted append left from there on."""
     if name not in group:
-        image = rows.ndim >= 3
-        chunks = (_IMAGE_CHUNK if image else _ROW_CHUNK, *rows.shape[1:])
-        group.create_array(
-            name, shape=(0, *rows.shape[1:]), chunks=chunks, dtype=rows.dtype, compressors=[_CODEC],
-        )  # fmt: skip
+        _create(group, name, rows, [_CODEC])
     # The setting is not kept in the store: without it Zarr drops a chunk that an append leaves all zeros.
     array = _array(group, name).with_config({"write_empty_chunks": True})
     array.resize((start + len(rows), *rows.shape[1:]))

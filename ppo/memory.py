@@ -2,21 +2,19 @@
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
 
 import jax
 import mujoco
-import psutil
 
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from learning.memory import compiled_bytes, device_limit, host_bytes, nbytes
 from mjx_envs.grasp_env import AutoReset
 from ppo import learner
 
 EXPERIENCE_COPIES = 5
 """Copies of an iteration's experience at its peak: 41 kB an environment, where 20 steps are 8 kB (XLA's own
 analysis on a CPU, 512 and 4096 environments)."""
-_CGROUP = Path("/sys/fs/cgroup")
 _SIGNS = ("RESOURCE_EXHAUSTED", "Out of memory", "MemoryError", "out of memory")
 
 
@@ -25,15 +23,14 @@ def check(config: Config, env: AutoReset) -> None:
     teacher = config.teacher
     state = jax.eval_shape(lambda key: learner.init(teacher, env, key), jax.random.PRNGKey(0)).env_state
     step = 2 * state.obs.size + teacher.num_envs * (2 * env.env.action_size + 4)  # floats in a transition
-    per_batch = 3 * _nbytes(state) + EXPERIENCE_COPIES * teacher.unroll_steps * step * 4
+    per_batch = 3 * nbytes(state) + EXPERIENCE_COPIES * teacher.unroll_steps * step * 4
     _compare(config, env, per_batch // env.mesh.size)
 
 
 def check_compiled(config: Config, env: AutoReset, compiled: jax.stages.Compiled) -> None:
     """UserError if the compiled iteration needs more than there is, by XLA's own analysis."""
-    if (stats := compiled.memory_analysis()) is not None:
-        held = stats.argument_size_in_bytes + stats.output_size_in_bytes - stats.alias_size_in_bytes
-        _compare(config, env, held + stats.temp_size_in_bytes)
+    if (needed := compiled_bytes(compiled)) is not None:
+        _compare(config, env, needed)
 
 
 @contextlib.contextmanager
@@ -59,28 +56,14 @@ def _compare(config: Config, env: AutoReset, device_bytes: int) -> None:
     local = env.mesh.local_devices
     share = config.teacher.num_envs // env.mesh.size * len(local)
     engine = share * mujoco.mj_sizeModel(env.env.mj_model) if config.world.backend == "cpu" else 0
-    stats = local[0].memory_stats() if local[0].platform != "cpu" else None
-    demands = [("host", engine, _host_bytes())]
-    if stats and "bytes_limit" in stats:
-        demands.append((f"device {local[0].device_kind}", device_bytes, stats["bytes_limit"]))
+    demands = [("host", engine, host_bytes())]
+    if (limit := device_limit(local[0])) is not None:
+        demands.append((f"device {local[0].device_kind}", device_bytes, limit))
     else:
-        demands = [("host", engine + device_bytes * len(local), _host_bytes())]
+        demands = [("host", engine + device_bytes * len(local), host_bytes())]
     for place, needed, free in demands:
         if needed > free:
             raise UserError(
                 f"teacher.num_envs {config.teacher.num_envs} needs about {needed / 1e9:.1f} GB of memory on "
                 f"the {place}, which has {free / 1e9:.1f} GB for it: {_REMEDY}."
             )
-
-
-def _host_bytes() -> int:
-    """Memory that this process may still take: the machine's, or what is left of the container's limit."""
-    free = psutil.virtual_memory().available
-    with contextlib.suppress(OSError, ValueError):
-        limit, used = (int((_CGROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
-        free = min(free, limit - used)
-    return free
-
-
-def _nbytes(tree) -> int:
-    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))

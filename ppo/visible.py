@@ -34,8 +34,9 @@ class Watcher:
 
     def __init__(self, env: GraspEnv):
         self._env = env
-        self._viewer = Viewer(env.config.profile, env.table.layout)
-        self._large = Viewer(contract.D455.scaled(PICTURE_SCALE), env.table.layout)
+        layout, renderer = env.table.layout, env.config.renderer
+        self._viewer = Viewer(env.config.profile, layout, renderer)
+        self._large = Viewer(contract.D455.scaled(PICTURE_SCALE), layout, renderer)
         self._geoms = jax.jit(jax.vmap(self._viewer.geoms))
         self._pixels = jax.jit(self._viewer.object_pixels)
         self._rgb = jax.jit(self._large.rgb)

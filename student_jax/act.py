@@ -1,7 +1,9 @@
 """The student at the wheel of many simulated environments, on clean depth or a depth source's."""
 
+from collections import deque
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +14,7 @@ from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.depth import to_metres
 from demos.rollout import Scene
-from student_jax.data import stack_steps
+from demos.spool import Spool
 from student_jax.depth_source import DepthSource
 from student_jax.policy import sample_actions
 
@@ -45,6 +47,7 @@ class StudentActor:
       params: the policy's, a tree of arrays.
       noise: start of the reverse diffusion, as in `DeployConfig.noise`: zero or normal.
       teacher_share: probability that an action is the teacher's instead.
+      keep: folder for the scratch file of `seen`; None takes the system's place for temporary files.
     """
 
     def __init__(
@@ -56,19 +59,24 @@ class StudentActor:
         rng: np.random.Generator,
         noise: str = "zero",
         teacher_share: float = 0.0,
+        keep: Path | None = None,
     ):
         self._act = partial(_act, config, profile, params)
         self._config, self._corrupt, self._rng, self._teacher_share = config, corrupt, rng, teacher_share
         self._noise_scale = float(noise == "normal")
         self._chunk = np.zeros(0)
-        self.seen_mm: list[np.ndarray] = []
+        self._stack: deque[np.ndarray] = deque(maxlen=contract.DEPTH_FRAMES)
+        self.seen = Spool(keep)
+        """What the student saw, (B, H, W) uint16 millimetres a step."""
 
     def __call__(self, scene: Scene) -> Float[np.ndarray, "B 8"]:
         """(B, 8) actions for the scene."""
-        self.seen_mm.append(self._corrupt(scene))
+        depth_mm = self._corrupt(scene)
+        self.seen.add(depth_mm)
+        self._stack.append(depth_mm)
         position = scene.step % self._config.head.execute_steps
         if position == 0:
-            frames = [self.seen_mm[t] for t in stack_steps(scene.step)]
+            frames = [self._stack[0]] * (contract.DEPTH_FRAMES - len(self._stack)) + [*self._stack]
             shape = (len(scene.state), self._config.head.chunk, contract.ACTION_SIZE)
             noise = self._noise_scale * self._rng.standard_normal(shape)
             self._chunk = np.asarray(

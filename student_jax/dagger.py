@@ -21,10 +21,12 @@ from demos.rollout import Roller
 from demos.store import EpisodeStore
 from learning.loop import Metrics, run_steps
 from learning.params import load_params, save_params
+from learning.prefetch import Prefetched
 from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
 from student_jax import frames_io, head, pretrained_encoder, train
 from student_jax.act import SourceCamera, StudentActor
+from student_jax.data import Window
 from student_jax.depth_source import DepthSource
 from student_jax.policy import PARAMS_FILE, init_params
 
@@ -51,7 +53,8 @@ class Trainer:
         self._config, self._student, self._profile = config, config.student, config.world.profile
         self._teacher, self._source = teacher, source
         self._directory, self._progress = directory, progress
-        self._store = EpisodeStore(directory / frames_io.CACHE, create=True)
+        self._store = EpisodeStore(directory / frames_io.CACHE, create=True, compressed=False)
+        self._window = Window.seen(self._profile, self._student.training.crop_shift_px)
         self._done: list[str] = []
         self.history: list[dict[str, Any]] = []
         self.params: dict = {}
@@ -60,7 +63,9 @@ class Trainer:
         """Every phase that is not finished; `params` is then the student."""
         self._restore()
         self._phase("poses", self._fit_on_poses)
-        frames_io.add_noisy_demos(demos, self._store, self._source, self._config, self._progress)
+        frames_io.add_noisy_demos(
+            demos, self._store, self._source, self._config, self._progress, self._window
+        )
         self._phase("demos", lambda: self._fit("demos", self._student.training.steps))
         for i in range(1, self._student.dagger.rounds + 1):
             self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))
@@ -110,7 +115,7 @@ class Trainer:
     def _fit_on_perception(self) -> dict[str, float]:
         if self._student.head.train_steps == 0:
             return {}
-        frames = frames_io.load(self._directory / frames_io.CACHE)
+        frames = frames_io.load(self._directory / frames_io.CACHE, self._window)
         self.params, measured = head.fit_on_perception(
             self._config, self.params, frames, self._directory, self._progress
         )
@@ -127,13 +132,14 @@ class Trainer:
             rng = np.random.default_rng([self._config.seed, _DAGGER_SEED, number])
             camera = SourceCamera(self._source, first)
             actor = StudentActor(
-                self.params, student, self._profile, camera, rng, self._config.deploy.noise, share
-            )
+                self.params, student, self._profile, camera, rng, self._config.deploy.noise, share,
+                keep=self._directory,
+            )  # fmt: skip
             roller = Roller(self._config, self._teacher, wanted - first, self._source.needs_rgb)
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
                 key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
                 episodes = roller.run(key, actor, lambda _: task.advance())
-            frames_io.add_rollouts(self._store, episodes, actor.seen_mm)
+            frames_io.add_rollouts(self._store, episodes, actor.seen, self._window)
             measured["rollout_success"] = rate = float(episodes.success.mean())
             self._progress.note(f"round {number}: {rate:.0%} success with the teacher taking {share:.0%}")
         return measured | self._fit(f"dagger-{number}", student.dagger.steps)
@@ -143,27 +149,31 @@ class Trainer:
         if steps == 0:
             return {}
         student, profile = self._student, self._profile
-        frames = frames_io.load(self._directory / frames_io.CACHE)
+        frames = frames_io.load(self._directory / frames_io.CACHE, self._window)
         trained, frozen = train.split(student, self.params)
         number = _phase_number(phase)
 
-        def step_once(state: TrainState, step: int) -> tuple[TrainState, Metrics]:
+        def batch_of(step: int) -> train.Batch:
             rng = np.random.default_rng([self._config.seed, number, step])
             index = frames.draw(rng, student.training.batch_size, student.training.held_weight)
-            batch = train.make_batch(frames, index, rng, student, profile)
-            return train.train_step(student, profile, steps, state, frozen, batch)
+            return train.make_batch(frames, index, rng, student, profile)
 
-        state, terms = run_steps(
-            train.init_state(student, steps, self._config.seed, trained),
-            steps,
-            step_once,
-            self._directory / CHECKPOINTS / phase,
-            label=f"student, {phase}",
-            progress=self._progress,
-            first_point=number * _POINTS_PER_PHASE,
-            log_every=LOG_EVERY,
-            shown=("position_error_mm", "yaw", "held"),
-        )
+        with Prefetched(batch_of, steps) as batches:
+
+            def step_once(state: TrainState, step: int) -> tuple[TrainState, Metrics]:
+                return train.train_step(student, profile, steps, state, frozen, batches(step))
+
+            state, terms = run_steps(
+                train.init_state(student, steps, self._config.seed, trained),
+                steps,
+                step_once,
+                self._directory / CHECKPOINTS / phase,
+                label=f"student, {phase}",
+                progress=self._progress,
+                first_point=number * _POINTS_PER_PHASE,
+                log_every=LOG_EVERY,
+                shown=("position_error_mm", "yaw", "held"),
+            )
         self.params = frozen | jax.tree.map(np.asarray, state.ema)
         return terms
 

@@ -1,7 +1,8 @@
-"""The student's training frames: noisy depth, joints, labels and privileged targets, in memory."""
+"""The student's training frames: noisy depth on disk; joints, labels and privileged targets in memory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt16
@@ -14,12 +15,75 @@ YAW_MULTIPLE = 2
 """The gripper looks the same after half a turn: the auxiliary target is the angle's double."""
 
 
+@runtime_checkable
+class DepthRows(Protocol):
+    """N depth pictures, wherever they lie."""
+
+    def read(self, index: Int[np.ndarray, " n"]) -> UInt16[np.ndarray, "n H W"]:
+        """Pictures `index`, in that order."""
+        ...
+
+
+@dataclass(frozen=True)
+class DepthInMemory:
+    """Pictures of whole episodes, for small numbers of them."""
+
+    depth_mm: UInt16[np.ndarray, "N H W"]
+
+    def read(self, index: Int[np.ndarray, " n"]) -> UInt16[np.ndarray, "n H W"]:
+        """See `DepthRows`."""
+        return self.depth_mm[index]
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of a camera's picture that a student can see, wherever its crop window is shifted to."""
+
+    rows: slice
+    columns: slice
+    height_px: int
+    """Of the whole picture."""
+    width_px: int
+    """Of the whole picture."""
+
+    @classmethod
+    def seen(cls, profile: contract.CameraProfile, shift_px: int) -> "Window":
+        """The crop window of `profile`, and `shift_px` pixels around it."""
+        top, left = profile.crop_origin_px
+        rows = slice(top - shift_px, top + profile.crop_height_px + shift_px)
+        columns = slice(left - shift_px, left + profile.crop_width_px + shift_px)
+        return cls(rows, columns, profile.height_px, profile.width_px)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Its rows and columns."""
+        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+    def cut(self, depth_mm: UInt16[np.ndarray, "*n H W"]) -> UInt16[np.ndarray, "*n h w"]:
+        """The window of whole pictures."""
+        return depth_mm[..., self.rows, self.columns]
+
+
+@dataclass(frozen=True)
+class DepthInWindow:
+    """Pictures of which a window is kept; around it they are invalid."""
+
+    kept: DepthRows
+    window: Window
+
+    def read(self, index: Int[np.ndarray, " n"]) -> UInt16[np.ndarray, "n H W"]:
+        """See `DepthRows`."""
+        depth = np.zeros((len(index), self.window.height_px, self.window.width_px), np.uint16)
+        self.window.cut(depth)[:] = self.kept.read(index)
+        return depth
+
+
 @dataclass
 class Frames:
     """N control steps of many episodes, one after another."""
 
-    depth_mm: list[UInt16[np.ndarray, "T H W"]]
-    """Per episode, as the student sees it, holes 0."""
+    depth_mm: DepthRows | None
+    """Depth of every step as the student sees it, holes 0; None without pictures."""
     state: Float32[np.ndarray, "N 8"]
     action: Float32[np.ndarray, "N 8"]
     """The teacher's labels."""
@@ -28,7 +92,7 @@ class Frames:
     held: Float32[np.ndarray, " N"]
     """1 where the object is in the hand."""
     episode: Int[np.ndarray, " N"]
-    """Index into `depth_mm`."""
+    """Which episode a step is of."""
     step: Int[np.ndarray, " N"]
     """Index within the episode."""
     _cumulative: tuple[float, np.ndarray] | None = None
@@ -48,11 +112,11 @@ class Frames:
 
     def depth_stack(self, index: Int[np.ndarray, " B"]) -> UInt16[np.ndarray, "B 3 H W"]:
         """(B, 3, H, W) uint16: the last three frames at each index, the first repeated at the start."""
-        return np.stack([self._stack_one(int(self.episode[i]), int(self.step[i])) for i in index])
-
-    def _stack_one(self, episode: int, step: int) -> np.ndarray:
-        frames = self.depth_mm[episode]
-        return np.stack([frames[t] for t in stack_steps(step)])
+        assert self.depth_mm is not None
+        back = np.arange(contract.DEPTH_FRAMES)[::-1]
+        rows = index[:, None] - np.minimum(self.step[index][:, None], back)
+        depth = self.depth_mm.read(rows.reshape(-1))
+        return depth.reshape(*rows.shape, *depth.shape[1:])
 
     def action_chunks(self, index: Int[np.ndarray, " B"], chunk: int) -> Float32[np.ndarray, "B {chunk} 8"]:
         """(B, chunk, 8) labels from each index on, the episode's last one repeated at its end."""
@@ -61,11 +125,6 @@ class Frames:
         inside = self.episode[ahead] == self.episode[index][:, None]
         last = np.where(inside, ahead, 0).max(axis=1, keepdims=True)
         return self.action[np.where(inside, ahead, last)]
-
-
-def stack_steps(step: int) -> list[int]:
-    """The steps whose frames are the student's stack at `step`, oldest first; at the start, 0 repeated."""
-    return [max(0, step - k) for k in reversed(range(contract.DEPTH_FRAMES))]
 
 
 def aux_targets(
@@ -95,7 +154,7 @@ def make_frames(
     """
     lengths = [len(s) for s in states]
     return Frames(
-        depth_mm=list(depth_mm),
+        depth_mm=DepthInMemory(np.concatenate(depth_mm)) if len(depth_mm) else None,
         state=np.concatenate(states).astype(np.float32),
         action=np.clip(np.concatenate(actions), -1, 1).astype(np.float32),
         observation=np.concatenate(observations).astype(np.float32),

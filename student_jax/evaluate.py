@@ -29,13 +29,16 @@ def closed_loop(
     metrics = {}
     for name, camera in cameras.items():
         rng = np.random.default_rng([config.seed, _SEED])
-        actor = StudentActor(params, config.student, config.world.profile, camera, rng, config.deploy.noise)
+        actor = StudentActor(
+            params, config.student, config.world.profile, camera, rng, config.deploy.noise,
+            keep=progress.directory,
+        )  # fmt: skip
         with progress.task(f"steps of {roller.count} trials, {name}", roller.steps) as task:
             episodes = roller.run(jax.random.PRNGKey(_SEED + config.seed), actor, lambda _: task.advance())  # noqa: B023
         metrics[name] = _counts(episodes, config.world.objects)
         best = int(np.argmax(episodes.success))
-        shown = np.linspace(0, min(len(actor.seen_mm), int(episodes.length[best])) - 1, 6).astype(int)
-        strip = np.stack([actor.seen_mm[t][best] for t in shown])
+        length = min(len(actor.seen), int(episodes.length[best]))
+        strip = actor.seen.episode(best, length)[np.linspace(0, length - 1, 6).astype(int)]
         progress.picture(name, **{"depth the student saw": strip})
     return metrics
 

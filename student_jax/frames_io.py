@@ -1,29 +1,34 @@
 """Demos and DAgger episodes as the student sees them, on disk, so that a resumed stage finds them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, UInt16
+from jaxtyping import Bool
 
 from ddg_jax.generate import Clip
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
 from demos.rollout import Episodes
+from demos.spool import Spool
 from demos.store import EpisodeStore
-from student_jax.data import Frames, make_frames
+from student_jax.data import DepthInWindow, Frames, Window, make_frames
 from student_jax.depth_source import DepthSource, check_colour
 
 CACHE = "frames.zarr"
-_FIELDS = ("depth_mm", "state", "action", "observation", "held")
+_COLUMNS = ("state", "action", "observation", "held")
+_FIELDS = ("depth_mm", *_COLUMNS)
 
 
 def add_noisy_demos(
-    demos: EpisodeStore, frames: EpisodeStore, source: DepthSource, config: Config, progress: Progress
-) -> None:
+    demos: EpisodeStore, frames: EpisodeStore, source: DepthSource, config: Config, progress: Progress,
+    window: Window | None = None,
+) -> None:  # fmt: skip
     """Copies the demos into `frames` with the source's artefacts on their depth, going on from what is there.
 
     A share of `config.student.training.clean_share` keeps clean depth. Steps long after the grasp are left
-    out. UserError if the source needs colour that the demos lack.
+    out, and so is what lies outside of the `window` if one is given. UserError if the source needs colour
+    that the demos lack.
     """
     check_colour(source, demos)
     ends = [0, *demos.ends.tolist()]
@@ -45,6 +50,8 @@ def add_noisy_demos(
             steps = {name: demos.steps(name, ends[i], ends[i] + lengths[i]) for name in _FIELDS}
             if not keep_clean[i]:
                 steps["depth_mm"] = next(noisy)
+            if window is not None:
+                steps["depth_mm"] = window.cut(steps["depth_mm"])
             frames.append(steps, {"from_demo": np.bool_(True)})
             task.advance()
 
@@ -55,16 +62,13 @@ def useful_steps(held: Bool[np.ndarray, " T"], held_steps: int) -> int:
     return int(enough[0]) + 1 if len(enough) else len(held)
 
 
-def add_rollouts(
-    frames: EpisodeStore, episodes: Episodes, seen_mm: list[UInt16[np.ndarray, "B H W"]]
-) -> None:
-    """Adds DAgger episodes with the depth that the student saw."""
-    seen = np.stack(seen_mm, axis=1)
+def add_rollouts(frames: EpisodeStore, episodes: Episodes, seen: Spool, window: Window) -> None:
+    """Adds DAgger episodes with the depth that the student saw in `window`."""
     for i, length in enumerate(episodes.length):
-        n = min(int(length), seen.shape[1])
+        n = min(int(length), len(seen))
         frames.append(
             {
-                "depth_mm": seen[i, :n],
+                "depth_mm": window.cut(seen.episode(i, n)),
                 "state": episodes.state[i, :n].astype(np.float32),
                 "action": episodes.action[i, :n].astype(np.float32),
                 "observation": episodes.observation[i, :n].astype(np.float32),
@@ -74,11 +78,12 @@ def add_rollouts(
         )
 
 
-def load(path: Path) -> Frames:
-    """All episodes of a frame store, in memory."""
+def load(path: Path, window: Window | None = None) -> Frames:
+    """All episodes of a frame store; depth stays on disk. `window`: the one that was kept, if any was."""
     store = EpisodeStore(path)
-    ends = np.concatenate([[0], store.ends])
-    columns = {name: np.split(store.steps(name), ends[1:-1]) for name in _FIELDS}
-    return make_frames(
-        columns["depth_mm"], columns["state"], columns["action"], columns["observation"], columns["held"]
-    )
+    bounds = store.ends[:-1]
+    columns = (np.split(store.steps(name), bounds) for name in _COLUMNS)
+    depth = store.reader("depth_mm")
+    if window is not None and depth.shape[1:] == window.shape:
+        depth = DepthInWindow(depth, window)
+    return replace(make_frames([], *columns), depth_mm=depth)

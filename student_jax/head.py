@@ -12,6 +12,7 @@ from ddgrasp.progress import Progress
 from demos.rollout import Roller
 from learning.loop import Metrics, run_steps
 from learning.params import load_params, save_params
+from learning.prefetch import Prefetched
 from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
 from student_jax import train
@@ -117,14 +118,19 @@ def _join(a: Samples, b: Samples) -> Samples:
 def _encode_all(config: Config, params: dict, frames: Frames, rng, progress: Progress) -> Seen:
     """What perception reports of all frames, each under one random crop and disparity noise."""
     student, profile, parts = config.student, config.world.profile, []
-    batches = range(0, len(frames), _ENCODE_BATCH)
-    for start in progress.track(batches, "features", len(batches)):
-        index = np.minimum(np.arange(start, start + _ENCODE_BATCH), len(frames) - 1)
+    count = -(-len(frames) // _ENCODE_BATCH)
+
+    def inputs(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        first = number * _ENCODE_BATCH
+        index = np.minimum(np.arange(first, first + _ENCODE_BATCH), len(frames) - 1)
         crops = random_crops(rng, _ENCODE_BATCH, profile, student.training.crop_shift_px)
-        key = jax.random.fold_in(jax.random.key(config.seed), start)
-        depth, state = frames.depth_stack(index), frames.state[index]
-        seen = train.encode(student, profile, params, depth, state, crops, key)
-        parts.append(jax.tree.map(np.asarray, seen))
+        return frames.depth_stack(index), frames.state[index], crops
+
+    with Prefetched(inputs, count) as batches:
+        for number in progress.track(range(count), "features", count):
+            key = jax.random.fold_in(jax.random.key(config.seed), number * _ENCODE_BATCH)
+            seen = train.encode(student, profile, params, *batches(number), key)
+            parts.append(jax.tree.map(np.asarray, seen))
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(frames)], *parts)
 
 

@@ -13,6 +13,7 @@ from ddgrasp.config import Config
 from ddgrasp.job import Job
 from demos.stage import STORE
 from demos.store import EpisodeStore
+from mjx_envs.render.batch_render import check_renderer
 from ppo import policy as teacher_policy
 from student_jax import evaluate, frames_io, pretrained_encoder
 from student_jax.dagger import Trainer
@@ -23,6 +24,7 @@ from student_jax.head import POSES
 def run(job: Job) -> Artifact:
     """Trains the student and evaluates it closed-loop on clean depth and on the source's."""
     config, directory, progress, parents = job.config, job.directory, job.progress, job.parents
+    check_renderer(config.world.renderer)  # its first picture may be hours away
     encoder_weights = pretrained_encoder.source(config.student)
     source = make_source(config, parents["ddg"].directory)
     teacher = teacher_policy.load(parents["teacher"].directory)

@@ -21,7 +21,7 @@ from ppo.evaluate import evaluate
 
 ITERATIONS = 12
 TINY = (
-    "--preset", "debug", "--teacher.init-from", "", "--teacher.clone-rounds", "0",
+    "--preset", "debug", "--teacher.start", "nothing",
     "--teacher.total-steps", str(16 * 4 * ITERATIONS), "--teacher.num-envs", "16",
     "--teacher.unroll-steps", "4", "--teacher.hidden", "16", "--teacher.learning-rate", "1e-3",
     "--teacher.pregrasp-share", "0", "--teacher.eval-every", "100", "--world.episode-steps", "6",

@@ -52,3 +52,17 @@ def test_without_a_gpu_it_says_so_in_one_line(tmp_path, monkeypatch, capsys):
     assert stop.value.code == 2 and not out.exists()
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and "needs an NVIDIA GPU" in lines[0] and "--device cpu" in lines[0]
+
+
+def test_generator_student_and_both_teachers_are_timed_and_named(tmp_path):
+    out = tmp_path / "check.json"
+    names = ["training", "ppo_from_guide", "ppo_from_nothing"]
+    assert gpu_check.run_all(names, "cpu", out) == 0, out.read_text()
+    report = json.loads(out.read_text())
+    assert report["training"]["preset"] == "debug"
+    assert min(report["training"]["student"].values()) > 0
+    assert min(report["training"]["generator"].values()) > 0
+    assert report["ppo_from_guide"]["start"] == "guide"
+    assert report["ppo_from_nothing"]["start"] == "nothing"
+    for name in names[1:]:
+        assert [row["iteration"] for row in report[name]["evaluations"]] == [0, 1, 2]

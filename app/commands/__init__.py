@@ -13,7 +13,7 @@ import tyro
 
 from app import pipeline
 from app.commands.base import DEFAULT_PRESET, Command, FromPreset
-from app.commands.checks import check_config_values, check_devices, check_options
+from app.commands.checks import check_config_values, check_devices, check_memory, check_options
 from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
@@ -21,7 +21,9 @@ from app.commands.parsing import parsed
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
+from ddgrasp.config import Config
 from ddgrasp.presets import get_preset
+from ddgrasp.scaling import scaled
 
 
 @dataclass(frozen=True)
@@ -29,11 +31,12 @@ class Run(FromPreset):
     """The whole flow: teacher, demos, record, ddg, student, export, deploy, report."""
 
     def run(self) -> None:
-        """Makes every stage that is not finished and prints the table."""
+        """Says what memory the stages will take, makes those that are not finished, prints the table."""
         from evaluation.report.summary import print_summary
 
         check_config_values(self.config)
         check_devices(self.config, self.out)
+        print(*check_memory(self.config, self.out), sep="\n", flush=True)
         report = pipeline.run(self.config, self.out, resume=self.resume)
         print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
         print_summary(report)
@@ -76,7 +79,7 @@ def parse(name: str, args: Sequence[str]) -> Command:
     cls = COMMANDS[name]
     options: dict[str, Any] = {}
     if issubclass(cls, FromPreset):
-        preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
+        preset = _scaled(get_preset(_option(args, "--preset") or DEFAULT_PRESET), _option(args, "--scale"))
         options["default"] = cls(config=preset, out=Path("runs") / preset.preset)
     elif issubclass(cls, Scoring):
         preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
@@ -96,6 +99,15 @@ def parse(name: str, args: Sequence[str]) -> Command:
     return command
 
 
+def _scaled(preset: Config, scale: str | None) -> Config:
+    """`preset` at the `scale` of the command line; what is no scale is left to the parser to refuse."""
+    try:
+        factor = float(scale or 1)
+    except ValueError:
+        return preset
+    return scaled(replace(preset, scale=factor), factor)
+
+
 def describe_commands(group: str = "") -> str:
     """The list that `ddgrasp --help` (or `ddgrasp teacher`) prints."""
     names = [name for name in COMMANDS if not group or name.split()[0] == group]
@@ -108,7 +120,8 @@ def describe_commands(group: str = "") -> str:
 _PRESET_HELP = (
     "Presets (--preset): debug (tests), demo (23 minutes on two cores), laptop (all from nothing, 73 minutes",
     "on two busy cores), camera (laptop, the generator for short recordings of a real camera), paper (one",
-    "GPU). Any value of a preset can be given, for example --teacher.num-envs 64.",
+    "GPU). Any value of a preset can be given, for example --teacher.num-envs 64. --scale 0.001 makes all of",
+    "its counts that much smaller, never its networks or pictures: a trial run, whose figures mean nothing.",
 )
 
 

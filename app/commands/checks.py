@@ -81,11 +81,31 @@ def check_data(option: str, path: Path) -> None:
 
 
 def check_devices(config: Config, run_dir: Path) -> None:
-    """UserError if the teacher, unless it is finished, cannot be trained on the devices present."""
+    """UserError if pictures cannot be drawn here, or the teacher, unless it is finished, not be trained."""
+    from mjx_envs.render.batch_render import check_renderer
+
+    check_renderer(config.world.renderer)
     if not artifacts.is_finished(run_dir / "teacher"):
         from ppo.stage import check
 
         check(config)
+
+
+def check_memory(config: Config, run_dir: Path) -> list[str]:
+    """What each unfinished stage that trains on pictures will take, a line for each; UserError if too much.
+
+    Traces a training step of each, which the stages do as well.
+    """
+    from ddg_jax import memory as ddg_memory
+    from learning import memory
+    from student_jax import memory as student_memory
+
+    lines = []
+    for stage, need_of in (("ddg", ddg_memory.need), ("student", student_memory.need)):
+        if not artifacts.is_finished(run_dir / stage):
+            memory.check(need := need_of(config), run_dir)
+            lines.append(str(need))
+    return lines
 
 
 def _check_start(stage: str, option: str, folder: str, others: str = "") -> None:

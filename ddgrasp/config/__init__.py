@@ -4,8 +4,9 @@ A field's docstring is the command line's help; its type says what it may hold (
 """
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from ddgrasp.config.checks import Section, Seed, Text
+from ddgrasp.config.checks import Range, Section, Seed, Text
 from ddgrasp.config.ddg import (
     CROSS_ENTROPY,
     DDIM,
@@ -76,10 +77,12 @@ from ddgrasp.config.teacher import GUIDE, NOTHING, HostsConfig, TeacherConfig
 from ddgrasp.config.world import (
     BACKENDS,
     PAPER_REWARD,
+    RENDERERS,
     Backend,
     CameraScale,
     GraspSwitch,
     RandomConfig,
+    Renderer,
     RewardConfig,
     RewardDistance,
     WorldConfig,
@@ -95,6 +98,9 @@ class Config(Section):
     """Name of the preset that the values started from."""
     seed: Seed = 0
     """Seed of all random numbers."""
+    scale: Annotated[float, Range(0, 1, above=True)] = 1.0
+    """Factor on the counts of the preset (steps, episodes, environments, trials, rounds), never on sizes of
+    networks or pictures: below 1 a trial run, whose figures mean nothing. Counts given on their own stay."""
     world: WorldConfig = field(default_factory=WorldConfig)
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
@@ -140,6 +146,8 @@ __all__ = [
     "ROBOTS",
     "Robot",
     "BACKENDS",
+    "RENDERERS",
+    "Renderer",
     "Backend",
     "CHANNELS",
     "CROSS_ENTROPY",

@@ -11,6 +11,8 @@ Backend = Literal["cpu", "jax", "warp"]
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
 RewardDistance = Literal["funnel", "plain"]
 GraspSwitch = Literal["touch", "near"]
+Renderer = Literal["jax", "warp"]
+RENDERERS: tuple[Renderer, ...] = get_args(Renderer)
 CameraScale = Annotated[float, Range(0.1, 1)]
 _Relative = Annotated[float, Range(0, 0.9)]
 """Half-range as a share of the nominal value."""
@@ -100,6 +102,8 @@ class WorldConfig(Section, name="world"):
     """Objects, mixed in one batch (`ddgrasp objects list` names them all)."""
     backend: Backend = "cpu"
     """Physics: cpu (MuJoCo's C engine on all cores), jax (MJX) or warp (MJX-Warp, on an NVIDIA GPU)."""
+    renderer: Renderer = "jax"
+    """Pictures of simulated scenes: jax (the project's ray caster) or warp (MJX-Warp's, on an NVIDIA GPU)."""
     episode_steps: Annotated[int, Range(1, 10_000)] = 60
     """Control steps in an episode (10 Hz)."""
     sim_dt_s: Annotated[float, Range(0.0001, contract.CONTROL_DT_S)] = 0.005

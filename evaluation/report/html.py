@@ -13,7 +13,7 @@ from ddgrasp.progress import PICTURES, read_curves
 from ddgrasp.stages import ON_REQUEST, STAGES
 from evaluation import wilson
 from evaluation.report import figures
-from evaluation.report.summary import summary_rows
+from evaluation.report.summary import summary_rows, trial_run
 
 REPORT_HTML = "report.html"
 
@@ -39,6 +39,7 @@ def render_html(report: Mapping[str, Any], run_dir: Path) -> str:
     made = f"{report['created']}, {machine['processor']}, {machine['cores']} cores."
     body = [
         f"<h1>DiffuDepGrasp-JAX: run <code>{escape(run_dir.name)}</code>, preset {preset}</h1>",
+        f"<p><strong>{escape(trial_run(report))}</strong></p>",
         f"<p class=note>{escape(made)} Success: rate of n trials, Wilson 95 % interval. The pseudo-real "
         "rig is a Franka in MuJoCo's C engine seen by a simulated active-stereo camera; no real robot was "
         "used.</p>",

@@ -24,7 +24,8 @@ def build_report(run_dir: Path) -> dict[str, Any]:
 
     Keys: `stages.<name>.{seconds, trained, loaded}`; `<name>` holds what that stage measured, except keys
     that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top; `machine`,
-    `versions`, `preset`, `seed`, `config`. A success rate is {rate, n, successes, low, high}.
+    `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`. A success rate is {rate, n,
+    successes, low, high}.
     `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows; `teacher.backends`, if `ddgrasp
     teacher compare` was, is `evaluation.backends.table`.
     """
@@ -41,6 +42,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     latest = finished[flow[-1]] if flow else next(iter(finished.values()))
     report: dict[str, Any] = {
         "preset": latest.config.get("preset"),
+        "scale": latest.config.get("scale", 1.0),
         "seed": latest.seed,
         "contract_version": contract.CONTRACT_VERSION,
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -115,8 +117,18 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     return rows
 
 
+def trial_run(report: Mapping[str, Any]) -> str:
+    """What must be said of a run whose counts were scaled down (`ddgrasp.scaling`); empty for any other."""
+    if (scale := report.get("scale", 1.0)) == 1:
+        return ""
+    return (
+        f"Trial run: the counts of preset {report['preset']} times {scale:g}, so that every stage is passed "
+        "through. Its figures say nothing about the preset."
+    )
+
+
 def print_summary(report: Mapping[str, Any]) -> None:
-    """Prints the table of `summary_rows` to standard output."""
+    """Prints the table of `summary_rows` to standard output, a trial run's with a warning above it."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -124,6 +136,8 @@ def print_summary(report: Mapping[str, Any]) -> None:
     console = Console()
     if not console.is_terminal:
         console = Console(width=140)
+    if warning := trial_run(report):
+        console.print(warning, style="bold", highlight=False)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for title in ("Stage", "From", "Time", "Measured (success: rate of n, Wilson 95 % interval)"):
         table.add_column(title, overflow="fold")

@@ -17,18 +17,19 @@ CONSTRAINTS_PER_ENV = 128
 """Rows; the most seen is 90."""
 
 
-def require_gpu() -> None:
-    """UserError unless warp-lang is installed and JAX sees an NVIDIA GPU."""
+def require_gpu(what: str = "backend") -> None:
+    """UserError unless warp-lang is installed and JAX sees an NVIDIA GPU. `what`: the setting that asks."""
     from mujoco.mjx import warp as mjx_warp
 
     if not mjx_warp.WARP_INSTALLED:
         raise UserError(
-            "backend 'warp' needs warp-lang, which is not installed: pip install -e '.[cuda,warp]'."
+            f"{what} 'warp' needs warp-lang, which is not installed: pip install -e '.[cuda,warp]'."
         )
     if not any(device.platform == "gpu" for device in jax.devices()):
         raise UserError(
-            f"backend 'warp' needs an NVIDIA GPU and JAX sees only {jax.devices()[0].platform}: choose cpu "
-            "or jax, or on a machine with a GPU pip install -e '.[cuda,warp]'."
+            f"{what} 'warp' needs an NVIDIA GPU and JAX sees only {jax.devices()[0].platform}: choose "
+            f"{'cpu or jax' if what == 'backend' else 'jax'}, or on a machine with a GPU pip install -e "
+            "'.[cuda,warp]'."
         )
 
 

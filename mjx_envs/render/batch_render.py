@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
+from ddgrasp.config import RENDERERS
 from ddgrasp.errors import unknown_name
 from mjx_envs.camera import Camera
 from mjx_envs.physics.mjx_warp import require_gpu
 from mjx_envs.render import raycast
 from mjx_envs.render.raycast import Geoms
 from mjx_envs.render.visible_geoms import AMBIENT, BACKGROUND_RGB, LIGHT_DIRECTION_W
-
-RENDERERS = ("jax", "warp")
 
 
 class Pictures(NamedTuple):
@@ -44,16 +43,24 @@ def make_renderer(name: str, camera: Camera, *, depth_only: bool = False, far_m:
 
     UserError for an unknown name, or for "warp" without a GPU.
     """
-    if name == "jax":
-        return jax_renderer(camera, depth_only=depth_only, far_m=far_m)
+    check_renderer(name)
+    make = warp_renderer if name == "warp" else jax_renderer
+    return make(camera, depth_only=depth_only, far_m=far_m)
+
+
+def check_renderer(name: str) -> None:
+    """UserError unless the named renderer is there and can run here."""
+    if name not in RENDERERS:
+        raise unknown_name("renderer", name, RENDERERS)
     if name == "warp":
-        require_gpu()
-        return warp_renderer(camera, depth_only=depth_only, far_m=far_m)
-    raise unknown_name("renderer", name, RENDERERS)
+        require_gpu("renderer")
 
 
 def jax_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0) -> Renderer:
-    """The JAX ray caster: on a GPU all scenes at once, on processors one after another, which is faster."""
+    """The JAX ray caster: on accelerators all scenes at once, on processors one after another (faster there).
+
+    Which of the two is decided when a program is lowered for its device.
+    """
 
     def draw(scene):
         geoms, T_world_cam = scene
@@ -63,9 +70,17 @@ def jax_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0
         seen = raycast.render(geoms, seen_from, far_m=far_m)
         return Pictures(seen.depth_m, seen.rgb, seen.segmentation)
 
-    if any(device.platform == "gpu" for device in jax.devices()):
-        return lambda geoms, T_world_cam: jax.vmap(draw)((geoms, T_world_cam))
-    return lambda geoms, T_world_cam: jax.lax.map(draw, (geoms, T_world_cam))
+    def one_after_another(geoms: Geoms, T_world_cam: jax.Array) -> Pictures:
+        return jax.lax.map(draw, (geoms, T_world_cam))
+
+    def at_once(geoms: Geoms, T_world_cam: jax.Array) -> Pictures:
+        return jax.vmap(draw)((geoms, T_world_cam))
+
+    def render(geoms: Geoms, T_world_cam: jax.Array) -> Pictures:
+        T = jnp.asarray(T_world_cam)
+        return jax.lax.platform_dependent(geoms, T, cpu=one_after_another, default=at_once)
+
+    return render
 
 
 def warp_renderer(camera: Camera, *, depth_only: bool = False, far_m: float = 2.0) -> Renderer:

@@ -130,6 +130,11 @@ def _rays(camera: Camera, row0: Any, col0: Any, shape: tuple[int, int]) -> tuple
     return x.reshape(-1, chunk), y.reshape(-1, chunk)
 
 
+def chunk_count(pixels: int) -> int:
+    """Chunks that a picture of so many pixels goes through in, one after another."""
+    return pixels // _chunk_size(pixels)
+
+
 def _chunk_size(pixels: int) -> int:
     """The largest divisor of `pixels` that leaves at least two chunks of at most _CHUNK_PX.
 

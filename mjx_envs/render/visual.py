@@ -25,7 +25,7 @@ class Viewer:
     Args:
       profile: the camera at the scale wanted.
       layout: the object's slots, as the environments have them (`ObjectTable.layout`).
-      renderer: one of `batch_render.RENDERERS`.
+      renderer: one of `ddgrasp.config.RENDERERS`.
     """
 
     def __init__(

@@ -1,0 +1,53 @@
+"""What training the student takes: of the device by shapes alone, of host and disk by counting frames."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from ddgrasp import contract
+from ddgrasp.config import Config
+from learning.memory import Need, traced_bytes
+from learning.prefetch import AHEAD
+from student_jax import train
+from student_jax.data import Window
+from student_jax.policy import Aux, param_shapes
+
+_ROW_BYTES = 4 * (8 + 8 + 40 + 1) + 16
+"""Of a training step beside its picture: state, action, observation, held, episode and step."""
+
+
+def need(config: Config) -> Need:
+    """What stage `student` takes. Depth of its training frames lies on disk while it works."""
+    student, profile = config.student, config.world.profile
+    picture = 2 * profile.height_px * profile.width_px
+    episodes = config.demos.episodes + student.dagger.rounds * student.dagger.episodes
+    frames = episodes * config.world.episode_steps
+    batch = student.training.batch_size * contract.DEPTH_FRAMES * picture
+    acting = max(student.dagger.episodes, config.evaluation.student_trials)
+    host = (AHEAD + 2) * batch + frames * _ROW_BYTES + acting * (contract.DEPTH_FRAMES + 3) * picture
+    height, width = Window.seen(profile, student.training.crop_shift_px).shape
+    disk = frames * 2 * height * width + acting * config.world.episode_steps * picture
+    remedy = "student.training.batch_size, student.dagger.episodes or world.camera_scale"
+    return Need("student", training_bytes(config), host, disk, remedy)
+
+
+def training_bytes(config: Config) -> int:
+    """Of an optimiser step on pictures."""
+    student, profile = config.student, config.world.profile
+    count, steps = student.training.batch_size, max(1, student.training.steps)
+    size = (count, contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
+    batch = train.Batch(
+        depth_mm=jax.ShapeDtypeStruct(size, jnp.uint16),
+        crop_rc=jax.ShapeDtypeStruct((count, 2), jnp.int32),
+        state=_floats(count, contract.STATE_SIZE),
+        action=_floats(count, student.head.chunk, contract.ACTION_SIZE),
+        aux=Aux(_floats(count, 3), _floats(count, 2), _floats(count)),
+    )
+    trained, frozen = train.split(student, param_shapes(student, profile))
+    state = jax.eval_shape(partial(train.init_state, student, steps, 0), trained)
+    return traced_bytes(train.train_step, student, profile, steps, state, frozen, batch)
+
+
+def _floats(*sizes: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(sizes, jnp.float32)

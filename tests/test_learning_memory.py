@@ -1,0 +1,84 @@
+"""Memory told beforehand: against XLA's own analysis, and refused in one line."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from benchmarks.programs import PROGRAMS
+from ddg_jax import memory as ddg_memory
+from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
+from learning.memory import Need, check, compiled_bytes, traced_bytes
+from student_jax import memory as student_memory
+
+MB = 2**20
+
+
+def floats(megabytes: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((megabytes, MB // 4), jnp.float32)
+
+
+def test_what_is_alive_at_once_by_hand():
+    def chain(x):
+        return jnp.cos(jnp.sin(x)).sum()  # x and sin(x), then x, sin(x) and cos(sin(x))
+
+    def kept(x):
+        a, b = jnp.sin(x), jnp.cos(x)
+        return (a @ b.T).sum()
+
+    def looped(x):
+        return jax.lax.scan(lambda carry, _: (jnp.sin(carry), None), x, None, 100)[0]
+
+    assert traced_bytes(jax.jit(chain), floats(8)) == 3 * 8 * MB
+    assert traced_bytes(jax.jit(kept), floats(8)) == pytest.approx(4 * 8 * MB, rel=0.01)
+    assert traced_bytes(jax.jit(looped), floats(8)) == 2 * 8 * MB  # not 100
+
+
+@pytest.mark.parametrize("name", ["generator: train step", "student: train step"])
+def test_estimates_are_near_what_xla_needs(name):
+    jitted, arguments = PROGRAMS[name](PRESETS["debug"])
+    compiled = compiled_bytes(jitted.lower(*arguments).compile())
+    assert compiled is not None
+    assert 0.9 < traced_bytes(jitted, *arguments) / compiled < 2
+
+
+def test_the_stages_needs_are_those_of_their_programs():
+    config = PRESETS["debug"]
+    for name, need in (("generator: train step", ddg_memory.training_bytes(config.ddg)),
+                       ("student: train step", student_memory.training_bytes(config))):  # fmt: skip
+        jitted, arguments = PROGRAMS[name](config)
+        assert need == traced_bytes(jitted, *arguments)
+
+
+def test_frames_of_the_paper_need_a_disk_not_memory():
+    paper = PRESETS["paper"]
+    frames, window = (1200 + 6 * 512) * 60, (225 + 2 * 12) * (290 + 2 * 12)
+    need = student_memory.need(paper)
+    assert need.disk == 2 * (frames * window + 512 * 60 * 360 * 640)  # 54 GB
+    assert need.host < need.disk / 15
+
+
+def test_more_than_there_is_is_refused_with_the_remedy(tmp_path):
+    fits = Need("student", 10**6, 10**6, 10**6, "student.training.batch_size")
+    check(fits, tmp_path / "not" / "there")
+    with pytest.raises(
+        UserError, match=r"^Stage student needs about 1000000\.0 GB of disk in .* lower student"
+    ):
+        check(replace(fits, disk=10**15), tmp_path)
+    with pytest.raises(UserError, match=r"needs about 1000000\.0 GB of memory on the"):
+        check(replace(fits, host=10**15), tmp_path)
+
+
+def test_a_batch_that_cannot_fit_is_refused_before_any_work(tmp_path):
+    from app.commands.checks import check_memory
+
+    config = PRESETS["debug"]
+    lines = check_memory(config, tmp_path)
+    assert [line.split(":")[0] for line in lines] == ["ddg", "student"]
+    training = replace(config.student.training, batch_size=65_536)
+    large = replace(config, student=replace(config.student, training=training))
+    with pytest.raises(UserError, match="Stage student needs about .* lower student.training.batch_size"):
+        check_memory(large, tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,44 @@
+"""Every jitted step lowers for GPUs and TPUs without either, at the shapes of preset `paper`."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import jax
+import pytest
+
+from benchmarks.programs import PROGRAMS, Program, lower
+from ddgrasp.config import Config
+from ddgrasp.presets import PRESETS
+
+PLATFORMS = ("cuda", "tpu")
+HOST_CALL = re.compile(r"custom_call.*(callback|xla_python|xla_ffi_python)")
+
+
+@cache
+def config() -> Config:
+    """`paper` itself: nothing is computed, so its sizes cost nothing."""
+    return PRESETS["paper"]
+
+
+@cache
+def program(name: str) -> Program:
+    return PROGRAMS[name](config())
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_it_lowers_for_every_accelerator_without_calling_the_host(name):
+    text = {platform: lower(program(name), platform).as_text() for platform in PLATFORMS}
+    for module in text.values():
+        assert "func.func public @main" in module
+        assert not HOST_CALL.search(module)
+
+
+def test_the_c_engine_is_a_call_of_the_host():
+    """What the test above looks for can be found."""
+    from mjx_envs.grasp_env import GraspEnv
+
+    env = GraspEnv(replace(config().world, backend="cpu"))
+    state = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), "uint32"))
+    traced = jax.jit(env.step).trace(state, jax.ShapeDtypeStruct((8,), "float32"))
+    assert HOST_CALL.search(traced.lower().as_text())
