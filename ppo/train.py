@@ -132,8 +132,8 @@ class _Clock:
         self._last: tuple[int, float] | None = None
 
     def rate(self, iteration: int) -> dict[str, float]:
-        """{"steps_per_s": control steps per second since it was asked last, evaluations included}; nothing the
-        first time."""
+        """{"steps_per_s": control steps per second since it was asked last, evaluations included}; the first
+        time nothing."""
         now, before = (iteration, time.monotonic()), self._last
         self._last = now
         if before is None:

@@ -25,7 +25,7 @@ SLOW = (
     "test_flow_debug", "test_teacher_devices", "test_teacher_learner", "test_world_physics", "test_gpu_check",
     "test_evaluation_score", "test_teacher_limits", "test_teacher_trials", "test_foundation_depth",
 )  # fmt: skip
-"""Files that take longest. They come first: what two workers share out ends together only if it ends small."""
+"""Files that take longest come first: two workers end together if what they share out last is small."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
