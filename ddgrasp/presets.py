@@ -118,12 +118,12 @@ LAPTOP = Config(
     ),
     evaluation=EvalConfig(student_trials=60, rig_trials=60),
 )
-"""Everything trained here on two cores, the teacher from the guide (73 minutes of stage time on two AMD EPYC cores
-that two to four other jobs shared, 2026-11-21)."""
+"""Everything trained here on two cores, the teacher from the guide (73 minutes of stage time on two AMD EPYC
+cores that two to four other jobs shared, 2026-11-21)."""
 
 _FROM_NOTHING = TeacherConfig(
     start="nothing",
-    total_steps=6_000_000,
+    total_steps=5_000_000,
     num_envs=1024,
     minibatches=16,
     learning_rate=3e-4,
@@ -135,6 +135,7 @@ _FROM_NOTHING = TeacherConfig(
     entropy_cost=2e-3,
     hidden=(256, 256, 128),
     pregrasp_share=0.5,
+    held_share=0.2,
     critic_warmup=0,
     eval_every=12,
     checkpoint_every=24,

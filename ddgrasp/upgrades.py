@@ -86,11 +86,13 @@ _ADDED_AFTER_1 = {"student.depth_source": "learned"}
 _ADDED_AFTER_2 = {
     "scale": 1.0,
     "world.renderer": "jax",
+    "world.random.held_share": 0.0,
     "world.reward.distance": "funnel",
     "world.reward.grasp_switch": "touch",
     "teacher.target_kl": 0.0,
     "teacher.gripper_std": 0.15,
     "teacher.min_std": 0.01,
+    "teacher.held_share": 0.0,
 }
 """Fields that version 2 lacked, with what it did."""
 

@@ -89,6 +89,11 @@ class GraspEnv(mjx_env.MjxEnv):
         if self.config.random.pregrasp_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
             qpos = randomize.maybe_pregrasp(k_start, self.config.random, qpos, *grasp)
+        if self.config.random.held_share > 0:
+            grasp = self._grasp_pose(qpos, variant, branch)
+            half_width = jnp.asarray(self.table.half_width, jnp.float32)[variant] * size
+            k_held = jax.random.fold_in(k_start, 1)
+            qpos = randomize.maybe_held(k_held, self.config.random, qpos, *grasp, half_width)
         state = physics.initial_state(qpos)
         episode = Episode(
             params=params,

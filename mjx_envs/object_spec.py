@@ -21,6 +21,9 @@ from jaxtyping import Float
 from ddgrasp.arrays import AnyArray
 
 _HIDDEN_M = 0.001
+_AXIS_POINTS = 33
+PAD_HALF_WIDTH_M = 0.0105
+"""Of a finger's pad, across the closing direction."""
 
 Factor = Float[AnyArray, ""] | float
 Vector = tuple[float, float, float]
@@ -249,6 +252,19 @@ class ObjectSpec:
         """(3,) length, width and height as it lies."""
         lower, upper = self._bounds_m()
         return upper - lower
+
+    def half_width_m(self) -> float:
+        """Half of what the fingers close on: along y, within a pad's width of the grasp."""
+        widest = 0.0
+        if self.box is not None:
+            corners = np.add(self.box.center_m, np.outer((-1, 1), self.box.half_m))
+            widest = np.abs(self._turned(corners)[:, 1]).max()
+        for capsule in self.capsules:
+            axis = self._turned(np.linspace(capsule.start_m, capsule.end_m, _AXIS_POINTS))
+            x, y = (axis - self.grasp_offset_m)[:, :2].T
+            at_pads = np.abs(x) < PAD_HALF_WIDTH_M
+            widest = max(widest, np.abs(y[at_pads]).max(initial=-capsule.radius_m) + capsule.radius_m)
+        return float(widest)
 
     def _bounds_m(self) -> np.ndarray:
         """(2, 3) lower and upper corner of the box and the capsules together, object frame."""

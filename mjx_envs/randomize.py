@@ -6,6 +6,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int, PRNGKeyArray, UInt32
 
+from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.config import RandomConfig
 from ddgrasp.layout import QPOS
@@ -39,6 +40,7 @@ class ObjectTable:
         self.symmetry = np.array([s.grasp_symmetry for s in specs])
         self.log_category = np.log([s.category_id for s in specs])
         self.grasp_offset = np.array([s.grasp_offset_m for s in specs])
+        self.half_width = np.array([s.half_width_m() for s in specs])
 
 
 def sample_variant(key: Key, config: RandomConfig, table: ObjectTable, index: Index) -> Int[Array, ""]:
@@ -102,6 +104,24 @@ def maybe_pregrasp(
     joints = inverse_kinematics.solve(qpos[QPOS.arm], target, grasp_quat)
     chosen = jax.random.uniform(k_choice) < config.pregrasp_share
     return qpos.at[QPOS.arm].set(jnp.where(chosen, joints, qpos[QPOS.arm]))
+
+
+def maybe_held(
+    key: Key, config: RandomConfig, qpos: Float[Array, "16"], grasp_pos: Float[Array, "3"],
+    grasp_quat: Float[Array, "4"], half_width_m: Float[Array, ""],
+) -> Float[Array, "16"]:  # fmt: skip
+    """qpos (16,) with, in a share of the episodes, the object between the fingers, raised by up to the way to
+    the lift target.
+
+    `half_width_m` () is the object's, along the fingers: they start 1 mm from it, and close if so commanded.
+    """
+    k_choice, k_height = jax.random.split(key)
+    way = contract.LIFT_TARGET_M[2] - qpos[QPOS.object_pos][2]
+    up = jnp.array([0.0, 0.0, 1.0]) * way * jax.random.uniform(k_height)
+    joints = inverse_kinematics.solve(qpos[QPOS.arm], grasp_pos + up, grasp_quat)
+    opening = jnp.minimum(half_width_m + 0.001, contract.GRIPPER_MAX_WIDTH_M / 2)
+    held = qpos.at[QPOS.arm].set(joints).at[QPOS.fingers].set(opening).at[QPOS.object_pos].add(up)
+    return jnp.where(jax.random.uniform(k_choice) < config.held_share, held, qpos)
 
 
 def sample_camera(key: Key, config: RandomConfig, T_world_cam: Float[AnyArray, "4 4"]) -> Float[Array, "4 4"]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.layout import CONTROLS, QPOS, QVEL
-from mjx_envs.object_spec import DEFAULT_SLOTS, ObjectSpec, SlotLayout
+from mjx_envs.object_spec import DEFAULT_SLOTS, PAD_HALF_WIDTH_M, ObjectSpec, SlotLayout
 from mjx_envs.objects import OBJECTS
 
 _S = 0.7071067811865476  # cos 45 degrees
@@ -118,7 +118,8 @@ def _hand_xml() -> str:
         <joint name="{joint}" type="slide" axis="0 1 0" range="0 0.04" damping="{FINGER_DAMPING_NS_M}"
                armature="{FINGER_ARMATURE_KG}"/>
         <geom class="arm" type="box" size="0.009 0.009 0.013" pos="0 0.012 0.013" rgba="0.2 0.2 0.2 1"/>
-        <geom name="{name}_pad" class="pad" type="box" size="0.0105 0.005 0.0155" pos="0 0.005 0.0415"/>
+        <geom name="{name}_pad" class="pad" type="box" size="{PAD_HALF_WIDTH_M} 0.005 0.0155"
+              pos="0 0.005 0.0415"/>
       </body>"""
     return f"""
     <body name="hand" pos="{_fmt(HAND_POS_M)}" quat="{_fmt(HAND_QUAT)}" gravcomp="1">

@@ -143,7 +143,10 @@ class _Clock:
 
 def training_world(config: Config) -> WorldConfig:
     """The world with the exploring starts that only training has."""
-    random = dataclasses.replace(config.world.random, pregrasp_share=config.teacher.pregrasp_share)
+    teacher = config.teacher
+    random = dataclasses.replace(
+        config.world.random, pregrasp_share=teacher.pregrasp_share, held_share=teacher.held_share
+    )
     return dataclasses.replace(config.world, random=random)
 
 

@@ -69,6 +69,8 @@ class TeacherConfig(Section, name="teacher"):
     """Layers of policy and value networks."""
     pregrasp_share: Share = 0.2
     """Share of training episodes that start with the hand above the object (exploring starts)."""
+    held_share: Share = 0.0
+    """Share of training episodes that start with the object in the hand, anywhere up to the lift target."""
     clone_rounds: Count = 8
     """DAgger rounds in which the policy network learns the guide before PPO; for start guide alone."""
     clone_envs: Count = 192

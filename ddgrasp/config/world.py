@@ -70,6 +70,9 @@ class RandomConfig(Section, name="world.random"):
     """Initial arm joints around home."""
     pregrasp_share: Share = 0.0
     """Share of episodes that start with the hand above the object (exploring starts, for training only)."""
+    held_share: Share = 0.0
+    """Share of episodes that start with the object in the hand, anywhere up to the lift target (exploring
+    starts, for training only)."""
     other_pose_share: Share = 0.5
     """Share of episodes in which an object that can both lie and stand rests in its other pose."""
     size: Annotated[float, Range(0, 0.5)] = 0.05
