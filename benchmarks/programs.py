@@ -43,8 +43,8 @@ Program = tuple[Any, tuple[Any, ...]]
 """A jitted function, and its arguments: shapes, and values where they are static."""
 
 
-def shape(*sizes: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
-    """Stands for an array."""
+def shape(*sizes: int, dtype: Any = jnp.float32) -> Any:
+    """Stands for an array: a jax.ShapeDtypeStruct."""
     return jax.ShapeDtypeStruct(sizes, dtype)
 
 
@@ -94,7 +94,7 @@ def evaluation_rollout(config: Config) -> Program:
     return rollout._roll_out, arguments
 
 
-def _teacher_shapes(config: Config) -> tuple[list[tuple[Any, Any]], jax.ShapeDtypeStruct]:
+def _teacher_shapes(config: Config) -> tuple[list[tuple[Any, Any]], Any]:
     sizes = (contract.OBSERVATION_SIZE, *config.teacher.hidden, 2 * contract.ACTION_SIZE)
     layers = [(shape(a, b), shape(b)) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
     return layers, shape(contract.OBSERVATION_SIZE)
@@ -113,7 +113,7 @@ def _roller(piece: str, config: Config) -> Program:
 # --- generator ------------------------------------------------------------------------------------
 
 
-def _maps(config: Config, count: int) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
+def _maps(config: Config, count: int) -> tuple[Any, Any]:
     size = (count, config.ddg.depth.height_px, config.ddg.depth.width_px)
     return shape(*size, representation.channels(config.ddg)), shape(*size)
 

@@ -115,10 +115,14 @@ class Roller:
             if not alive.any():
                 break
 
-        columns["action"] = columns.pop("expert")
+        whole = {name: np.stack(values, axis=1) for name, values in columns.items()}
         return Episodes(
-            **{name: np.stack(values, axis=1) for name, values in columns.items()},
-            **pictures,
+            state=whole["state"],
+            action=whole["expert"],
+            observation=whole["observation"],
+            held=whole["held"],
+            depth_mm=pictures.get("depth_mm"),
+            rgb=pictures.get("rgb"),
             length=length,
             success=success,
             object_index=np.asarray(state.info["episode"].object_index),

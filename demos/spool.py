@@ -45,7 +45,7 @@ class Spool:
 
 def read_into(file: int, array: np.ndarray, offset: int) -> None:
     """Fills the contiguous `array` from `offset` of the open `file` on; OSError if it ends before."""
-    view = memoryview(array.reshape(-1).view(np.uint8))
+    view = array.reshape(-1).view(np.uint8).data
     while view:
         if not (count := os.preadv(file, [view], offset)):
             raise OSError(f"ends before byte {offset + len(view)}")

@@ -59,7 +59,7 @@ def _places(need: Need, directory: Path) -> Iterator[tuple[str, int, int]]:
     yield f"of disk in {directory}", need.disk, shutil.disk_usage(there).free
 
 
-def device_limit(device: jax.Device) -> int | None:
+def device_limit(device: Any) -> int | None:
     """Bytes that JAX may take of an accelerator; None where the device's memory is the host's."""
     stats = device.memory_stats() if device.platform != "cpu" else None
     return stats.get("bytes_limit") if stats else None

@@ -1,6 +1,7 @@
 """What training the student takes: of the device by shapes alone, of host and disk by counting frames."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,16 +39,17 @@ def training_bytes(config: Config) -> int:
     count, steps = student.training.batch_size, max(1, student.training.steps)
     size = (count, contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
     batch = train.Batch(
-        depth_mm=jax.ShapeDtypeStruct(size, jnp.uint16),
-        crop_rc=jax.ShapeDtypeStruct((count, 2), jnp.int32),
-        state=_floats(count, contract.STATE_SIZE),
-        action=_floats(count, student.head.chunk, contract.ACTION_SIZE),
-        aux=Aux(_floats(count, 3), _floats(count, 2), _floats(count)),
+        depth_mm=_shape(*size, dtype=jnp.uint16),
+        crop_rc=_shape(count, 2, dtype=jnp.int32),
+        state=_shape(count, contract.STATE_SIZE),
+        action=_shape(count, student.head.chunk, contract.ACTION_SIZE),
+        aux=Aux(_shape(count, 3), _shape(count, 2), _shape(count)),
     )
     trained, frozen = train.split(student, param_shapes(student, profile))
     state = jax.eval_shape(partial(train.init_state, student, steps, 0), trained)
     return traced_bytes(train.train_step, student, profile, steps, state, frozen, batch)
 
 
-def _floats(*sizes: int) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(sizes, jnp.float32)
+def _shape(*sizes: int, dtype: Any = jnp.float32) -> Any:
+    """Stands for an array."""
+    return jax.ShapeDtypeStruct(sizes, dtype)
