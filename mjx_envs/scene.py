@@ -86,6 +86,9 @@ FINGER_ARMATURE_KG = 1.0
 PAD_FRICTION = 1.0
 JOINT_DAMPING_NMS_RAD = 1.0
 
+MAX_GEOM_PAIRS = 8
+MAX_CONTACTS = 12
+
 N_ARM, N_ROBOT = QPOS.arm.stop, QPOS.fingers.stop
 NQ, NV, NU = QPOS.size, QVEL.size, CONTROLS.size
 
@@ -192,6 +195,10 @@ def scene_xml(sim_dt_s: float = 0.005, layout: SlotLayout = DEFAULT_SLOTS) -> st
     </default>
     <default class="drawn_slot"><geom contype="0" conaffinity="0" group="1"/></default>
   </default>
+  <custom>
+    <numeric name="max_geom_pairs" data="{MAX_GEOM_PAIRS}"/>
+    <numeric name="max_contact_points" data="{MAX_CONTACTS}"/>
+  </custom>
   <visual><global offwidth="1280" offheight="720"/><map znear="0.02" zfar="20"/></visual>
   <worldbody>
     <light pos="0.6 -0.6 2" dir="-0.1 0.3 -1" directional="true"/>
