@@ -103,7 +103,7 @@ class GraspEnv(mjx_env.MjxEnv):
         )
         obs = self._get_obs(state, episode)
         metrics = {f"reward/{name}": jnp.zeros(()) for name in rewards.TERMS}
-        metrics |= {"success": jnp.zeros(()), "saturated": jnp.zeros(())}
+        metrics |= {name: jnp.zeros(()) for name in ("success", "saturated", "contacts_dropped")}
         info = {"episode": episode, "rng": k_next, "truncation": jnp.zeros(())}
         return mjx_env.State(state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
 
@@ -147,6 +147,7 @@ class GraspEnv(mjx_env.MjxEnv):
         )  # fmt: skip
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jnp.float32)
+        metrics["contacts_dropped"] = new.dropped.astype(jnp.float32)
         metrics["saturated"] = jnp.mean(jnp.abs(action[ACTION.arm]) > 0.95)
         info = state.info | {"episode": episode, "truncation": (over & ~lost).astype(jnp.float32)}
         return replace(

@@ -206,6 +206,7 @@ def _unroll(env, env_state, policy, key, length):
     (env_state, _), (data, done, metrics) = jax.lax.scan(step, (env_state, key), None, length)
     episodes = jnp.maximum(done.sum(), 1.0)
     outcome = {"success": metrics["success"].sum() / episodes, "saturated": metrics["saturated"].mean()}
+    outcome["contacts_dropped"] = metrics["contacts_dropped"].sum()
     outcome |= {k: v.mean() for k, v in metrics.items() if k.startswith("reward/")}
     return env_state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data), outcome
 

@@ -224,6 +224,6 @@ def _slopes(task: Problem, line: _Line):
             jnp.where(sticks, stuck_slope + step * stuck_curvature, jnp.where(slides, cone_slope, 0.0))
         )
         curvature += jnp.sum(jnp.where(sticks, stuck_curvature, jnp.where(slides, cone_curvature, 0.0)))
-        return slope, curvature
+        return slope, jnp.maximum(curvature, _TINY)
 
     return at

@@ -15,6 +15,9 @@ CONTACTS_PER_ENV = 40
 at once, are 36 candidates; the most contacts seen is 20 (a persimmon pressed by the hand)."""
 CONSTRAINTS_PER_ENV = 128
 """Rows; the most seen is 90."""
+TOO_MANY = (1 << 0) | (1 << 2) | (1 << 3)
+"""Bits of MuJoCo Warp's `Data.overflow` (its `OverflowType`): rows, candidate pairs, contacts. They are set for
+good and name an environment at least; how many contacts were lost is not kept."""
 
 
 def require_gpu() -> None:
@@ -74,10 +77,12 @@ class WarpPhysics:
             mx = self._mx.replace(**fields, **self._index.derived(self._mx, fields))
             data = empty.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
             data, _ = jax.lax.scan(lambda d, _: (mjx.step(mx, d), None), data, None, self._substeps)
-            return data.qpos, data.qvel, data.qacc_warmstart, data.sensordata
+            return data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data._impl.overflow
 
-        qpos, qvel, warmstart, sensors = jax.vmap(one)(params, state, ctrl)
-        return PhysicsState(qpos=qpos, qvel=qvel, warmstart=warmstart, touch=touch_from_sensors(sensors, jnp))
+        qpos, qvel, warmstart, sensors, overflow = jax.vmap(one)(params, state, ctrl)
+        touch = touch_from_sensors(sensors, jnp)
+        dropped = ((overflow & TOO_MANY) != 0).astype(jnp.int32)
+        return PhysicsState(qpos=qpos, qvel=qvel, warmstart=warmstart, touch=touch, dropped=dropped)
 
     def _advance_nested(self, axis_size, batched, *arguments):
         """`vmap` of `_advance`: one larger batch."""
