@@ -40,7 +40,9 @@ class JaxPhysics:
         self._substeps = substeps
         self._index = ModelIndex(self._model)
         self._pads = np.array([self._model.geom(f"{side}_finger_pad").id for side in ("left", "right")])
-        self._slots = scene.slot_ids(self._model)[: len(layout.colliding_names)]
+        self._slots = np.array([self._model.geom(name).id for name in layout.colliding_names])
+        capsules, boxes = self._slots[1:], [self._model.geom("hand_box").id, *self._pads]
+        self._culled = np.stack(np.meshgrid(capsules, boxes), axis=-1).reshape(-1, 2)
 
     def step(self, params: ModelParams, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         """See `Physics.step`."""
@@ -48,7 +50,7 @@ class JaxPhysics:
         mx = self._mx.replace(**fields, **self._index.derived(self._mx, fields))
         start = _Moving(state.qpos, state.qvel, state.warmstart, jnp.zeros(2), jnp.int32(0))
         new, _ = jax.lax.scan(lambda now, _: (self._substep(mx, now, ctrl), None), start, None, self._substeps)
-        return PhysicsState(qpos=new.qpos, qvel=new.qvel, warmstart=new.warmstart, touch=new.touch)
+        return PhysicsState(**new._asdict())
 
     def _substep(self, mx: mjx.Model, now: _Moving, ctrl: jax.Array) -> _Moving:
         """`mjx.step` less what the scene has none of: sensors, tendons, cameras, applied forces."""
@@ -67,13 +69,28 @@ class JaxPhysics:
         return _Moving(data.qpos, data.qvel, acceleration, touch, now.dropped + dropped)
 
     def _collide(self, mx: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
-        """`data` with the deepest contacts, and () how many geoms touch or may touch beyond the caps."""
+        """`data` with the deepest contacts, and () how many beyond the caps there are or may be."""
         found = mjx.collision(mx, data)._impl.contact
         cap = self.empty._impl.ncon
         _, deepest = jax.lax.top_k(-found.dist, cap)
-        dropped = jnp.maximum(jnp.sum(found.dist < 0) - cap, 0)
+        dropped = jnp.maximum(jnp.sum(found.dist < 0) - cap, 0) + self._pairs_left_out(mx, data)
         contact = jax.tree.map(lambda x: x[deepest], found)
         return data.tree_replace({"_impl.contact": contact}), dropped
+
+    def _pairs_left_out(self, mx: mjx.Model, data: mjx.Data) -> jax.Array:
+        """() pairs of a capsule and a box that are not among those that `mjx.collision` looks at, and may touch:
+        a sphere about the capsule reaches into the box.
+
+        MJX looks at the pairs whose bounding spheres are closest; of other kinds there are fewer than the cap.
+        """
+        capsule, box = self._culled.T
+        away = data.geom_xpos[capsule] - data.geom_xpos[box]
+        gap = jnp.linalg.norm(away, axis=-1) - mx.geom_rbound[capsule] - mx.geom_rbound[box]
+        closer = jnp.sum(gap[None, :] < gap[:, None], axis=1)
+        inside_box = jnp.einsum("pji,pj->pi", data.geom_xmat[box], away)
+        beyond = jnp.maximum(jnp.abs(inside_box) - mx.geom_size[box], 0.0)
+        reaches = jnp.linalg.norm(beyond, axis=-1) < mx.geom_rbound[capsule]
+        return jnp.sum(reaches & (closer >= scene.MAX_GEOM_PAIRS))
 
     def _touch(self, data: mjx.Data, force: jax.Array) -> jax.Array:
         """(2,) N, as the scene's sensors have it: the strongest contact of a pad with each slot, summed."""

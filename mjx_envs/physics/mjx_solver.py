@@ -183,7 +183,7 @@ def _line_search(task: Problem, line: _Line, steps: int) -> jax.Array:
         slope, curvature = slopes(here)
         low, high = jnp.where(slope < 0, here, low), jnp.where(slope < 0, high, here)
         there = here - slope / curvature
-        return (low, high, jnp.where((there > low) & (there < high), there, (low + high) / 2)), None
+        return (low, high, jnp.where((there >= low) & (there <= high), there, (low + high) / 2)), None
 
     zero = jnp.float32(0.0)
     slope, curvature = slopes(zero)
