@@ -56,7 +56,7 @@ class JaxPhysics:
         """`mjx.step` less what the scene has none of: sensors, tendons, cameras, applied forces."""
         data = self.empty.replace(qpos=now.qpos, qvel=now.qvel, ctrl=ctrl)
         data = mjx.crb(mx, mjx.com_pos(mx, kinematics(mx, data)))
-        data, dropped = self._collide(mx, data)
+        data, dropped = self.collide(mx, data)
         data = mjx.transmission(mx, mjx.make_constraint(mx, data))
         data = mjx.fwd_actuation(mx, mjx.fwd_velocity(mx, data))
         task = mjx_solver.problem(mx, data)
@@ -68,7 +68,7 @@ class JaxPhysics:
         data = _advance(mx, data)
         return _Moving(data.qpos, data.qvel, acceleration, touch, now.dropped + dropped)
 
-    def _collide(self, mx: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
+    def collide(self, mx: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
         """`data` with the deepest contacts, and () how many beyond the caps there are or may be."""
         found = mjx.collision(mx, data)._impl.contact
         cap = self.empty._impl.ncon

@@ -9,7 +9,6 @@ has the measurements, and a test holds the times.
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from mujoco import mjx
 
 from mjx_envs import kinematics as quaternions
@@ -30,7 +29,8 @@ def kinematics(mx: mjx.Model, data: mjx.Data) -> mjx.Data:
     for body in range(1, mx.nbody):
         parent_pos, parent_quat = poses[mx.body_parentid[body]]
         pos, quat = _compose(parent_pos, parent_quat, mx.body_pos[body], mx.body_quat[body])
-        for joint in mx.body_jntadr[body] + np.arange(mx.body_jntnum[body]):
+        first = int(mx.body_jntadr[body])
+        for joint in range(first, first + int(mx.body_jntnum[body])):
             pos, quat, anchor, axis = _move(mx, data.qpos, joint, pos, quat)
             anchors.append(anchor)
             axes.append(axis)

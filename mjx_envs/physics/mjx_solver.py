@@ -152,17 +152,15 @@ def _cones(cone, away, stiffness) -> tuple[jax.Array, jax.Array]:
     safe = jnp.maximum(tangent, _TINY)
     rigid = stiffness[:, 0] / (mu**2 * (1 + mu**2))
     outside = normal - mu * tangent
-    pull = -rigid * outside * mu
     unit = scaled / safe[:, None]
-    ray = jnp.concatenate([jnp.ones_like(mu)[:, None], -unit[:, 1:]], axis=1)
-    sliding = pull[:, None] * ray * cone
+    ray = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * unit[:, 1:]], axis=1)
+    sliding = -(rigid * outside)[:, None] * ray * cone
     forces = jnp.where(sticks[:, None], -stiffness * away, jnp.where(slides[:, None], sliding, 0.0))
 
     edge = (mu * normal / safe)[:, None, None] * unit[:, :, None] * unit[:, None, :]
     edge += (mu**2 - mu * normal / safe)[:, None, None] * jnp.eye(CONE)
-    border = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * unit[:, 1:]], axis=1)
     first = jnp.arange(CONE) == 0
-    bent = jnp.where(first[:, None], border[:, None, :], jnp.where(first, border[:, :, None], edge))
+    bent = jnp.where(first[:, None], ray[:, None, :], jnp.where(first, ray[:, :, None], edge))
     bent = bent * (rigid[:, None, None] * cone[:, :, None] * cone[:, None, :])
     stuck = stiffness[:, :, None] * jnp.eye(CONE)
     weights = jnp.where(
