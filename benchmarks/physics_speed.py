@@ -31,8 +31,8 @@ BARE_TARGET = 0.6
 MENDED_TARGET = 5.0
 EARLIER_TARGET = 300.0
 EARLIER_RATE = 27.9
-"""Physics steps/s of this environment on MJX-JAX before contacts were capped and links kept apart (two AMD EPYC
-cores, 2026-11-21)."""
+"""Physics steps/s of this environment on MJX-JAX before contacts were capped and links kept apart (two AMD
+EPYC cores, 2026-11-21)."""
 PLAYGROUND_BATCHES = (1, 32)
 """Of Playground as it is, which gets the better of the two: a large batch spares it overhead, a small one
 synchronisation. All of a batch start from one reset."""
@@ -49,7 +49,7 @@ _SETTLE_UNROLLS = 3
 
 
 def playground_rows(config: Config, rounds: int) -> list[Row]:
-    """Environment steps with random actions: ours on two backends, PandaPickCube on MJX-JAX as it is and mended."""
+    """Environment steps with random actions: ours on two backends, PandaPickCube as it is and mended."""
     substeps = _substeps(config)
     jax_world = replace(config.world, backend="jax")
     cpu, mjx = "C engine (cpu)", "MJX (jax)"
@@ -89,9 +89,7 @@ def playground_rows(config: Config, rounds: int) -> list[Row]:
         )
     ]
     units = {"ours_units": substeps, "peer_units": pick.n_substeps}
-    rows += [
-        compare(rates, "environment", "control steps/s", ours, best, **units) for ours in (cpu, mjx)
-    ]
+    rows += [compare(rates, "environment", "control steps/s", ours, best, **units) for ours in (cpu, mjx)]
     return rows
 
 

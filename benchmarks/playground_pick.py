@@ -38,8 +38,10 @@ def make_env() -> pick.PandaPickCube:
 
 
 class WithBarriers:
-    """Playground's environment with a barrier between a link and the next, the cure of `docs/physics.md`: what
-    it could do on a CPU if its library had it. Faster than without XLA's fusion emitters, the flag."""
+    """Playground's environment with a barrier between a link and the next, the cure of `docs/physics.md`.
+
+    Faster than without XLA's fusion emitters, which only a flag of older versions turns off.
+    """
 
     def __init__(self, env: pick.PandaPickCube):
         self._env = env

@@ -12,12 +12,13 @@ from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, to
 
 CONTACTS_PER_ENV = 40
 """Room per environment in the batch's common buffer: nine slots against table, hand and two pads, all near
-at once, are 36 candidates; the most contacts seen is 20 (a persimmon pressed by the hand)."""
+at once, are 36 candidates; the most contacts seen is 20 (a persimmon pressed by the hand). Warp computes those that
+there are, so that a closer cap would save memory alone."""
 CONSTRAINTS_PER_ENV = 128
 """Rows; the most seen is 90."""
 TOO_MANY = (1 << 0) | (1 << 2) | (1 << 3)
-"""Bits of MuJoCo Warp's `Data.overflow` (its `OverflowType`): rows, candidate pairs, contacts. They are set for
-good and name an environment at least; how many contacts were lost is not kept."""
+"""Bits of MuJoCo Warp's `Data.overflow` (its `OverflowType`): rows, candidate pairs, contacts. Once set they
+stay, and how many were lost is not kept: an environment counts 1 for a control step."""
 
 
 def require_gpu() -> None:
