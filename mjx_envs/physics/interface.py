@@ -61,8 +61,8 @@ class PhysicsState:
     touch: jax.Array
     """(2,) contact force (N) between the object and the left and right finger pad."""
     dropped: jax.Array
-    """() int32 contacts beyond what the backend holds, summed over the last control step's physics steps: there
-    geoms felt nothing of each other. 0 on the C engine, which holds any number."""
+    """() int32 contacts beyond what the backend holds, summed over the last control step's physics steps:
+    those geoms felt nothing of each other. 0 on the C engine, which holds any number."""
 
 
 @runtime_checkable

@@ -12,8 +12,8 @@ from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, to
 
 CONTACTS_PER_ENV = 40
 """Room per environment in the batch's common buffer: nine slots against table, hand and two pads, all near
-at once, are 36 candidates; the most contacts seen is 20 (a persimmon pressed by the hand). Warp computes those that
-there are, so that a closer cap would save memory alone."""
+at once, are 36 candidates; the most contacts seen is 20 (a persimmon pressed by the hand). Warp computes
+those that there are, so that a closer cap would save memory alone."""
 CONSTRAINTS_PER_ENV = 128
 """Rows; the most seen is 90."""
 TOO_MANY = (1 << 0) | (1 << 2) | (1 << 3)
