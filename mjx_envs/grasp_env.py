@@ -111,7 +111,8 @@ class GraspEnv(mjx_env.MjxEnv):
         )
         obs = self._get_obs(state, episode)
         metrics = {f"reward/{name}": jnp.zeros(()) for name in rewards.TERMS}
-        metrics |= {name: jnp.zeros(()) for name in ("success", "saturated", "return", "length")}
+        names = ("success", "saturated", "return", "length", "contacts_dropped")
+        metrics |= {name: jnp.zeros(()) for name in names}
         info = {"episode": episode, "rng": k_next, "truncation": jnp.zeros(())}
         return mjx_env.State(state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
 
@@ -159,6 +160,7 @@ class GraspEnv(mjx_env.MjxEnv):
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jnp.float32)
         metrics |= {"return": episode.total_reward, "length": steps.astype(jnp.float32)}
+        metrics["contacts_dropped"] = new.dropped.astype(jnp.float32)
         metrics["saturated"] = jnp.mean(jnp.abs(action[ACTION.arm]) > 0.95)
         info = state.info | {"episode": episode, "truncation": (over & ~lost).astype(jnp.float32)}
         return replace(

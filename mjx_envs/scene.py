@@ -86,6 +86,13 @@ FINGER_ARMATURE_KG = 1.0
 PAD_FRICTION = 1.0
 JOINT_DAMPING_NMS_RAD = 1.0
 
+MAX_CONTACTS = 12
+"""Contacts that MJX-JAX holds, the deepest ones; it computes as many, touching or not, so that 60 cost 257
+constraint rows where 12 cost 65. A cube between the pads has eight. The C engine and MJX-Warp do not read it.
+
+MJX can also cap the pairs of geoms (`max_geom_pairs`), but it keeps those whose bounding spheres are closest,
+and the hand's is so large (11 cm) that its pairs would push out those of the pads."""
+
 N_ARM, N_ROBOT = QPOS.arm.stop, QPOS.fingers.stop
 NQ, NV, NU = QPOS.size, QVEL.size, CONTROLS.size
 
@@ -193,6 +200,7 @@ def scene_xml(sim_dt_s: float = 0.005, layout: SlotLayout = DEFAULT_SLOTS) -> st
     </default>
     <default class="drawn_slot"><geom contype="0" conaffinity="0" group="1"/></default>
   </default>
+  <custom><numeric name="max_contact_points" data="{MAX_CONTACTS}"/></custom>
   <visual><global offwidth="1280" offheight="720"/><map znear="0.02" zfar="20"/></visual>
   <worldbody>
     <light pos="0.6 -0.6 2" dir="-0.1 0.3 -1" directional="true"/>

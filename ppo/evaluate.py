@@ -20,7 +20,8 @@ def evaluate(env: GraspEnv, policy: TeacherPolicy, trials: int, seed: int) -> di
 
     Returns:
       success {"successes", "n"}; objects {name: {"successes", "n"}}; saturated_actions; motion, a row
-      {"object", ...} of `motion_metrics` for each object that came up, and one for all.
+      {"object", ...} of `motion_metrics` for each object that came up, and one for all; contacts_dropped,
+      those that the physics backend could not hold.
     """
     keys = jax.random.split(jax.random.PRNGKey(seed), trials)
     seen = roll_out(env, policy, keys, motion_of)
@@ -41,4 +42,5 @@ def evaluate(env: GraspEnv, policy: TeacherPolicy, trials: int, seed: int) -> di
         "objects": objects,
         "saturated_actions": rows[-1]["saturated_actions"],
         "motion": rows,
+        "contacts_dropped": seen.dropped,
     }

@@ -231,6 +231,7 @@ def _unroll(env, env_state, policy, key, length):
     episodes = jnp.maximum(done.sum(), 1.0)
     outcome = {"success": metrics["success"].sum() / episodes, "saturated": metrics["saturated"].mean()}
     outcome |= {f"episode/{k}": (metrics[k] * done).sum() / episodes for k in ("return", "length")}
+    outcome["contacts_dropped"] = metrics["contacts_dropped"].sum()
     outcome |= {k: v.mean() for k, v in metrics.items() if k.startswith("reward/")}
     return env_state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data), outcome
 

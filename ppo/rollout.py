@@ -1,5 +1,6 @@
 """Whole episodes of a deterministic teacher, on all devices, keeping of every step what is asked for."""
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,7 +14,7 @@ from mujoco_playground import State
 
 from mjx_envs import devices
 from mjx_envs.grasp_env import GraspEnv
-from mjx_envs.physics.interface import ModelParams
+from mjx_envs.physics.interface import ModelParams, dropped_warning
 from ppo.policy import TeacherPolicy
 
 Keep = Callable[[State, jax.Array, State], dict[str, jax.Array]]
@@ -34,6 +35,8 @@ class Rollout:
     """(T, N) bool, whether the episode was still going on as the step began."""
     kept: dict[str, np.ndarray]
     """(T, N, ...) each."""
+    dropped: int
+    """Contacts that the physics backend could not hold, of all episodes."""
 
 
 def roll_out(env: GraspEnv, policy: TeacherPolicy, keys: jax.Array | np.ndarray, keep: Keep) -> Rollout:
@@ -45,10 +48,13 @@ def roll_out(env: GraspEnv, policy: TeacherPolicy, keys: jax.Array | np.ndarray,
     surplus = -len(keys) % mesh.size  # the devices share evenly: some repeat the last episode
     padded = np.concatenate([keys, np.repeat(keys[-1:], surplus, axis=0)])
     made = _roll_out(env, mesh, keep, policy.layers, policy.mean, policy.std, padded)
-    (params, index, success), per_step = jax.tree.map(np.asarray, made)
+    (params, index, success), (running, kept, lost) = jax.tree.map(np.asarray, made)
     first = partial(jax.tree.map, lambda values: values[: len(keys)])
-    running, kept = jax.tree.map(lambda values: values[:, : len(keys)], per_step)
-    return Rollout(first(params), first(index), first(success), running, kept)
+    running, kept, lost = jax.tree.map(lambda values: values[:, : len(keys)], (running, kept, lost))
+    dropped = int(lost[running].sum())
+    if warning := dropped_warning(dropped, int(running.sum())):
+        print(warning, file=sys.stderr, flush=True)
+    return Rollout(first(params), first(index), first(success), running, kept, dropped)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -62,7 +68,7 @@ def _roll_out(env: GraspEnv, mesh: Mesh, keep: Keep, layers, mean, std, keys) ->
         action = policy(state.obs, jnp)
         new = devices.each(mesh, env.step)(state, action)
         success = jnp.where(alive, new.metrics["success"] > 0, success)
-        return (new, alive & (new.done == 0), success), (alive, keep(state, action, new))
+        return (new, alive & (new.done == 0), success), (alive, keep(state, action, new), new.data.dropped)
 
     start = (state, jnp.ones(len(keys), bool), jnp.zeros(len(keys), bool))
     (*_, success), per_step = jax.lax.scan(step, start, None, env.config.episode_steps)

@@ -14,6 +14,7 @@ from ddgrasp.progress import Progress
 from learning.checkpoints import Checkpoints
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
+from mjx_envs.physics.interface import dropped_warning
 from ppo import health, hosts, learner, memory
 from ppo.evaluate import evaluate
 from ppo.policy import PARAMS_FILE, TeacherPolicy, from_learner, load_state, save
@@ -56,7 +57,7 @@ def _train(
             state, metrics, watched = iterate(state)
             health.check(i, watched, saved.latest, directory)
             if i % LOG_EVERY == 0 or i == total:
-                _log(i, metrics | clock.rate(i), progress, task)
+                _log(i, metrics | clock.rate(i), teacher.num_envs * teacher.unroll_steps, progress, task)
             task.advance()
             if i % teacher.eval_every == 0:
                 rate = _evaluate(test_env, state, config, i, progress)
@@ -169,8 +170,10 @@ def _start(config: Config, env: AutoReset, saved: Checkpoints, progress: Progres
     return state
 
 
-def _log(i: int, metrics, progress: Progress, task) -> None:
+def _log(i: int, metrics, control_steps: int, progress: Progress, task) -> None:
     values = {name: float(value) for name, value in metrics.items()}
+    if warning := dropped_warning(values["contacts_dropped"], control_steps):
+        progress.note(warning)
     progress.scalars(i, **values)
     task.advance(0, success=values["success"])
 

@@ -82,7 +82,7 @@ class TeacherCompare:
     backends: tuple[Backend, ...] = ("cpu", "jax")
     """Physics backends: cpu, jax, warp."""
     trials: Count | None = None
-    """Episodes per backend; by default 1000, on jax 200 (without a GPU it compiles for minutes)."""
+    """Episodes per backend; by default 1000, on jax 200."""
     seed: Seed = 0
     """Seed of the episodes."""
 

@@ -73,6 +73,7 @@ class _HostBatch:
             qvel=self._qvel.astype(np.float32),
             warmstart=self._warmstart.astype(np.float32),
             touch=touch_from_sensors(self._sensors, np).astype(np.float32),
+            dropped=np.zeros(len(ctrl), np.int32),
         )
 
     def _write_params(self, params: ModelParams) -> None:

@@ -60,6 +60,9 @@ class PhysicsState:
     """(15,) the constraint solver's last solution: with it a step is repeatable to the bit."""
     touch: jax.Array
     """(2,) contact force (N) between the object and the left and right finger pad."""
+    dropped: jax.Array
+    """() int32 contacts beyond what the backend holds, summed over the last control step's physics steps:
+    those geoms felt nothing of each other. 0 on the C engine, which holds any number."""
 
 
 @runtime_checkable
@@ -74,7 +77,19 @@ class Physics(Protocol):
 def initial_state(qpos: Float[jax.Array, "16"]) -> PhysicsState:
     """At rest in `qpos` (16,), touching nothing."""
     return PhysicsState(
-        qpos=qpos, qvel=jnp.zeros(scene.NV), warmstart=jnp.zeros(scene.NV), touch=jnp.zeros(2)
+        qpos=qpos, qvel=jnp.zeros(scene.NV), warmstart=jnp.zeros(scene.NV), touch=jnp.zeros(2),
+        dropped=jnp.zeros((), jnp.int32),
+    )  # fmt: skip
+
+
+def dropped_warning(dropped: float, control_steps: float) -> str | None:
+    """One line about contacts that the backend could not hold in so many control steps; None without."""
+    if not dropped:
+        return None
+    return (
+        f"warning: {dropped:,.0f} contacts in {control_steps:,.0f} control steps were more than the physics "
+        "backend holds and were left out: use --world.backend cpu, or raise MAX_CONTACTS of "
+        "mjx_envs/scene.py (jax) or CONTACTS_PER_ENV and CONSTRAINTS_PER_ENV of mjx_warp.py (warp)"
     )
 
 

@@ -12,9 +12,13 @@ from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, to
 
 CONTACTS_PER_ENV = 40
 """Room per environment in the batch's common buffer: nine slots against table, hand and two pads, all near
-at once, are 36 candidates; the most contacts seen is 20 (a persimmon pressed by the hand)."""
+at once, are 36 candidates; the most contacts seen is 20 (a persimmon pressed by the hand). Warp computes
+those that there are, so that a closer cap would save memory alone."""
 CONSTRAINTS_PER_ENV = 128
 """Rows; the most seen is 90."""
+TOO_MANY = (1 << 0) | (1 << 2) | (1 << 3)
+"""Bits of MuJoCo Warp's `Data.overflow` (its `OverflowType`): rows, candidate pairs, contacts. Once set they
+stay, and how many were lost is not kept: an environment counts 1 for a control step."""
 
 
 def require_gpu(what: str = "backend") -> None:
@@ -75,10 +79,12 @@ class WarpPhysics:
             mx = self._mx.replace(**fields, **self._index.derived(self._mx, fields))
             data = empty.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
             data, _ = jax.lax.scan(lambda d, _: (mjx.step(mx, d), None), data, None, self._substeps)
-            return data.qpos, data.qvel, data.qacc_warmstart, data.sensordata
+            return data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, data._impl.overflow
 
-        qpos, qvel, warmstart, sensors = jax.vmap(one)(params, state, ctrl)
-        return PhysicsState(qpos=qpos, qvel=qvel, warmstart=warmstart, touch=touch_from_sensors(sensors, jnp))
+        qpos, qvel, warmstart, sensors, overflow = jax.vmap(one)(params, state, ctrl)
+        touch = touch_from_sensors(sensors, jnp)
+        dropped = ((overflow & TOO_MANY) != 0).astype(jnp.int32)
+        return PhysicsState(qpos=qpos, qvel=qvel, warmstart=warmstart, touch=touch, dropped=dropped)
 
     def _advance_nested(self, axis_size, batched, *arguments):
         """`vmap` of `_advance`: one larger batch."""

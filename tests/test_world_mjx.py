@@ -1,0 +1,137 @@
+"""MJX-JAX: no link is computed again and again, rows and contacts are as asked for, none is lost unseen."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from ddgrasp.config import WorldConfig
+from mjx_envs import scene
+from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.object_spec import DEFAULT_SLOTS, SlotLayout
+from mjx_envs.physics import interface, mjx_kinematics
+from mjx_envs.physics.mjx_jax import JaxPhysics
+from ppo import rollout
+from ppo.policy import TeacherPolicy
+
+BATCH = 64
+SLOWER_THAN_C = 90.0
+"""Bound of the guard, in CPU time: a good compile takes 4.5 times the C engine's (`docs/physics.md`)."""
+
+
+def _cpu_seconds(run: Callable[[], object]) -> float:
+    """Least CPU time of a call, of all threads: other processes do not count."""
+    run()
+    times = []
+    for _ in range(10):
+        start = time.process_time()
+        run()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+def test_the_poses_of_links_are_computed_once():
+    model = scene.build_model()
+    mx, empty = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+    rng = np.random.default_rng(0)
+    qpos = np.tile(model.qpos0, (BATCH, 1))
+    qpos[:, : scene.N_ARM] = np.array(scene.HOME_RAD) + rng.uniform(-0.3, 0.3, (BATCH, scene.N_ARM))
+    qpos[:, 12:] = rng.normal(size=(BATCH, 4))
+
+    @jax.jit
+    @jax.vmap
+    def poses(qpos):
+        data = mjx.com_pos(mx, mjx_kinematics.kinematics(mx, empty.replace(qpos=qpos)))
+        return data.xpos, data.xmat, data.xipos, data.ximat, data.geom_xpos, data.geom_xmat, data.cdof
+
+    data = mujoco.MjData(model)
+    start = qpos.astype(np.float32)
+    seen = jax.device_get(poses(start))
+    for i, state in enumerate(qpos):
+        data.qpos[:] = state
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        expected = data.xpos, data.xmat, data.xipos, data.ximat, data.geom_xpos, data.geom_xmat, data.cdof
+        for mine, theirs in zip(seen, expected, strict=True):
+            np.testing.assert_allclose(mine[i], theirs.reshape(mine[i].shape), atol=2e-6)
+
+    def c_engine() -> None:
+        for state in qpos:
+            data.qpos[:] = state
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+
+    ours, theirs = _cpu_seconds(lambda: jax.block_until_ready(poses(start))), _cpu_seconds(c_engine)
+    print(f"poses of {BATCH}: {ours * 1e3:.2f} ms, C engine {theirs * 1e3:.2f} ms")
+    assert ours < SLOWER_THAN_C * theirs
+
+
+@pytest.mark.parametrize("layout", [DEFAULT_SLOTS, SlotLayout(capsules=8, cylinders=2, plates=5)])
+def test_rows_and_contacts_are_those_asked_for(layout):
+    physics = JaxPhysics(0.005, 20, layout)
+    made = physics.empty._impl
+    assert (made.ncon, made.nefc) == (12, 65)
+    assert (made.ne, made.nf, made.nl) == (1, 7, 9)
+    assert (made.contact.dim == 4).all()
+    assert made.efc_J.shape == (65, scene.NV)
+
+
+def test_contacts_beyond_the_cap_are_counted():
+    layout = SlotLayout(capsules=8)
+    physics = JaxPhysics(0.005, 20, layout)
+    falling = scene.build_model(layout=layout).qpos0.astype(np.float32)
+    falling[: scene.N_ARM], falling[11] = scene.HOME_RAD, 0.1
+    sunk = falling.copy()
+    sunk[11] = -0.2  # 4 contacts of the box, 2 of each capsule
+
+    @jax.jit
+    @jax.vmap
+    def collide(qpos):
+        data = mjx_kinematics.kinematics(physics.model, physics.empty.replace(qpos=qpos))
+        data, dropped = physics.collide(physics.model, data)
+        return jnp.sum(data._impl.contact.dist < 0), dropped
+
+    held, dropped = jax.device_get(collide(np.stack([falling, sunk])))
+    assert held.tolist() == [0, 12]
+    assert dropped.tolist() == [0, 8]
+
+
+class Overfull:
+    """The C engine's physics, saying that it lost three contacts in every step."""
+
+    def __init__(self, physics: interface.Physics):
+        self._physics = physics
+
+    def step(
+        self, params: interface.ModelParams, state: interface.PhysicsState, ctrl: jax.Array
+    ) -> interface.PhysicsState:
+        return dataclasses.replace(self._physics.step(params, state, ctrl), dropped=jnp.int32(3))
+
+
+def _still() -> TeacherPolicy:
+    """A policy of zeros: the arm keeps its pose."""
+    layer = np.zeros((40, 16), np.float32), np.zeros(16, np.float32)
+    return TeacherPolicy(np.zeros(40, np.float32), np.ones(40, np.float32), [layer])
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_an_evaluation_reports_what_its_physics_lost(lost, capsys):
+    env = GraspEnv(WorldConfig(episode_steps=3))
+    if lost:
+        env.physics = Overfull(env.physics)
+    keys = jax.random.split(jax.random.PRNGKey(0), 4)
+    seen = rollout.roll_out(env, _still(), keys, _nothing)
+    said = capsys.readouterr().err
+    assert seen.dropped == (3 * int(seen.running.sum()) if lost else 0)
+    assert ("36 contacts in 12 control steps were more than the physics backend holds" in said) == lost
+    assert said.count("\n") == int(lost)
+
+
+def _nothing(before, action, after):
+    return {}
