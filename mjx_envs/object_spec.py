@@ -23,7 +23,7 @@ from ddgrasp.arrays import AnyArray
 _HIDDEN_M = 0.001
 _AXIS_POINTS = 33
 PAD_HALF_WIDTH_M = 0.0105
-"""Of a finger's pad, across the closing direction."""
+"""A finger's pad, across the closing direction."""
 
 Factor = Float[AnyArray, ""] | float
 Vector = tuple[float, float, float]

@@ -113,7 +113,7 @@ def iterations(config: TeacherConfig) -> int:
 
 def make_optimizer(config: TeacherConfig) -> optax.GradientTransformation:
     """Adam with clipped gradients, for actor and critic apart; step sizes decay linearly, or the actor's is a
-    part of the state that `_steered` sets."""
+    part of the state that `steered` sets."""
     updates = iterations(config) * config.epochs * config.minibatches
 
     def clipped(adam: optax.GradientTransformation) -> optax.GradientTransformation:
@@ -236,7 +236,7 @@ def _unroll(env, env_state, policy, key, length):
     return env_state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data), outcome
 
 
-def _steered(opt_state: Any, kl: jax.Array, target_kl: float) -> Any:
+def steered(opt_state: Any, kl: jax.Array, target_kl: float) -> Any:
     """`opt_state` with the actor's step size lowered where `kl` () is twice its target, raised where it is
     half of it."""
     actor = opt_state.inner_states["policy"]
@@ -269,7 +269,7 @@ def _improve(config, networks, normalizer, data, key, state, mesh):
         grads = network_params(policy_grads, grads.value)
         updates, opt_state = optimizer.update(grads, opt_state, params)
         if config.target_kl:
-            opt_state = _steered(opt_state, terms["kl_mean"], config.target_kl)
+            opt_state = steered(opt_state, terms["kl_mean"], config.target_kl)
         params = cast(ppo_losses.PPONetworkParams, optax.apply_updates(params, updates))
         return (params, opt_state), terms
 

@@ -9,6 +9,7 @@ import pytest
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig, WorldConfig
+from ddgrasp.layout import QPOS
 from mjx_envs import grasp_math, kinematics, randomize, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import GraspEnv
@@ -92,6 +93,7 @@ def sampler(table):
 def test_every_range_is_listed():
     assert {field.name for field in fields(RandomConfig)} == {
         *MOVES,
+        "held_share",
         "latency_share",
         "other_pose_share",
     }
@@ -146,6 +148,24 @@ def test_the_pose_covers_the_workspace_and_all_yaws():
 def test_pregrasp_share_is_a_share(sampler):
     home = np.abs(sampler(replace(NOTHING, pregrasp_share=0.25))["joints"]).max(axis=1) < 1e-6
     assert 1 - home.mean() == pytest.approx(0.25, abs=0.06)
+
+
+@pytest.mark.parametrize("share", [0.25, 1.0])
+def test_episodes_start_with_the_object_in_the_hand_in_their_share(share):
+    """A gripper that is told to close then holds it, whichever it is."""
+    env = GraspEnv(WorldConfig(objects=tuple(OBJECTS), random=RandomConfig(held_share=share)))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 240))
+    height = np.asarray(state.data.qpos[:, QPOS.object_pos][:, 2] - state.info["episode"].rest_height)
+    raised = height > 1e-4
+    assert raised.mean() == pytest.approx(share, abs=0.08)
+    assert height[raised].max() < contract.LIFT_TARGET_M[2] and np.ptp(height[raised]) > 0.3
+    assert np.asarray(state.info["episode"].distances.grip_to_object)[raised].max() < 0.03
+    close = jnp.zeros((240, 8)).at[:, 7].set(1.0)
+    step = jax.jit(jax.vmap(env.step))
+    for _ in range(5):
+        state = step(state, close)
+    assert np.asarray(state.info["episode"].grasped)[raised].mean() > 0.97
+    assert not np.asarray(state.info["episode"].grasped)[~raised].any()
 
 
 MODEL_FIELDS = {

@@ -3,6 +3,7 @@
 Stages are imported inside `run`, so that `--help` starts without JAX.
 """
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,7 +37,7 @@ class Run(FromPreset):
 
         check_config_values(self.config)
         check_devices(self.config, self.out)
-        print(*check_memory(self.config, self.out), sep="\n", flush=True)
+        print(*check_memory(self.config, self.out), sep="\n", file=sys.stderr, flush=True)
         report = pipeline.run(self.config, self.out, resume=self.resume)
         print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
         print_summary(report)

@@ -17,7 +17,7 @@ from mjx_envs.physics.mjx_kinematics import kinematics
 ITERATIONS = 20
 LINE_STEPS = 6
 TOLERANCE = 1e-8
-"""Of the solver. From the last step's solution two iterations are the rule; the batch goes on until its last
+"""The solver's. From the last step's solution two iterations are the rule; the batch goes on until its last
 environment is done."""
 
 
