@@ -37,6 +37,7 @@ class Run(FromPreset):
 
         check_config_values(self.config)
         check_devices(self.config, self.out)
+        pipeline.check_place(self.out, resume=self.resume)
         print(*check_memory(self.config, self.out), sep="\n", file=sys.stderr, flush=True)
         report = pipeline.run(self.config, self.out, resume=self.resume)
         print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
