@@ -42,9 +42,9 @@ class Window:
     rows: slice
     columns: slice
     height_px: int
-    """Of the whole picture."""
+    """The whole picture's."""
     width_px: int
-    """Of the whole picture."""
+    """The whole picture's."""
 
     @classmethod
     def seen(cls, profile: contract.CameraProfile, shift_px: int) -> "Window":

@@ -15,7 +15,7 @@ from student_jax.data import Window
 from student_jax.policy import Aux, param_shapes
 
 _ROW_BYTES = 4 * (8 + 8 + 40 + 1) + 16
-"""Of a training step beside its picture: state, action, observation, held, episode and step."""
+"""A training step beside its picture: state, action, observation, held, episode and step."""
 
 
 def need(config: Config) -> Need:
@@ -34,7 +34,7 @@ def need(config: Config) -> Need:
 
 
 def training_bytes(config: Config) -> int:
-    """Of an optimiser step on pictures."""
+    """What an optimiser step on pictures takes."""
     student, profile = config.student, config.world.profile
     count, steps = student.training.batch_size, max(1, student.training.steps)
     size = (count, contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
