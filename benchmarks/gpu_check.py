@@ -217,17 +217,26 @@ def training(sizes: Sizes, save: Save) -> Iterator[str]:
 
 def ppo_from_guide(sizes: Sizes, save: Save) -> Iterator[str]:
     """PPO of a policy that was cloned from the scripted guide first, as preset laptop does it."""
-    from ddgrasp.presets import LAPTOP
-
-    rounds = {} if sizes is GPU else {"clone_rounds": 1}
-    yield from _teacher(sizes, save, replace(LAPTOP.teacher, **sizes.teacher | rounds))
+    yield from _teacher(sizes, save, guided(sizes))
 
 
 def ppo_from_nothing(sizes: Sizes, save: Save) -> Iterator[str]:
     """PPO of a policy that starts at random: no guide, no checkpoint; otherwise as in preset paper."""
+    yield from _teacher(sizes, save, unguided(sizes))
+
+
+def guided(sizes: Sizes) -> TeacherConfig:
+    """The teacher of section `ppo_from_guide`."""
+    from ddgrasp.presets import LAPTOP
+
+    return replace(LAPTOP.teacher, **sizes.teacher)
+
+
+def unguided(sizes: Sizes) -> TeacherConfig:
+    """The teacher of section `ppo_from_nothing`."""
     from ddgrasp.presets import PAPER
 
-    yield from _teacher(sizes, save, replace(PAPER.teacher, **sizes.teacher))
+    return replace(PAPER.teacher, **sizes.teacher)
 
 
 def _teacher(sizes: Sizes, save: Save, teacher: TeacherConfig) -> Iterator[str]:

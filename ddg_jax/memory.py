@@ -25,13 +25,13 @@ def need(config: Config) -> Need:
 
 
 def training_bytes(config: DDGConfig) -> int:
-    """In an optimiser step."""
+    """What an optimiser step takes."""
     state = jax.eval_shape(partial(init_state, config), _key_data())
     return traced_bytes(train_step, config, state, *_maps(config, config.training.batch_size))
 
 
 def sampling_bytes(config: DDGConfig) -> int:
-    """In a batch of maps."""
+    """What drawing a batch of maps takes."""
     params = jax.eval_shape(partial(init_state, config), _key_data()).params
     count = config.sampling.batch_size
     numbers = jax.ShapeDtypeStruct((count,), jnp.int32)

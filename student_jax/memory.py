@@ -34,7 +34,7 @@ def need(config: Config) -> Need:
 
 
 def training_bytes(config: Config) -> int:
-    """In an optimiser step on pictures."""
+    """What an optimiser step on pictures takes."""
     student, profile = config.student, config.world.profile
     count, steps = student.training.batch_size, max(1, student.training.steps)
     size = (count, contract.DEPTH_FRAMES, profile.height_px, profile.width_px)

@@ -54,15 +54,20 @@ def test_without_a_gpu_it_says_so_in_one_line(tmp_path, monkeypatch, capsys):
     assert len(lines) == 1 and "needs an NVIDIA GPU" in lines[0] and "--device cpu" in lines[0]
 
 
-def test_generator_student_and_both_teachers_are_timed_and_named(tmp_path):
+def test_generator_and_student_are_timed(tmp_path):
     out = tmp_path / "check.json"
-    names = ["training", "ppo_from_guide", "ppo_from_nothing"]
-    assert gpu_check.run_all(names, "cpu", out) == 0, out.read_text()
+    assert gpu_check.run_section("training", gpu_check.CPU, out) == 0
     report = json.loads(out.read_text())
-    assert report["training"]["preset"] == "debug"
-    assert min(report["training"]["student"].values()) > 0
-    assert min(report["training"]["generator"].values()) > 0
-    assert report["ppo_from_guide"]["start"] == "guide"
-    assert report["ppo_from_nothing"]["start"] == "nothing"
-    for name in names[1:]:
-        assert [row["iteration"] for row in report[name]["evaluations"]] == [0, 1, 2]
+    assert report["preset"] == "debug"
+    assert min(report["student"].values()) > 0 and min(report["generator"].values()) > 0
+
+
+def test_the_teacher_from_nothing_starts_from_nothing_and_the_guided_one_from_the_guide(tmp_path):
+    for sizes in gpu_check.SIZES.values():
+        assert gpu_check.guided(sizes).start == "guide"
+        assert gpu_check.unguided(sizes).start == "nothing"
+    out = tmp_path / "check.json"
+    assert gpu_check.run_section("ppo_from_nothing", gpu_check.CPU, out) == 0
+    report = json.loads(out.read_text())
+    assert report["start"] == "nothing"
+    assert [row["iteration"] for row in report["evaluations"]] == [0, 1, 2]
