@@ -3,8 +3,8 @@
 The acceleration minimises 1/2 (a - a_s)' M (a - a_s) + s(J a - a_ref), a_s being the acceleration without
 constraints and s the cost of violating them (MuJoCo's documentation, "Computation: constraint model"); cones
 are elliptic. Newton's method with an exact line search. `mjx.solve` builds a dense (rows, rows) matrix for
-the cones in every iteration, evaluates three points in every step of its line search and starts by evaluating the
-problem three times; here cones are blocks, and a step of the search evaluates one point.
+the cones in every iteration, evaluates three points in every step of its line search and starts by evaluating
+the problem three times; here cones are blocks, and a step of the search evaluates one point.
 """
 
 from typing import NamedTuple
