@@ -34,7 +34,7 @@ def of_update(
       value/explained_variance: 1 - Var(return - value) / Var(return), with the return as GAE estimates it
         and the value before the update: 1 foresees every return, 0 knows no more than their mean.
     """
-    distribution = networks.parametric_action_distribution
+    distribution: Any = networks.parametric_action_distribution
     logits = networks.policy_network.apply(normalizer, policy_after, data.observation)
     policy = data.extras["policy_extras"]
     new, old = distribution.create_dist(logits), distribution.create_dist(policy["distribution_params"])

@@ -1,6 +1,7 @@
 """MuJoCo's C engine on all cores, called from jitted JAX code."""
 
 import os
+from typing import Any
 
 import jax
 import mujoco
@@ -68,12 +69,13 @@ class _HostBatch:
         self._qpos[:], self._qvel[:] = state.qpos, state.qvel
         self._warmstart[:], self._ctrl[:] = state.warmstart, ctrl
         self._batch.step(nstep=substeps)
+        none: Any = np.zeros(len(ctrl), np.int32)
         return PhysicsState(
             qpos=self._qpos.astype(np.float32),
             qvel=self._qvel.astype(np.float32),
             warmstart=self._warmstart.astype(np.float32),
             touch=touch_from_sensors(self._sensors, np).astype(np.float32),
-            dropped=np.zeros(len(ctrl), np.int32),
+            dropped=none,
         )
 
     def _write_params(self, params: ModelParams) -> None:
