@@ -42,11 +42,17 @@ def run(
 
     Raises UserError if `run_dir` holds a run and `resume` is off, or holds one of another configuration.
     """
-    if not resume:
-        _refuse_occupied(run_dir, [stage.name for stage in stages])
+    check_place(run_dir, resume=resume, stages=stages)
     for stage in stages:
         make(stage, config, run_dir, resume=resume, quiet=quiet)
     return importlib.import_module("evaluation.report.stage").write_report(run_dir)
+
+
+def check_place(run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES) -> None:
+    """UserError unless `run_dir` can be written, and is free for the stages or to be gone on with."""
+    if not resume:
+        _refuse_occupied(run_dir, [stage.name for stage in stages])
+    _create(run_dir / stages[0].name)
 
 
 def make(

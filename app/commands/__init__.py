@@ -36,7 +36,9 @@ class Run(FromPreset):
 
         check_config_values(self.config)
         check_devices(self.config, self.out)
-        print(*check_memory(self.config, self.out), sep="\n", flush=True)
+        needs = check_memory(self.config, self.out)
+        pipeline.check_place(self.out, resume=self.resume)
+        print(*needs, sep="\n", flush=True)
         report = pipeline.run(self.config, self.out, resume=self.resume)
         print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
         print_summary(report)
