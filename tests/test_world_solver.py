@@ -56,6 +56,7 @@ def visited():
             grip = data.site("grip").xpos
             data.qpos[9:12] = [grip[0], grip[1], OBJECTS[name].rest_height_m + height]
             data.ctrl[:7], data.ctrl[7:] = data.qpos[:7], 0.0
+            data.qvel[9] = 1.0 if height == 0 else 0.0
             for step in range(120):
                 guess = data.qacc_warmstart.copy()
                 mujoco.mj_forward(model, data)
@@ -92,8 +93,11 @@ def _cost(problem: mjx_solver.Problem, acceleration: np.ndarray) -> float:
     return total
 
 
-def test_it_minimises_the_same_cost_as_the_c_engine(visited):
+@pytest.mark.parametrize("noise", [0.0, 5.0])
+def test_it_minimises_the_same_cost_as_the_c_engine(visited, noise):
     arrays, fixed, guesses, expected, contacts = visited
+    off = np.random.default_rng(0).normal(size=guesses.shape)
+    guesses = (guesses + noise * off).astype(np.float32)
     assert contacts.max() >= 8 and contacts.min() == 0
 
     def solve(parts, guess):
@@ -105,6 +109,6 @@ def test_it_minimises_the_same_cost_as_the_c_engine(visited):
         task = mjx_solver.Problem(*(part[i] for part in arrays), equalities=fixed)
         least = _cost(task, best)
         assert _cost(task, acceleration.astype(float)) - least < 1e-5 * max(1.0, abs(least)), i
-        np.testing.assert_allclose(acceleration[:9], best[:9], atol=0.02, err_msg=str(i))
+        np.testing.assert_allclose(acceleration[:9], best[:9], atol=1e-4, err_msg=str(i))
         balance = task.mass @ acceleration - task.force - forces[i] @ task.jacobian
-        assert np.abs(balance).max() < 1e-2, i
+        assert np.abs(balance).max() < 1e-3, i

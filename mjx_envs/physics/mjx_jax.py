@@ -15,7 +15,7 @@ from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState
 from mjx_envs.physics.mjx_kinematics import kinematics
 
 ITERATIONS = 20
-LINE_STEPS = 6
+LINE_STEPS = 30
 TOLERANCE = 1e-8
 """The solver's. From the last step's solution two iterations are the rule; the batch goes on until its last
 environment is done."""

@@ -15,6 +15,8 @@ from mujoco import mjx
 
 CONE = 4
 """Rows of a contact: normal, two tangents, torsion (`condim` 4)."""
+FLAT = 0.01
+"""Share of the slope at its start at which a line search ends (MuJoCo's `ls_tolerance`)."""
 _TINY = 1e-15
 
 
@@ -89,14 +91,15 @@ def solve(
         gradient = task.mass @ acceleration - task.force - force @ task.jacobian
         hessian = task.mass + task.jacobian.T @ weighted
         direction = -_solve_positive(hessian, gradient)
+        gain = -gradient @ direction / 2
         line = _Line(
             at=away,
             along=task.jacobian @ direction,
             slope=direction @ (task.mass @ acceleration - task.force),
             curvature=direction @ task.mass @ direction,
         )
-        step = _line_search(task, line, line_steps)
-        gain = -gradient @ direction / 2
+        flat = jnp.maximum(FLAT * 2 * gain, least)
+        step = _line_search(task, line, flat, line_steps)
         return count + 1, acceleration + step * direction, away + step * line.along, gain
 
     away = task.jacobian @ start - task.reference
@@ -167,24 +170,30 @@ def _cones(cone, away, stiffness) -> tuple[jax.Array, jax.Array]:
     return forces, weights
 
 
-def _line_search(task: Problem, line: _Line, steps: int) -> jax.Array:
-    """() the step along the line where the cost is least: Newton's method, bisection outside the bracket.
+def _line_search(task: Problem, line: _Line, flat: jax.Array, steps: int) -> jax.Array:
+    """() a step along the line where the cost's slope is at most `flat`: Newton's method, else bisection.
 
-    The cost is convex, so that its slope changes sign once; it falls at zero.
+    The cost is convex, so that its slope changes sign once; it falls at zero, and 1 is Newton's own step. Where
+    the search were to end early the cost may have risen, and grasped objects were thrown.
     """
     slopes = _slopes(task, line)
 
-    def step(state, _):
-        low, high, here = state
+    def unfinished(state):
+        count, _, _, _, done = state
+        return (count < steps) & ~done
+
+    def move(state):
+        count, low, high, here, _ = state
         slope, curvature = slopes(here)
         low, high = jnp.where(slope < 0, here, low), jnp.where(slope < 0, high, here)
         there = here - slope / curvature
-        return (low, high, jnp.where((there >= low) & (there <= high), there, (low + high) / 2)), None
+        middle = jnp.where(jnp.isinf(high), here, (low + high) / 2)
+        there = jnp.where((there > low) & (there < high), there, middle)
+        done = jnp.abs(slope) <= flat
+        return count + 1, low, high, jnp.where(done, here, there), done
 
-    zero = jnp.float32(0.0)
-    slope, curvature = slopes(zero)
-    start = (zero, jnp.float32(1e10), -slope / curvature)
-    return jax.lax.scan(step, start, None, steps)[0][2]
+    zero, one = jnp.zeros_like(line.slope), jnp.ones_like(line.slope)
+    return jax.lax.while_loop(unfinished, move, (0, zero, zero + jnp.inf, one, zero > 0))[3]
 
 
 def _slopes(task: Problem, line: _Line):
