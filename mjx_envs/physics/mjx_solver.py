@@ -173,8 +173,8 @@ def _cones(cone, away, stiffness) -> tuple[jax.Array, jax.Array]:
 def _line_search(task: Problem, line: _Line, flat: jax.Array, steps: int) -> jax.Array:
     """() a step along the line where the cost's slope is at most `flat`: Newton's method, else bisection.
 
-    The cost is convex, so that its slope changes sign once; it falls at zero, and 1 is Newton's own step. Where
-    the search were to end early the cost may have risen, and grasped objects were thrown.
+    The cost is convex, so that its slope changes sign once; it falls at zero, and 1 is Newton's own step. A
+    search that ends too early may raise the cost: with six steps and no test grasped fruits were thrown.
     """
     slopes = _slopes(task, line)
 
