@@ -15,7 +15,8 @@ from ddgrasp.config import WorldConfig
 from mjx_envs import scene
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.object_spec import DEFAULT_SLOTS, SlotLayout
-from mjx_envs.physics import interface, mjx_kinematics
+from mjx_envs.objects import OBJECTS
+from mjx_envs.physics import interface, mjx_collision, mjx_kinematics
 from mjx_envs.physics.mjx_jax import JaxPhysics
 from ppo import rollout
 from ppo.policy import TeacherPolicy
@@ -92,14 +93,50 @@ def test_contacts_beyond_the_cap_are_counted():
 
     @jax.jit
     @jax.vmap
-    def collide(qpos):
+    def collided(qpos):
         data = mjx_kinematics.kinematics(physics.model, physics.empty.replace(qpos=qpos))
-        data, dropped = physics.collide(physics.model, data)
-        return jnp.sum(data._impl.contact.dist < 0), dropped
+        contact, dropped = mjx_collision.collide(physics.model, data, scene.MAX_CONTACTS)
+        return jnp.sum(contact.dist < 0), dropped
 
-    held, dropped = jax.device_get(collide(np.stack([falling, sunk])))
+    held, dropped = jax.device_get(collided(np.stack([falling, sunk])))
     assert held.tolist() == [0, 12]
     assert dropped.tolist() == [0, 8]
+
+
+def test_a_ball_beside_a_pads_face_is_touched():
+    """A capsule that is nearly a sphere, from in front of the pad's face to beyond its edge."""
+    model = scene.build_model()
+    scene.fill_slots(model, OBJECTS["peach"], DEFAULT_SLOTS)
+    data = mujoco.MjData(model)
+    data.qpos[: scene.N_ARM], data.qpos[7:9] = scene.HOME_RAD, 0.04
+    mujoco.mj_forward(model, data)
+    pad, turn = data.geom("left_finger_pad").xpos, data.geom("left_finger_pad").xmat.reshape(3, 3)
+    ball = model.geom("slot_capsule0")
+    states, expected = [], []
+    for beyond in np.linspace(-0.004, 0.006, 11):
+        centre = np.array([0.0105 + beyond, -0.005 - ball.size[0] + 0.002, 0.0])
+        data.qpos[9:12] = pad + turn @ centre - ball.pos
+        mujoco.mj_forward(model, data)
+        states.append(data.qpos.astype(np.float32))
+        depths = [c.dist for c in data.contact if {*c.geom} == {ball.id, model.geom("left_finger_pad").id}]
+        expected.append(min(depths, default=0.0))
+    mx, empty = mjx.put_model(_uncapped(model), impl="jax"), mjx.make_data(scene.build_model(), impl="jax")
+
+    @jax.jit
+    @jax.vmap
+    def depth(qpos):
+        posed = mjx_kinematics.kinematics(mx, empty.replace(qpos=qpos))
+        contact, _ = mjx_collision.collide(mx, posed, scene.MAX_CONTACTS)
+        pair = jnp.array([ball.id, model.geom("left_finger_pad").id])
+        return jnp.min(jnp.where((contact.geom == pair).all(axis=1), contact.dist, 0.0))
+
+    assert min(expected) < -0.0015 and max(expected) < -0.001
+    np.testing.assert_allclose(depth(np.stack(states)), expected, atol=1e-4)
+
+
+def _uncapped(model: mujoco.MjModel) -> mujoco.MjModel:
+    model.numeric_data[:] = -1
+    return model
 
 
 class Overfull:

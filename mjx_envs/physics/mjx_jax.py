@@ -12,6 +12,7 @@ from mjx_envs import scene
 from mjx_envs.object_spec import SlotLayout
 from mjx_envs.physics import mjx_solver
 from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState
+from mjx_envs.physics.mjx_collision import collide
 from mjx_envs.physics.mjx_kinematics import kinematics
 
 ITERATIONS = 20
@@ -57,7 +58,8 @@ class JaxPhysics:
         """`mjx.step` less what the scene has none of: sensors, tendons, cameras, applied forces."""
         data = self.empty.replace(qpos=now.qpos, qvel=now.qvel, ctrl=ctrl)
         data = mjx.crb(mx, mjx.com_pos(mx, kinematics(mx, data)))
-        data, dropped = self.collide(mx, data)
+        contact, dropped = collide(mx, data, scene.MAX_CONTACTS)
+        data = data.tree_replace({"_impl.contact": contact})
         data = mjx.transmission(mx, mjx.make_constraint(mx, data))
         data = mjx.fwd_actuation(mx, mjx.fwd_velocity(mx, data))
         task = mjx_solver.problem(mx, data)
@@ -66,15 +68,6 @@ class JaxPhysics:
         touch = self._touch(data, force)
         data = _advance(mx, data)
         return _Moving(data.qpos, data.qvel, acceleration, touch, now.dropped + dropped)
-
-    def collide(self, mx: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, jax.Array]:
-        """`data` with the deepest contacts, and () how many touch beyond those."""
-        found = mjx.collision(mx, data)._impl.contact
-        cap = self.empty._impl.ncon
-        _, deepest = jax.lax.top_k(-found.dist, cap)
-        dropped = jnp.maximum(jnp.sum(found.dist < 0) - cap, 0)
-        contact = jax.tree.map(lambda x: x[deepest], found)
-        return data.tree_replace({"_impl.contact": contact}), dropped
 
     def _touch(self, data: mjx.Data, force: jax.Array) -> jax.Array:
         """(2,) N, as the scene's sensors have it: the strongest contact of a pad with each slot, summed."""
