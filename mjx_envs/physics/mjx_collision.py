@@ -1,8 +1,8 @@
 """Contacts for MJX-JAX: those of `mjx.collision`, one kind that it misses, and no more than are held.
 
-`mjx.collision` sees nothing between a box and a short capsule whose centre is millimetres beside the face
-that it presses: the face is left out, since the centre is beyond its edge, and so is the edge, since it lies
-within eight degrees of the face's normal. Pads sank into pears, whose capsules are nearly spheres.
+`mjx.collision` sees nothing between a box and a short capsule whose centre is some millimetres beside the
+face that it presses: the face is left out, since the centre is beyond its edge, and so is the edge, since it
+lies within eight degrees of the face's normal. Pads sank into pears, whose capsules are nearly spheres.
 """
 
 import jax
