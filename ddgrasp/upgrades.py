@@ -93,6 +93,7 @@ _ADDED_AFTER_2 = {
     "teacher.gripper_std": 0.15,
     "teacher.min_std": 0.01,
     "teacher.held_share": 0.0,
+    "teacher.settle_from": 1.0,
 }
 """Fields that version 2 lacked, with what it did."""
 

@@ -37,6 +37,9 @@ from ppo import diagnostics, health
 OBSERVATION_STD_MIN = 0.01
 """Bounds the normalised size of components that hardly ever move, such as an upright object's tilt."""
 
+SETTLED = 0.1
+"""Factor on the KL divergence and the least step size at the end (`TeacherConfig.settle_from`)."""
+
 STEERED_RATE_MIN = 1e-4
 """Least step size that `target_kl` steers to: at 3e-5, which Brax's own 1e-5 allows, PPO from nothing stayed
 with the object in the hand and did not learn to lift it."""
@@ -196,7 +199,7 @@ def iteration(
     networks = make_networks(config)
     key = jax.random.fold_in(state.key, state.iteration)
     k_unroll, k_sgd = jax.random.split(key)
-    env_state = env.refresh(state.env_state)
+    env_state = env.refresh(state.env_state, jnp.where(settling(config, state.iteration) > 0, 0.0, 1.0))
     policy = ppo_networks.make_inference_fn(networks)((state.normalizer, state.params.policy))
     env_state, data, outcome = _unroll(env, env_state, policy, k_unroll, config.unroll_steps)
     data = jax.lax.with_sharding_constraint(data, devices.over_envs(env.mesh))
@@ -236,11 +239,23 @@ def _unroll(env, env_state, policy, key, length):
     return env_state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data), outcome
 
 
-def steered(opt_state: Any, kl: jax.Array, target_kl: float) -> Any:
+def settling(config: TeacherConfig, iteration: jax.Array) -> jax.Array:
+    """() how much of the time that `settle_from` leaves for settling is over: 0 before, 1 at the end."""
+    total = iterations(config)
+    start = round(config.settle_from * total)
+    return jnp.clip((iteration + 1 - start) / max(1, total - start), 0.0, 1.0)
+
+
+def steered(
+    opt_state: Any,
+    kl: jax.Array,
+    target_kl: jax.Array | float,
+    least_rate: jax.Array | float = STEERED_RATE_MIN,
+) -> Any:
     """`opt_state` with the actor's step size lowered where `kl` () is twice its target, raised where it is
-    half of it."""
+    half of it, never below `least_rate`."""
     actor = opt_state.inner_states["policy"]
-    chain, _ = adaptive_kl_learning_rate(actor.inner_state, kl, target_kl, STEERED_RATE_MIN)
+    chain, _ = adaptive_kl_learning_rate(actor.inner_state, kl, target_kl, least_rate)
     return opt_state._replace(
         inner_states=opt_state.inner_states | {"policy": actor._replace(inner_state=chain)}
     )
@@ -249,6 +264,7 @@ def steered(opt_state: Any, kl: jax.Array, target_kl: float) -> Any:
 def _improve(config, networks, normalizer, data, key, state, mesh):
     """`epochs` passes of minibatch gradient steps; new (params, opt_state), mean loss terms and gradients."""
     optimizer = make_optimizer(config)
+    calm = 1.0 - (1.0 - SETTLED) * settling(config, state.iteration)
     loss_fn = partial(
         ppo_losses.compute_ppo_loss,
         ppo_network=networks,
@@ -269,7 +285,8 @@ def _improve(config, networks, normalizer, data, key, state, mesh):
         grads = network_params(policy_grads, grads.value)
         updates, opt_state = optimizer.update(grads, opt_state, params)
         if config.target_kl:
-            opt_state = steered(opt_state, terms["kl_mean"], config.target_kl)
+            kl = terms["kl_mean"]
+            opt_state = steered(opt_state, kl, calm * config.target_kl, calm * STEERED_RATE_MIN)
         params = cast(ppo_losses.PPONetworkParams, optax.apply_updates(params, updates))
         return (params, opt_state), terms
 

@@ -1,5 +1,6 @@
 """PPO from nothing improves a policy: a small problem, from 1 of 64 to nearly always in 160,000 steps."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -55,3 +56,14 @@ def test_the_step_size_follows_the_divergence_of_an_update(kl, expected):
     for _ in range(20):
         state = learner.steered(state, jnp.asarray(1.0), TEACHER.target_kl)
     assert float(optax.tree_utils.tree_get(state, "learning_rate")) == pytest.approx(learner.STEERED_RATE_MIN)
+
+
+@pytest.mark.parametrize(
+    ("settle_from", "expected"),
+    [(1.0, [0, 0, 0, 0, 0]), (0.6, [0, 0, 0, 0.5, 1]), (0.0, [0.2, 0.4, 0.6, 0.8, 1])],
+)
+def test_training_settles_in_its_last_iterations(settle_from, expected):
+    teacher = replace(
+        TEACHER, total_steps=5 * TEACHER.num_envs * TEACHER.unroll_steps, settle_from=settle_from
+    )
+    assert [float(learner.settling(teacher, jnp.asarray(i))) for i in range(5)] == pytest.approx(expected)

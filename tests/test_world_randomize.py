@@ -12,7 +12,7 @@ from ddgrasp.config import RandomConfig, WorldConfig
 from ddgrasp.layout import QPOS
 from mjx_envs import grasp_math, kinematics, randomize, scene
 from mjx_envs.camera import nominal_camera
-from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.grasp_env import AutoReset, GraspEnv
 from mjx_envs.objects import OBJECTS
 from mjx_envs.physics import interface as physics
 from rig.world import RigWorld
@@ -62,7 +62,7 @@ def sampler(table):
             params, size = randomize.sample_params(k_params, config, table, 0)
             qpos = randomize.sample_qpos(k_qpos, config, jnp.asarray(CUBE.rest_height_m))
             grasp = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], jnp.asarray(4), 0.0, jnp)
-            qpos = randomize.maybe_pregrasp(k_start, config, qpos, *grasp)
+            qpos = randomize.maybe_pregrasp(k_start, config.pregrasp_share, qpos, *grasp)
             turn = CAMERA[:3, :3].T @ randomize.sample_camera(k_camera, config, CAMERA)[:3, :3]
             return {
                 "size": size,
@@ -166,6 +166,19 @@ def test_episodes_start_with_the_object_in_the_hand_in_their_share(share):
         state = step(state, close)
     assert np.asarray(state.info["episode"].grasped)[raised].mean() > 0.97
     assert not np.asarray(state.info["episode"].grasped)[~raised].any()
+
+
+@pytest.mark.parametrize("exploring", [0.0, 0.5])
+def test_shares_of_exploring_starts_are_turned_down(exploring):
+    """Of pregrasps and of held objects alike, in a running batch."""
+    random = replace(NOTHING, pregrasp_share=0.5, held_share=0.5)
+    env = AutoReset(GraspEnv(WorldConfig(objects=("cube",), random=random)))
+    state = env.reset(jax.random.split(jax.random.PRNGKey(0), 400))
+    qpos = np.asarray(env.refresh(state, exploring).info["next"][0].qpos)
+    held = qpos[:, QPOS.object_pos][:, 2] > 0.026
+    moved = np.abs(qpos[:, QPOS.arm] - scene.HOME_RAD).max(axis=1) > 1e-6
+    assert held.mean() == pytest.approx(0.5 * exploring, abs=0.08)
+    assert moved[~held].mean() == pytest.approx(0.5 * exploring, abs=0.08)
 
 
 MODEL_FIELDS = {

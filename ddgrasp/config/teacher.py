@@ -71,6 +71,9 @@ class TeacherConfig(Section, name="teacher"):
     """Share of training episodes that start with the hand above the object (exploring starts)."""
     held_share: Share = 0.0
     """Share of training episodes that start with the object in the hand, anywhere up to the lift target."""
+    settle_from: Share = 1.0
+    """From this share of the iterations on PPO settles: episodes start as the world's do, without the two
+    shares above, and target_kl with the least step size shrinks linearly to a tenth; 1 for never."""
     clone_rounds: Count = 8
     """DAgger rounds in which the policy network learns the guide before PPO; for start guide alone."""
     clone_envs: Count = 192
