@@ -1,18 +1,16 @@
 """PPO from nothing improves a policy: a small problem, from 1 of 64 to nearly always in 160,000 steps."""
 
 from dataclasses import replace
-from functools import partial
 
-import jax
 import jax.numpy as jnp
 import optax
 import pytest
 
-from ddgrasp.config import RandomConfig, RewardConfig, TeacherConfig, WorldConfig
+from ddgrasp.config import Config, RandomConfig, RewardConfig, TeacherConfig, WorldConfig
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import learner
 from ppo.evaluate import evaluate
-from ppo.train import policy_of
+from ppo.train import compile_iteration, initial, policy_of
 
 TEACHER = TeacherConfig(
     start="nothing", total_steps=160_000, num_envs=256, unroll_steps=10, minibatches=4, learning_rate=6e-4,
@@ -28,9 +26,9 @@ TRIALS = 64
 
 
 def test_ppo_from_nothing_learns_to_lift_and_hold():
+    config = Config("test", world=WORLD, teacher=TEACHER)
     env = AutoReset(GraspEnv(WORLD))
-    state = jax.jit(partial(learner.init, TEACHER, env))(jax.random.PRNGKey(0))
-    iterate = jax.jit(partial(learner.iteration, TEACHER, env), donate_argnums=0)
+    state, iterate = initial(config, env)(), compile_iteration(config, env)
 
     def successes() -> int:
         return evaluate(env.env, policy_of(state), TRIALS, seed=1)["success"]["successes"]

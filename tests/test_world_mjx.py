@@ -27,17 +27,25 @@ SLOWER_THAN_C = 90.0
 
 
 def _cpu_seconds(run: Callable[[], object]) -> float:
-    """Least CPU time of a call, of all threads: other processes do not count."""
-    run()
-    times = []
-    for _ in range(10):
+    """Least CPU time of a call, of all threads: other processes do not count. Of ten, or fewer slow ones."""
+    times: list[float] = []
+    while len(times) < 10 and sum(times) < 2.0:
         start = time.process_time()
         run()
         times.append(time.process_time() - start)
     return min(times)
 
 
-def test_the_poses_of_links_are_computed_once():
+@pytest.fixture
+def all_optimizations():
+    """Programs as users compile them; the other tests do without."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+def test_the_poses_of_links_are_computed_once(all_optimizations):
     model = scene.build_model()
     mx, empty = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
     rng = np.random.default_rng(0)
