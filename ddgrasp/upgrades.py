@@ -86,12 +86,14 @@ _ADDED_AFTER_1 = {"student.depth_source": "learned"}
 _ADDED_AFTER_2 = {
     "scale": 1.0,
     "world.renderer": "jax",
+    "world.random.pregrasp_turn_rad": 0.0,
     "world.random.held_share": 0.0,
     "world.reward.distance": "funnel",
     "world.reward.grasp_switch": "touch",
     "teacher.target_kl": 0.0,
     "teacher.gripper_std": 0.15,
     "teacher.min_std": 0.01,
+    "teacher.pregrasp_turn_rad": 0.0,
     "teacher.held_share": 0.0,
     "teacher.settle_from": 1.0,
 }

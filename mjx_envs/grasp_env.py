@@ -92,7 +92,8 @@ class GraspEnv(mjx_env.MjxEnv):
         if self.config.random.pregrasp_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
             share = exploring * self.config.random.pregrasp_share
-            qpos = randomize.maybe_pregrasp(k_start, share, qpos, *grasp)
+            turn_rad = self.config.random.pregrasp_turn_rad
+            qpos = randomize.maybe_pregrasp(k_start, share, turn_rad, qpos, *grasp)
         if self.config.random.held_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
             half_width = jnp.asarray(self.table.half_width, jnp.float32)[variant] * size

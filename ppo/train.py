@@ -185,7 +185,10 @@ def training_world(config: Config) -> WorldConfig:
     """The world with the exploring starts that only training has."""
     teacher = config.teacher
     random = dataclasses.replace(
-        config.world.random, pregrasp_share=teacher.pregrasp_share, held_share=teacher.held_share
+        config.world.random,
+        pregrasp_share=teacher.pregrasp_share,
+        pregrasp_turn_rad=teacher.pregrasp_turn_rad,
+        held_share=teacher.held_share,
     )
     return dataclasses.replace(config.world, random=random)
 

@@ -69,6 +69,9 @@ class TeacherConfig(Section, name="teacher"):
     """Layers of policy and value networks."""
     pregrasp_share: Share = 0.2
     """Share of training episodes that start with the hand above the object (exploring starts)."""
+    pregrasp_turn_rad: Annotated[float, Range(0, 1.5)] = 0.0
+    """The hand's yaw there, off the grasp's by up to this: how to turn to either side is found near the
+    object."""
     held_share: Share = 0.0
     """Share of training episodes that start with the object in the hand, anywhere up to the lift target."""
     settle_from: Share = 1.0
