@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.sharding import Mesh
+from jaxtyping import UInt32
 from mujoco_playground import State
 
+from ddgrasp.arrays import AnyArray
 from mjx_envs import devices
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.physics.interface import ModelParams, dropped_warning
@@ -58,7 +60,7 @@ def roll_out(env: GraspEnv, policy: TeacherPolicy, keys: jax.Array | np.ndarray,
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def begin(env: GraspEnv, mesh: Mesh, keys) -> State:
+def begin(env: GraspEnv, mesh: Mesh, keys: UInt32[AnyArray, "n 2"]) -> State:
     """The first states of the episodes of `keys` (N, 2). A program of its own: it calls no host, so it stays
     in JAX's cache on disk, which the episodes on the C engine do not."""
     return devices.each(mesh, env.reset)(keys)

@@ -190,8 +190,8 @@ def test_shares_of_exploring_starts_are_turned_down(exploring):
     """Of pregrasps and of held objects alike, in a running batch."""
     random = replace(NOTHING, pregrasp_share=0.5, held_share=0.5)
     env = AutoReset(GraspEnv(WorldConfig(objects=("cube",), random=random)))
-    state = env.reset(jax.random.split(jax.random.PRNGKey(0), 400))
-    qpos = np.asarray(env.refresh(state, exploring).info["next"][0].qpos)
+    state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 400))
+    qpos = np.asarray(jax.jit(env.refresh)(state, exploring).info["next"][0].qpos)
     held = qpos[:, QPOS.object_pos][:, 2] > 0.026
     moved = np.abs(qpos[:, QPOS.arm] - scene.HOME_RAD).max(axis=1) > 1e-6
     assert held.mean() == pytest.approx(0.5 * exploring, abs=0.08)
