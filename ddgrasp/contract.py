@@ -16,6 +16,7 @@ CONTRACT_VERSION = 1
 CONTROL_HZ = 10.0
 CONTROL_DT_S = 1.0 / CONTROL_HZ
 
+
 # --- robot: limits from Franka's published interface specification ---------------------------
 @dataclass(frozen=True)
 class Arm:
@@ -46,7 +47,7 @@ FR3 = Arm(
     joint_velocity_rad_s=(2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
     joint_acceleration_rad_s2=(10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0),
 )
-"""Franka Research 3. Within a few hundredths of a radian of a position limit it allows less speed than this."""
+"""Franka Research 3. Within a few hundredths of a radian of a position limit it allows less speed."""
 ARMS = {arm.name: arm for arm in (PANDA, FR3)}
 
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))

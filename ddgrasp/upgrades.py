@@ -86,6 +86,13 @@ _ADDED_AFTER_1 = {"student.depth_source": "learned"}
 _ADDED_AFTER_2 = {
     "scale": 1.0,
     "world.renderer": "jax",
+    "deploy.clock": "machine",
+    "deploy.franka.model": "fr3",
+    "deploy.franka.kernel": "realtime",
+    "deploy.franka.start_dynamics": 0.05,
+    "deploy.franka.contact_torque_nm": 20.0,
+    "deploy.franka.contact_force_n": 30.0,
+    "deploy.franka.load_kg": 0.0,
     "world.random.held_share": 0.0,
     "world.reward.distance": "funnel",
     "world.reward.grasp_switch": "touch",

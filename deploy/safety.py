@@ -27,7 +27,7 @@ class SafetyLimits:
     lower_rad: tuple[float, ...] = contract.JOINT_LOWER_RAD
     upper_rad: tuple[float, ...] = contract.JOINT_UPPER_RAD
     velocity_rad_s: tuple[float, ...] = contract.JOINT_VELOCITY_LIMIT_RAD_S
-    """Largest step per control period, divided by the period."""
+    """Largest step per control period, divided by the period; no more than the driver will let the arm do."""
     acceleration_rad_s2: tuple[float, ...] = contract.JOINT_ACCELERATION_LIMIT_RAD_S2
     """Largest change between two steps that follow each other, divided by the period squared."""
     workspace_lower_m: tuple[float, float, float] = (0.15, -0.45, 0.012)

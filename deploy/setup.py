@@ -12,15 +12,29 @@ def loop_settings(config: DeployConfig, info: PolicyMetadata) -> LoopSettings:
     return LoopSettings(period_s=1.0 / info.control_hz, stale_periods=config.stale_periods)
 
 
-def safety_filter(config: DeployConfig, info: PolicyMetadata) -> SafetyFilter:
-    """Joint limits narrow enough for both this robot and the policy; the rest from the configuration."""
-    acceleration = (config.acceleration_scale * a for a in contract.JOINT_ACCELERATION_LIMIT_RAD_S2)
+def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim") -> SafetyFilter:
+    """Limits narrow enough for both `robot` (as `--robot` names it) and the policy."""
+    arm = contract.ARMS[config.franka.model] if robot == "franka" else contract.PANDA
+    speed = config.franka.speed_rad_s if robot == "franka" else arm.joint_velocity_rad_s
     limits = SafetyLimits(
-        lower_rad=tuple(map(max, contract.JOINT_LOWER_RAD, info.joint_lower_rad)),
-        upper_rad=tuple(map(min, contract.JOINT_UPPER_RAD, info.joint_upper_rad)),
-        acceleration_rad_s2=tuple(acceleration),
+        lower_rad=tuple(map(max, arm.joint_lower_rad, info.joint_lower_rad)),
+        upper_rad=tuple(map(min, arm.joint_upper_rad, info.joint_upper_rad)),
+        velocity_rad_s=speed,
+        acceleration_rad_s2=tuple(config.acceleration_scale * a for a in arm.joint_acceleration_rad_s2),
         workspace_lower_m=config.workspace_lower_m,
         workspace_upper_m=config.workspace_upper_m,
         period_s=1.0 / info.control_hz,
     )
     return SafetyFilter(limits, info.action_scale_rad)
+
+
+def speed_notice(config: DeployConfig, info: PolicyMetadata) -> str:
+    """One line where the policy may ask for more speed than `deploy.franka.dynamics` gives; else ""."""
+    asked, given = info.action_scale_rad * info.control_hz, min(config.franka.speed_rad_s)
+    if asked <= given:
+        return ""
+    enough = config.franka.dynamics * asked / given
+    return (
+        f"speed: the policy may ask for {asked:.2f} rad/s, deploy.franka.dynamics {config.franka.dynamics:g} "
+        f"gives {given:.2f}; steps are cut to that ({enough:.2f} gives all of it)"
+    )

@@ -27,7 +27,8 @@ class Channel:
             self._socket = socket.create_connection((host, PORT), CONNECT_S)
         except OSError as error:
             raise UserError(
-                f"no FR3 rig at {host!r} ({error.strerror or error}): start one with `ddgrasp rig fr3 --host {host}`."
+                f"no FR3 rig at {host!r} ({error.strerror or error}): start one, "
+                f"`ddgrasp rig fr3 --host {host}`."
             ) from error
         self._socket.settimeout(ANSWER_S)
         self._file = self._socket.makefile("rw")

@@ -89,6 +89,10 @@ class Fr3Rig:
         assert self._process is not None
         return self._process.pid
 
+    def running(self) -> bool:
+        """Whether the process lives."""
+        return self._process is not None and self._process.poll() is None
+
     def close(self) -> None:
         """Ends the process: asked first, killed if it does not go."""
         if self._channel is not None:
@@ -122,8 +126,12 @@ class Fr3Rig:
                 if "ready" in said:
                     return
                 if not line or "error" in said:
-                    raise UserError(f"the FR3 rig did not start at {self.host}: {said.get('error', 'see above')}.")
-        raise UserError(f"the FR3 rig did not start at {self.host} within {START_S:g} s: is the machine busy?")
+                    raise UserError(
+                        f"the FR3 rig did not start at {self.host}: {said.get('error', 'see above')}."
+                    )
+        raise UserError(
+            f"the FR3 rig did not start at {self.host} within {START_S:g} s: is the machine busy?"
+        )
 
 
 def check_ports(host: str) -> None:
@@ -135,6 +143,6 @@ def check_ports(host: str) -> None:
                 probe.bind((host, port))
             except OSError as error:
                 raise UserError(
-                    f"{host}:{port} ({purpose}) cannot be listened on ({os.strerror(error.errno or 0)}): stop what "
+                    f"{host}:{port} ({purpose}) cannot be used ({os.strerror(error.errno or 0)}): stop what "
                     "listens there, or give another loopback address, --host 127.0.0.2."
                 ) from error

@@ -6,12 +6,16 @@ Error numbers: `research_interface::robot::Error` of Franka's published protocol
 """
 
 import select
+import socket
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from franky_sim import FrankaRobotServer, franka_robot_protocol as protocol
+from franky_sim import FrankaRobotServer
+from franky_sim import franka_robot_protocol as protocol
 from franky_sim.base_simulator import BaseRobot
+from franky_sim.franka_gripper_protocol import GripperCommandStatus
+from franky_sim.franka_gripper_server import FrankaGripperServer
 from franky_sim.franka_robot_state import FrankaRobotState
 from franky_sim.franka_server import BaseCommand
 from jaxtyping import Float
@@ -46,6 +50,7 @@ class ReflexServer(FrankaRobotServer):
     """
 
     def __init__(self, robot: BaseRobot, hostnames: list[str]):
+        self._arm = robot
         super().__init__(robot, hostnames)
         commands = self._FrankaServer__command_class_map  # type: ignore[attr-defined]
         commands[protocol.RobotCommand.kSetCollisionBehavior] = _SetCollisionBehavior
@@ -53,8 +58,12 @@ class ReflexServer(FrankaRobotServer):
         self.thresholds = Thresholds()
         self.error: int | None = None
         """The number of the error that stopped the arm, None if it may move."""
-        self._arm: BaseRobot = robot
         self._torque_nm = np.zeros(7)
+
+    def _bind_children(self, hostname: str) -> None:
+        gripper = GripperServer(self._arm, hostname)
+        gripper.init()
+        self._FrankaRobotServer__gripper_server = gripper
 
     def start_motion(self, controller_mode, motion_generator_mode, motion_id: int) -> None:
         """See franky-sim; refused while an error stands."""
@@ -65,7 +74,11 @@ class ReflexServer(FrankaRobotServer):
     def watch(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Once per tick: stops the arm if what it touches or is told goes beyond the limits."""
         self._torque_nm += FILTER_SHARE * (contact_torque(model, data) - self._torque_nm)
-        if self.error is None and self.current_motion_id and (error := self._exceeded(model, data)) is not None:
+        if (
+            self.error is None
+            and self.current_motion_id
+            and (error := self._exceeded(model, data)) is not None
+        ):
             self._stop(error)
 
     def recover(self) -> None:
@@ -113,6 +126,23 @@ class ReflexServer(FrankaRobotServer):
         status = protocol.MoveStatus.kReflexAborted
         BaseCommand.send_response(self._tcp_socket, protocol.RobotCommand.kMove, motion, status)
         self.reset_current_motion_id()
+
+
+class GripperServer(FrankaGripperServer):
+    """franky-sim's gripper, which answers the command that a stop aborts: its caller would wait for ever."""
+
+    def stop(self, command_id: int, tcp_socket: socket.socket) -> None:
+        """See franky-sim."""
+        if self._pending_command_id is not None and self._pending_tcp_socket is not None:
+            BaseCommand.send_response(
+                self._pending_tcp_socket,
+                self._pending_command_type,
+                self._pending_command_id,
+                GripperCommandStatus.kAborted,
+                command_type_struct="H",
+                status_type_struct="H",
+            )
+        super().stop(command_id, tcp_socket)
 
 
 class _SetCollisionBehavior(protocol.SetCollisionBehaviorCommand):

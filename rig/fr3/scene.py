@@ -88,7 +88,7 @@ def _object(thing: SceneObject, xy_m: tuple[float, float], yaw_rad: float) -> ET
 
 def _slot_geoms(spec: ObjectSpec, layout: SlotLayout) -> str:
     """Geoms of a primitive; those that only show (cylinders, plates) do not collide."""
-    touching = 'condim="4" priority="1" friction="{} 0.005 0.0001" solref="0.004 1"'.format(spec.friction)
+    touching = f'condim="4" priority="1" friction="{spec.friction} 0.005 0.0001" solref="0.004 1"'
     geoms = ""
     columns = zip(layout.names, layout.kinds, *spec.slot_arrays(layout), spec.slot_rgb(layout), strict=True)
     for name, kind, size, pos, quat, rgb in columns:

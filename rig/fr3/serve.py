@@ -68,7 +68,7 @@ class Rig:
         return answer.get()
 
     def answer(self, asked: dict[str, Any]) -> dict[str, Any]:
-        """What the side channel can be asked: scene, state, place (x_m, y_m, yaw_rad), disconnect (seconds)."""
+        """The side channel's requests: scene, state, place (x_m, y_m, yaw_rad), disconnect (seconds)."""
         match asked["ask"]:
             case "scene":
                 return {"xml": self._xml, "object": self.thing.name}
