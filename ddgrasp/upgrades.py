@@ -87,6 +87,8 @@ _ADDED_AFTER_2 = {
     "scale": 1.0,
     "world.renderer": "jax",
     "deploy.clock": "machine",
+    "deploy.arm_lower_m": [-0.55, -0.80, 0.0],
+    "deploy.arm_upper_m": [0.95, 0.80, 1.30],
     "deploy.franka.model": "fr3",
     "deploy.franka.kernel": "realtime",
     "deploy.franka.start_dynamics": 0.05,

@@ -23,6 +23,8 @@ def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim"
         acceleration_rad_s2=tuple(config.acceleration_scale * a for a in arm.joint_acceleration_rad_s2),
         workspace_lower_m=config.workspace_lower_m,
         workspace_upper_m=config.workspace_upper_m,
+        arm_lower_m=config.arm_lower_m,
+        arm_upper_m=config.arm_upper_m,
         period_s=1.0 / info.control_hz,
     )
     return SafetyFilter(limits, info.action_scale_rad)

@@ -78,6 +78,10 @@ class DeployConfig(Section, name="deploy"):
     """Where the point between the finger pads may go, robot base frame; 12 mm = fingertips on the table."""
     workspace_upper_m: _Corner = (0.80, 0.45, 0.80)
     """The box's other corner."""
+    arm_lower_m: _Corner = (-0.55, -0.80, 0.0)
+    """Where elbow, forearm, wrist and hand may be: table and walls, robot base frame."""
+    arm_upper_m: _Corner = (0.95, 0.80, 1.30)
+    """That box's other corner."""
     realtime_trials: Count = 3
     """Trials on the machine's own clock, for time keeping (success comes from evaluation.rig_trials)."""
     workers: Annotated[int, Range(1, 1024)] = 2
@@ -91,8 +95,12 @@ class DeployConfig(Section, name="deploy"):
 
     def check(self) -> None:
         """See `Section.check`."""
-        if any(low >= high for low, high in zip(self.workspace_lower_m, self.workspace_upper_m, strict=True)):
-            raise UserError(
-                f"deploy.workspace is {self.workspace_lower_m} to {self.workspace_upper_m}; expected the "
-                "lower corner below the upper one in x, y and z."
-            )
+        for name, lower, upper in (
+            ("workspace", self.workspace_lower_m, self.workspace_upper_m),
+            ("arm", self.arm_lower_m, self.arm_upper_m),
+        ):
+            if any(low >= high for low, high in zip(lower, upper, strict=True)):
+                raise UserError(
+                    f"deploy.{name} is {lower} to {upper}; expected the lower corner below the upper one in "
+                    "x, y and z."
+                )
