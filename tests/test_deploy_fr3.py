@@ -196,11 +196,12 @@ def test_a_panda_s_protocol_is_refused():
     with socket.create_server(("127.0.0.12", 1337)) as server:
 
         def answer():
-            client, _ = server.accept()
-            with client:
-                command, number, _ = struct.unpack("<III", client.recv(64)[:12])
-                client.sendall(struct.pack("<III", command, number, 20) + struct.pack("<HH4x", 1, 5))
-                client.recv(1)
+            while True:
+                client, _ = server.accept()
+                with client:
+                    command, number, _ = struct.unpack("<III", client.recv(64)[:12])
+                    client.sendall(struct.pack("<III", command, number, 20) + struct.pack("<HH4x", 1, 5))
+                    client.recv(1)
 
         threading.Thread(target=answer, daemon=True).start()
         robot, _ = connect(config_for("127.0.0.12"))

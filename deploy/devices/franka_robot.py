@@ -21,6 +21,7 @@ from ddgrasp.errors import UserError
 from deploy import kinematics
 from deploy.devices import franka_faults
 from deploy.devices.franka_hand import FrankaHand
+from deploy.devices.franka_probe import check_answers
 from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotError, RobotState
 from mjx_envs.scene import HOME_RAD
@@ -62,6 +63,7 @@ class FrankaRobot:
         Raises UserError.
         """
         franky = self._franky = load_franky()
+        check_answers(self._config.host)
         self._errors = (franky.Exception, franky.GripperException)
         self._holding = self._moved = self._faulted = False
         config = self._config
