@@ -1,5 +1,7 @@
-"""Whether a control unit answers at all: franky's own connection waits for ever, and stops every thread, where
-another program holds the arm.
+"""Whether a control unit answers at all.
+
+Where another program holds the arm, franky's own connection waits for
+ever and stops every thread meanwhile.
 
 One `Connect` of Franka's published protocol (libfranka-common, research_interface/robot/service_types.h).
 """
@@ -21,9 +23,13 @@ def check_answers(host: str) -> None:
 
     The connection is given up at once: franky makes its own.
     """
-    request = struct.pack("<HH", _VERSION, 0)
     try:
-        with socket.create_connection((host, ROBOT_PORT), ANSWER_S) as connection:
+        with (
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as states,
+            socket.create_connection((host, ROBOT_PORT), ANSWER_S) as connection,
+        ):
+            states.bind(("", 0))  # where the unit sends its state
+            request = struct.pack("<HH", _VERSION, states.getsockname()[1])
             connection.sendall(_HEADER.pack(_CONNECT, 0, _HEADER.size + len(request)) + request)
             answered = bool(connection.recv(_HEADER.size))
     except TimeoutError as error:
