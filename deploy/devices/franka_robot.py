@@ -125,8 +125,8 @@ class FrankaRobot:
             self._arm = None
 
     def time_s(self) -> float | None:
-        """See TimedRobot: the arm's own clock."""
-        if self._arm is None:
+        """See TimedRobot: the arm's own clock; None once the arm has failed."""
+        if self._arm is None or self._faulted:
             return None
         with self._reporting():
             return float(self._arm.state.time.to_sec())

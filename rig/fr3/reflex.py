@@ -86,6 +86,10 @@ class ReflexServer(FrankaRobotServer):
         self.error = None
         self._torque_nm[:] = 0.0
 
+    def hold(self) -> None:
+        """One tick at the joints where it was last told to stand."""
+        self._post_process_commands()
+
     @property
     def robot_state(self) -> FrankaRobotState:
         """See franky-sim; with the contact torque and the error that stands."""
@@ -123,8 +127,9 @@ class ReflexServer(FrankaRobotServer):
         self._FrankaRobotServer__holding_q = tuple(self._arm.inner_state.q)  # type: ignore[attr-defined]
         self.error = error
         self.send_state()  # the client looks for the reason in the state that comes before the answer
-        status = protocol.MoveStatus.kReflexAborted
-        BaseCommand.send_response(self._tcp_socket, protocol.RobotCommand.kMove, motion, status)
+        status, client = protocol.MoveStatus.kReflexAborted, self._tcp_socket
+        assert client is not None  # there is a motion, so somebody asked for it
+        BaseCommand.send_response(client, protocol.RobotCommand.kMove, motion, status)
         self.reset_current_motion_id()
 
 
@@ -133,7 +138,8 @@ class GripperServer(FrankaGripperServer):
 
     def stop(self, command_id: int, tcp_socket: socket.socket) -> None:
         """See franky-sim."""
-        if self._pending_command_id is not None and self._pending_tcp_socket is not None:
+        if self._pending_command_id is not None:
+            assert self._pending_tcp_socket is not None and self._pending_command_type is not None
             BaseCommand.send_response(
                 self._pending_tcp_socket,
                 self._pending_command_type,

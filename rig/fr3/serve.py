@@ -87,15 +87,17 @@ class Rig:
             asked, answer = self._requests.get()
             answer.put(self.answer(asked))
         if time.monotonic() < self._away_until_s:
-            time.sleep(0.01)
+            self._server.hold_once()
             return
         self._server.reconnect()
         self._server.run_once(1.0 / self._options.speed)
+        assert self._sim.model is not None and self._sim.data is not None
         self._server.robot_server.watch(self._sim.model, self._sim.data)
         self._server.robot_server.wait_for_command(COMMAND_WAIT_S)
 
     def _state(self) -> dict[str, Any]:
         data, server = self._sim.data, self._server.robot_server
+        assert data is not None
         body = data.body(scene.OBJECT_BODY)
         return {
             "time_s": data.time,
@@ -111,6 +113,7 @@ class Rig:
 
     def _place(self, x_m: float, y_m: float, yaw_rad: float) -> dict[str, Any]:
         """The object put down by a person: upright, at rest."""
+        assert self._sim.data is not None
         joint = self._sim.data.joint(scene.OBJECT_JOINT)
         quat = (np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2))
         joint.qpos[:] = (x_m, y_m, self.thing.rest_height_m, *quat)
@@ -140,6 +143,12 @@ class _Server(SimulationServer):
             server.reset_state()
         self.robot_server.cleanup()
         self._connected = False
+
+    def hold_once(self) -> None:
+        """One tick of an arm that nobody can reach."""
+        self.robot_server.hold()
+        self.sim.step()
+        time.sleep(TICK_S)
 
     def reconnect(self) -> None:
         """Listen again, if `disconnect` came before."""
