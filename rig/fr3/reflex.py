@@ -65,7 +65,12 @@ class ReflexServer(FrankaRobotServer):
         gripper.init()
         self._FrankaRobotServer__gripper_server = gripper
 
-    def start_motion(self, controller_mode, motion_generator_mode, motion_id: int) -> None:
+    def start_motion(
+        self,
+        controller_mode: protocol.MoveCommandControllerMode,
+        motion_generator_mode: protocol.MoveCommandMotionGeneratorMode,
+        motion_id: int,
+    ) -> None:
         """See franky-sim; refused while an error stands."""
         if self.error is not None:
             raise RuntimeError(f"error {self.error} stands: automatic error recovery first")

@@ -33,7 +33,7 @@ class SceneObject:
     """Children of its <body>: geoms, and an <inertial> if density is not to give it. The body's origin is
     what the rig reports as the object's position."""
     rest_height_m: float
-    """Of that origin above the table, as it lies."""
+    """Height of that origin above the table, as it lies."""
     assets_xml: str = ""
     """Children of <asset>; mesh files by absolute path."""
 
