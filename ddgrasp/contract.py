@@ -23,7 +23,7 @@ class Arm:
     """A Franka arm with its hand. Both have the same kinematics, and differ in what their joints may do."""
 
     name: str
-    """As the arm's own model description calls it."""
+    """As `deploy.franka.model` names it."""
     joint_lower_rad: tuple[float, ...]
     joint_upper_rad: tuple[float, ...]
     joint_velocity_rad_s: tuple[float, ...]

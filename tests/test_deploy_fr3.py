@@ -186,26 +186,27 @@ def test_another_arm_than_the_configured_one_is_refused(rig):
     config = config_for(HOST)
     panda = replace(config, franka=replace(config.franka, model="panda"))
     robot, _ = connect(panda)
-    with pytest.raises(UserError, match="is a 'fr3', deploy.franka.model is 'panda': set deploy"):
+    with pytest.raises(UserError, match="is a 'fr3' .*version 10.*model is 'panda': set deploy.franka"):
         robot.start()
     robot.stop()
 
 
 def test_a_panda_s_protocol_is_refused():
-    """A control unit that answers a connection as a Panda's does: version 5, incompatible."""
+    """A control unit that answers a connection as a Panda's does: version 5, incompatible with ours."""
     with socket.create_server(("127.0.0.12", 1337)) as server:
 
         def answer():
-            while True:
-                client, _ = server.accept()
-                with client:
-                    command, number, _ = struct.unpack("<III", client.recv(64)[:12])
-                    client.sendall(struct.pack("<III", command, number, 20) + struct.pack("<HH4x", 1, 5))
-                    client.recv(1)
+            client, _ = server.accept()
+            with client:
+                command, number, _ = struct.unpack("<III", client.recv(64)[:12])
+                client.sendall(struct.pack("<III", command, number, 20) + struct.pack("<HH4x", 1, 5))
+                client.recv(1)
 
         threading.Thread(target=answer, daemon=True).start()
         robot, _ = connect(config_for("127.0.0.12"))
-        with pytest.raises(UserError, match="another version of the protocol .*deploy.franka.model is 'fr3'"):
+        with pytest.raises(
+            UserError, match="is a 'panda' .robot server version 5., deploy.franka.model is 'fr3'"
+        ):
             robot.start()
 
 

@@ -38,9 +38,8 @@ def no_connection(franky: Any, host: str, model: str, error: BaseException) -> s
     said = one_line(error)
     if isinstance(error, franky.IncompatibleVersionException):
         return (
-            f"the arm at {host!r} speaks another version of the protocol ({said}), as a Panda or other "
-            f"firmware does, than the installed franky; deploy.franka.model is {model!r}: install franky's "
-            "wheel for that arm's robot server, and name the arm."
+            f"the {model!r} at {host!r} speaks another version of the protocol ({said}) than the installed "
+            "franky: install franky's wheel for its robot server."
         )
     if isinstance(error, franky.RealtimeException):
         return f"{said}: install a realtime kernel, or set deploy.franka.kernel any and expect lost packets."

@@ -8,7 +8,6 @@ stop in your hand.
 import contextlib
 import importlib
 import time
-import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +20,7 @@ from ddgrasp.errors import UserError
 from deploy import kinematics
 from deploy.devices import franka_faults
 from deploy.devices.franka_hand import FrankaHand
-from deploy.devices.franka_probe import check_answers
+from deploy.devices.franka_probe import check_arm
 from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotError, RobotState
 from mjx_envs.scene import HOME_RAD
@@ -63,7 +62,7 @@ class FrankaRobot:
         Raises UserError.
         """
         franky = self._franky = load_franky()
-        check_answers(self._config.host)
+        check_arm(self._config.host, self._config.model)
         self._errors = (franky.Exception, franky.GripperException)
         self._holding = self._moved = self._faulted = False
         config = self._config
@@ -73,7 +72,6 @@ class FrankaRobot:
             self._arm = franky.Robot(
                 config.host, relative_dynamics_factor=config.dynamics, realtime_config=kernel
             )
-            self._check_model()
             self._prepare()
             gripper = franky.Gripper(config.host)
             if self._confirm is not None:
@@ -130,17 +128,6 @@ class FrankaRobot:
             return None
         with self._reporting():
             return float(self._arm.state.time.to_sec())
-
-    def _check_model(self) -> None:
-        """UserError if another arm answers than the configured one."""
-        found = ET.fromstring(self._arm.model_urdf).get("name", "")
-        if found != self._limits.name:
-            known = found in contract.ARMS
-            remedy = f"set deploy.franka.model {found}" if known else f"known are {', '.join(contract.ARMS)}"
-            raise UserError(
-                f"the arm at {self._config.host!r} is a {found!r}, deploy.franka.model is "
-                f"{self._limits.name!r}: {remedy}; joint limits differ."
-            )
 
     def _prepare(self) -> None:
         """Errors cleared, contact thresholds, load, and no limit above the arm's own. UserError."""
