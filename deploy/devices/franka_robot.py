@@ -190,16 +190,21 @@ class FrankaRobot:
         """What happened and how the arm stands now, in one line; it is not told to move again."""
         self._faulted = True
         if isinstance(error, self._franky.NetworkException):
-            said = franka_faults.one_line(error)
-            return f"the connection to {self._config.host} is lost ({said}): the arm stands by itself"
+            return self._lost(error)
         if isinstance(error, self._franky.GripperException):
             return f"the gripper failed: {franka_faults.one_line(error)}"
         try:
             recovered = bool(self._arm.recover_from_errors())
+        except self._franky.NetworkException:
+            return self._lost(error)
         except self._errors as trouble:
             return f"{franka_faults.describe(error)}; no recovery: {franka_faults.one_line(trouble)}"
         after = "recovered, the arm stands" if recovered else "not recovered: look at it and clear it in Desk"
         return f"the arm stopped itself: {franka_faults.describe(error)}; {after}"
+
+    def _lost(self, error: Exception) -> str:
+        said = franka_faults.one_line(error)
+        return f"the connection to {self._config.host} is lost ({said}): the arm stands by itself"
 
 
 def load_franky() -> Any:
