@@ -54,6 +54,7 @@ class FrankaRobot:
         self._arm: Any = None
         self._hand: FrankaHand | None = None
         self._errors: tuple[type[Exception], ...] = ()
+        self._lost_by: tuple[type[Exception], ...] = ()
         self._holding = self._moved = self._faulted = False
 
     def start(self) -> None:
@@ -63,7 +64,9 @@ class FrankaRobot:
         """
         franky = self._franky = load_franky()
         check_arm(self._config.host, self._config.model)
-        self._errors = (franky.Exception, franky.GripperException)
+        # A socket that breaks comes through libfranka as a bare RuntimeError ("Net Exception").
+        self._errors = (franky.Exception, franky.GripperException, RuntimeError)
+        self._lost_by = (franky.NetworkException, RuntimeError)
         self._holding = self._moved = self._faulted = False
         config = self._config
         realtime = franky.RealtimeConfig
@@ -189,13 +192,13 @@ class FrankaRobot:
     def _fault(self, error: Exception) -> str:
         """What happened and how the arm stands now, in one line; it is not told to move again."""
         self._faulted = True
-        if isinstance(error, self._franky.NetworkException):
+        if isinstance(error, self._lost_by):
             return self._lost(error)
         if isinstance(error, self._franky.GripperException):
             return f"the gripper failed: {franka_faults.one_line(error)}"
         try:
             recovered = bool(self._arm.recover_from_errors())
-        except self._franky.NetworkException:
+        except self._lost_by:
             return self._lost(error)
         except self._errors as trouble:
             return f"{franka_faults.describe(error)}; no recovery: {franka_faults.one_line(trouble)}"
