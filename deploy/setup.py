@@ -6,6 +6,10 @@ from ddgrasp.policy_metadata import PolicyMetadata
 from deploy.loop import LoopSettings
 from deploy.safety import SafetyFilter, SafetyLimits
 
+JOINT_MARGIN_RAD = 0.02
+"""A real arm's targets stay this far inside its range: the planner that smooths them overshoots a little, and
+the control unit stops an arm that asks for more than its range."""
+
 
 def loop_settings(config: DeployConfig, info: PolicyMetadata) -> LoopSettings:
     """The policy's own rate, the configured patience."""
@@ -16,9 +20,14 @@ def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim"
     """Limits narrow enough for both `robot` (as `--robot` names it) and the policy."""
     arm = contract.ARMS[config.franka.model] if robot == "franka" else contract.PANDA
     speed = config.franka.speed_rad_s if robot == "franka" else arm.joint_velocity_rad_s
+    margin = JOINT_MARGIN_RAD if robot == "franka" else 0.0
     limits = SafetyLimits(
-        lower_rad=tuple(map(max, arm.joint_lower_rad, info.joint_lower_rad)),
-        upper_rad=tuple(map(min, arm.joint_upper_rad, info.joint_upper_rad)),
+        lower_rad=tuple(
+            max(a + margin, p) for a, p in zip(arm.joint_lower_rad, info.joint_lower_rad, strict=True)
+        ),
+        upper_rad=tuple(
+            min(a - margin, p) for a, p in zip(arm.joint_upper_rad, info.joint_upper_rad, strict=True)
+        ),
         velocity_rad_s=speed,
         acceleration_rad_s2=tuple(config.acceleration_scale * a for a in arm.joint_acceleration_rad_s2),
         workspace_lower_m=config.workspace_lower_m,

@@ -243,13 +243,13 @@ def test_dry_run_says_and_draws_what_it_would_send_and_moves_nothing(tmp_path, r
 
 def test_limits_are_the_fr3_s_and_the_filter_keeps_them_before_the_arm_would(tmp_path):
     near = HOME_RAD.copy()
-    near[3] = contract.FR3.joint_lower_rad[3] + 0.02
+    near[3] = contract.FR3.joint_lower_rad[3] + 0.05
     with Fr3Rig("127.0.0.14", primitive("cube"), q_rad=near) as rig:
         config = config_for(rig.host)
         report = run_trial(tmp_path, config, joint_bias(j4=-1.0), steps=5)
-        assert report.fault == "" and report.safety.by_cause["joint_position"] >= 4
+        assert report.fault == "" and report.safety.by_cause["joint_position"] >= 3
         assert contract.PANDA.joint_lower_rad[3] < contract.FR3.joint_lower_rad[3]
-        assert rig.channel.ask("state")["q_rad"][3] > contract.FR3.joint_lower_rad[3] - 5e-3
+        assert rig.channel.ask("state")["q_rad"][3] > contract.FR3.joint_lower_rad[3]
         robot, clock = connect(config)  # without the filter the arm itself refuses
         robot.start()
         beyond = robot.read_state().q_rad

@@ -27,6 +27,9 @@ from mjx_envs.scene import HOME_RAD
 
 AT_START_RAD = 0.01
 """No joint further than this from the start pose: the arm is there."""
+START_S = 120.0
+RECOVERY_S = 0.5
+"""Until the arm's state says that an error is gone."""
 _POLL_S = 0.01
 
 
@@ -140,7 +143,7 @@ class FrankaRobot:
                 f"the arm at {config.host!r} is stopped by a person: release the stop, try again."
             )
         stood = franka_faults.names(RuntimeError(repr(arm.state.current_errors)))
-        if not arm.recover_from_errors():
+        if not self._recover():
             raise UserError(
                 f"the arm at {config.host!r} does not recover from {', '.join(stood) or 'its error'}: "
                 "look at it, clear the error in Desk, try again."
@@ -171,8 +174,21 @@ class FrankaRobot:
             self._say("moving to the start pose")
             slower = min(1.0, self._config.start_dynamics / self._config.dynamics)
             self._arm.move(self._to(np.array(HOME_RAD), relative_dynamics_factor=slower), asynchronous=True)
-            while self._arm.poll_motion():
-                time.sleep(_POLL_S)
+            self._wait_at_start()
+
+    def _wait_at_start(self) -> None:
+        """Until the joints are there. Raises UserError if they are not in `START_S` of the arm's time."""
+        begun_s = self._arm.state.time.to_sec()
+        while True:
+            self._arm.poll_motion()
+            state = self._arm.state
+            if np.max(np.abs(np.asarray(state.q) - HOME_RAD)) <= AT_START_RAD:
+                return
+            if state.time.to_sec() - begun_s > START_S:
+                raise UserError(
+                    f"the arm has not reached its start pose in {START_S:g} s: look what holds it."
+                )
+            time.sleep(_POLL_S)
 
     def _to(self, q_target_rad: Float[np.ndarray, "7"], **options: Any) -> Any:
         return self._franky.JointMotion([float(q) for q in q_target_rad], **options)
@@ -197,13 +213,19 @@ class FrankaRobot:
         if isinstance(error, self._franky.GripperException):
             return f"the gripper failed: {franka_faults.one_line(error)}"
         try:
-            recovered = bool(self._arm.recover_from_errors())
+            recovered = self._recover()
         except self._lost_by:
             return self._lost(error)
         except self._errors as trouble:
             return f"{franka_faults.describe(error)}; no recovery: {franka_faults.one_line(trouble)}"
         after = "recovered, the arm stands" if recovered else "not recovered: look at it and clear it in Desk"
         return f"the arm stopped itself: {franka_faults.describe(error)}; {after}"
+
+    def _recover(self) -> bool:
+        """Whether the arm is free of errors after automatic error recovery."""
+        if not self._arm.recover_from_errors():
+            time.sleep(RECOVERY_S)  # the state it looked at may be older than the recovery
+        return not self._arm.has_errors
 
     def _lost(self, error: Exception) -> str:
         said = franka_faults.one_line(error)

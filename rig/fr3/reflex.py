@@ -23,7 +23,7 @@ from jaxtyping import Float
 from ddgrasp import contract
 
 JOINT_REFLEX, CARTESIAN_REFLEX = 6, 7
-GENERATOR_POSITION_LIMITS = 14
+GENERATOR_POSITION_LIMITS = 12
 """joint_motion_generator_position_limits_violation."""
 _ERRORS = 41
 FILTER_SHARE = 0.05
