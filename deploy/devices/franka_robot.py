@@ -185,9 +185,7 @@ class FrankaRobot:
             if np.max(np.abs(np.asarray(state.q) - HOME_RAD)) <= AT_START_RAD:
                 return
             if state.time.to_sec() - begun_s > START_S:
-                raise UserError(
-                    f"the arm has not reached its start pose in {START_S:g} s: look what holds it."
-                )
+                raise UserError(f"the arm is not at its start pose after {START_S:g} s: see what holds it.")
             time.sleep(_POLL_S)
 
     def _to(self, q_target_rad: Float[np.ndarray, "7"], **options: Any) -> Any:
