@@ -24,6 +24,7 @@ from benchmarks.programs import PROGRAMS, lower
 from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.presets import get_preset
+from mjx_envs import inverse_kinematics
 from mjx_envs.render import raycast
 
 TENSOR_FLOPS = 494.7e12
@@ -69,6 +70,9 @@ def rows(config: Config) -> Iterator[Row]:
     length = config.world.episode_steps
     substeps = round(contract.CONTROL_DT_S / config.world.sim_dt_s)
     yield Row("teacher", "control step", teacher.total_steps / teacher.num_envs, substeps, tensor=False)
+    iterations = teacher.total_steps / (teacher.num_envs * teacher.unroll_steps)
+    yield Row("teacher", "PPO: new episodes", iterations, inverse_kinematics.ITERATIONS, tensor=False)
+    yield Row("teacher", "PPO: gradient steps", iterations, teacher.epochs * teacher.minibatches)
 
     steps = math.ceil(demos.episodes / demos.parallel) * length
     chunks = raycast.chunk_count(config.world.profile.height_px * config.world.profile.width_px)

@@ -1,6 +1,5 @@
 """Steps per second of the grasping environment and of the PPO rollout, against Playground and bare MuJoCo."""
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -17,7 +16,7 @@ from mujoco.batch import Batch
 
 from benchmarks import playground_pick
 from benchmarks.compare import Contender, Row, compare, measure
-from ddgrasp import contract
+from ddgrasp import contract, cores
 from ddgrasp.config import Config
 from ddgrasp.layout import QPOS
 from mjx_envs import grasp_math
@@ -169,7 +168,7 @@ def bare_contenders(
       ctrl: (B, 9).
       substeps: physics steps in a call.
     """
-    count, threads = len(ctrl), len(os.sched_getaffinity(0))
+    count, threads = len(ctrl), cores.available()
     batch = Batch(model, nsim=count, nthread=threads)
     for name, value in ModelIndex(model).fields(model, params).items():
         batch.expand(name)[:] = value

@@ -34,7 +34,7 @@ from ddgrasp.config import (
 from demos.rollout import Roller
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
-from ppo import evaluate, learner, policy, rollout, train
+from ppo import evaluate, policy, rollout, train
 from student_jax import act, depth_source
 from student_jax import policy as student_policy
 from student_jax import train as student_train
@@ -65,17 +65,9 @@ def _training_env(config: Config) -> AutoReset:
     return AutoReset(GraspEnv(train.training_world(_on_jax(config))), devices.make_mesh())
 
 
-def ppo_iteration(config: Config) -> Program:
-    """`ppo.train.compile_iteration`'s, uncompiled."""
-    env = _training_env(config)
-    places, everywhere = learner.shardings(env.mesh), devices.replicated(env.mesh)
-    jitted = jax.jit(
-        partial(learner.iteration, config.teacher, env),
-        in_shardings=(places,),
-        out_shardings=(places, everywhere, everywhere),
-        donate_argnums=0,
-    )
-    return jitted, (jax.eval_shape(train.initial(config, env)),)
+def ppo(piece: str, config: Config) -> Program:
+    """A part of an iteration of PPO, by its name in `ppo.train.programs`."""
+    return train.programs(config, _training_env(config))[piece]
 
 
 def control_step(config: Config) -> Program:
@@ -89,9 +81,9 @@ def evaluation_rollout(config: Config) -> Program:
     """Whole episodes of the deterministic teacher."""
     env = GraspEnv(_on_jax(config).world)
     layers, mean = _teacher_shapes(config)
-    keys = shape(config.evaluation.teacher_trials, 2, dtype=jnp.uint32)
-    arguments = (env, devices.make_mesh(), evaluate.motion_of, layers, mean, mean, keys)
-    return rollout._roll_out, arguments
+    mesh, keys = devices.make_mesh(), shape(config.evaluation.teacher_trials, 2, dtype=jnp.uint32)
+    start = jax.eval_shape(partial(rollout.begin, env, mesh), keys)
+    return rollout._roll_out, (env, mesh, evaluate.motion_of, layers, mean, mean, start)
 
 
 def _teacher_shapes(config: Config) -> tuple[list[tuple[Any, Any]], Any]:
@@ -256,7 +248,9 @@ def pose_acting(config: Config) -> Program:
 
 
 PROGRAMS: dict[str, Callable[[Config], Program]] = {
-    "PPO iteration": ppo_iteration,
+    "PPO: new episodes": partial(ppo, "refresh"),
+    "PPO: experience": partial(ppo, "collect"),
+    "PPO: gradient steps": partial(ppo, "improve"),
     "control step": control_step,
     "evaluation rollout": evaluation_rollout,
     "demo rollout: begin": partial(_roller, "begin"),

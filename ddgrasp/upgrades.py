@@ -95,13 +95,16 @@ _ADDED_AFTER_2 = {
     "deploy.franka.contact_torque_nm": 20.0,
     "deploy.franka.contact_force_n": 30.0,
     "deploy.franka.load_kg": 0.0,
+    "world.random.pregrasp_turn_rad": 0.0,
     "world.random.held_share": 0.0,
     "world.reward.distance": "funnel",
     "world.reward.grasp_switch": "touch",
     "teacher.target_kl": 0.0,
     "teacher.gripper_std": 0.15,
     "teacher.min_std": 0.01,
+    "teacher.pregrasp_turn_rad": 0.0,
     "teacher.held_share": 0.0,
+    "teacher.settle_from": 1.0,
 }
 """Fields that version 2 lacked, with what it did."""
 

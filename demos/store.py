@@ -50,7 +50,9 @@ class EpisodeStore:
         """(E,) index behind each episode's last step."""
         if "episode_ends" not in self._meta:
             return np.zeros(0, np.int64)
-        return np.asarray(_array(self._meta, "episode_ends")[:])
+        ends = np.asarray(_array(self._meta, "episode_ends")[:])
+        # The array grows before its row is written: who is killed in between leaves a zero.
+        return ends[: np.count_nonzero(np.logical_and.accumulate(ends > 0))]
 
     def __len__(self) -> int:
         return len(self.ends)

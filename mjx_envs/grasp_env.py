@@ -77,8 +77,11 @@ class GraspEnv(mjx_env.MjxEnv):
         self.physics = make_physics(config.backend, config.sim_dt_s, self.table.layout)
         self._mj_model = scene.build_model(config.sim_dt_s, self.table.layout)
 
-    def reset(self, rng: randomize.Key) -> mjx_env.State:
-        """A new episode: object, pose, dynamics and joints drawn from `rng`."""
+    def reset(self, rng: randomize.Key, exploring: randomize.Share = 1.0) -> mjx_env.State:
+        """A new episode: object, pose, dynamics and joints drawn from `rng`.
+
+        `exploring` () is a factor on the shares of episodes that start above the object or with it in hand.
+        """
         _, k_variant, k_params, k_qpos, k_start, k_next = jax.random.split(rng, 6)
         index = self.object_drawn(rng)
         variant = randomize.sample_variant(k_variant, self.config.random, self.table, index)
@@ -88,12 +91,14 @@ class GraspEnv(mjx_env.MjxEnv):
         branch = grasp_math.yaw_branch(qpos[QPOS.object_quat], self._symmetry(variant), jnp)
         if self.config.random.pregrasp_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
-            qpos = randomize.maybe_pregrasp(k_start, self.config.random, qpos, *grasp)
+            share = exploring * self.config.random.pregrasp_share
+            turn_rad = self.config.random.pregrasp_turn_rad
+            qpos = randomize.maybe_pregrasp(k_start, share, turn_rad, qpos, *grasp)
         if self.config.random.held_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
             half_width = jnp.asarray(self.table.half_width, jnp.float32)[variant] * size
-            k_held = jax.random.fold_in(k_start, 1)
-            qpos = randomize.maybe_held(k_held, self.config.random, qpos, *grasp, half_width)
+            k_held, share = jax.random.fold_in(k_start, 1), exploring * self.config.random.held_share
+            qpos = randomize.maybe_held(k_held, share, qpos, *grasp, half_width)
         state = physics.initial_state(qpos)
         episode = Episode(
             params=params,
@@ -252,9 +257,10 @@ class AutoReset:
         info = state.info | {"episode": replace(episode, steps=stagger.astype(jnp.int32))}
         return self.refresh(replace(state, info=info))
 
-    def refresh(self, state: mjx_env.State) -> mjx_env.State:
-        """Draw the batch's next episodes."""
-        fresh = devices.each(self.mesh, self.env.reset)(state.info["rng"])
+    def refresh(self, state: mjx_env.State, exploring: randomize.Share = 1.0) -> mjx_env.State:
+        """Draw the batch's next episodes, `exploring` as in `GraspEnv.reset`."""
+        keys = state.info["rng"]
+        fresh = devices.each(self.mesh, self.env.reset)(keys, jnp.full(len(keys), exploring, jnp.float32))
         waiting = (fresh.data, fresh.obs, fresh.info["episode"])
         return replace(state, info=state.info | {"next": waiting, "rng": fresh.info["rng"]})
 

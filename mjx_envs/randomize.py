@@ -10,7 +10,7 @@ from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.config import RandomConfig
 from ddgrasp.layout import QPOS
-from mjx_envs import draws, inverse_kinematics, scene
+from mjx_envs import draws, inverse_kinematics, kinematics, scene
 from mjx_envs.object_spec import ObjectModel, slot_layout
 from mjx_envs.objects import get_object
 from mjx_envs.physics.interface import ModelParams
@@ -19,6 +19,8 @@ PREGRASP_HEIGHT_M = 0.15
 
 Key = PRNGKeyArray | UInt32[Array, "2"]
 Index = Int[AnyArray, ""] | int
+Share = Float[AnyArray, ""] | float
+Angle = Float[AnyArray, ""] | float
 
 
 class ObjectTable:
@@ -93,24 +95,27 @@ def sample_qpos(key: Key, config: RandomConfig, rest_height_m: Float[Array, ""])
 
 
 def maybe_pregrasp(
-    key: Key, config: RandomConfig, qpos: Float[Array, "16"], grasp_pos: Float[Array, "3"],
+    key: Key, share: Share, turn_rad: Angle, qpos: Float[Array, "16"], grasp_pos: Float[Array, "3"],
     grasp_quat: Float[Array, "4"],
 ) -> Float[Array, "16"]:  # fmt: skip
-    """qpos (16,) with the hand, in a share of the episodes, up to PREGRASP_HEIGHT_M above the grasp pose."""
+    """qpos (16,) with the hand, in `share` of the episodes, up to PREGRASP_HEIGHT_M above the grasp pose and
+    turned from it by up to `turn_rad` about the vertical."""
     k_choice, k_offset = jax.random.split(key)
     offset = _unit(k_offset, (3,))
     height = PREGRASP_HEIGHT_M * (0.5 + 0.5 * offset[2])
     target = grasp_pos + jnp.stack([0.005 * offset[0], 0.005 * offset[1], height])
-    joints = inverse_kinematics.solve(qpos[QPOS.arm], target, grasp_quat)
-    chosen = jax.random.uniform(k_choice) < config.pregrasp_share
+    turn = kinematics.quat_about_z(turn_rad * _unit(jax.random.fold_in(key, 1)), jnp)
+    quat = kinematics.quat_mul(turn, grasp_quat, jnp)
+    joints = inverse_kinematics.solve(qpos[QPOS.arm], target, quat)
+    chosen = jax.random.uniform(k_choice) < share
     return qpos.at[QPOS.arm].set(jnp.where(chosen, joints, qpos[QPOS.arm]))
 
 
 def maybe_held(
-    key: Key, config: RandomConfig, qpos: Float[Array, "16"], grasp_pos: Float[Array, "3"],
+    key: Key, share: Share, qpos: Float[Array, "16"], grasp_pos: Float[Array, "3"],
     grasp_quat: Float[Array, "4"], half_width_m: Float[Array, ""],
 ) -> Float[Array, "16"]:  # fmt: skip
-    """qpos (16,) with, in a share of the episodes, the object between the fingers, raised by up to the way to
+    """qpos (16,) with, in `share` of the episodes, the object between the fingers, raised by up to the way to
     the lift target.
 
     `half_width_m` () is the object's, along the fingers: they start 1 mm from it, and close if so commanded.
@@ -121,7 +126,7 @@ def maybe_held(
     joints = inverse_kinematics.solve(qpos[QPOS.arm], grasp_pos + up, grasp_quat)
     opening = jnp.minimum(half_width_m + 0.001, contract.GRIPPER_MAX_WIDTH_M / 2)
     held = qpos.at[QPOS.arm].set(joints).at[QPOS.fingers].set(opening).at[QPOS.object_pos].add(up)
-    return jnp.where(jax.random.uniform(k_choice) < config.held_share, held, qpos)
+    return jnp.where(jax.random.uniform(k_choice) < share, held, qpos)
 
 
 def sample_camera(key: Key, config: RandomConfig, T_world_cam: Float[AnyArray, "4 4"]) -> Float[Array, "4 4"]:

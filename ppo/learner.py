@@ -1,6 +1,8 @@
 """PPO as pure functions over one state: Brax's networks, losses and normaliser under our own loop.
 
-`iteration` collects one batch of experience and takes the gradient steps on it. The whole learner,
+An iteration draws episodes, collects one batch of experience and takes the gradient steps on it: `refresh`,
+`collect`, `improve`, three programs, since XLA keeps no program that calls the host (the C engine) on disk,
+and compiling the two others took most of the time. The whole learner,
 environments included, is one pytree, so that a checkpoint of it resumes exactly. It lies on a mesh of
 devices: environments and batches are shared out, parameters are everywhere, and the numbers drawn are the
 same on any number of devices.
@@ -16,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from brax.training import acting, distribution
+from brax.training import acting, distribution, types
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
@@ -36,6 +38,9 @@ from ppo import diagnostics, health
 
 OBSERVATION_STD_MIN = 0.01
 """Bounds the normalised size of components that hardly ever move, such as an upright object's tilt."""
+
+SETTLED = 0.1
+"""Factor on the KL divergence and the least step size at the end (`TeacherConfig.settle_from`)."""
 
 STEERED_RATE_MIN = 1e-4
 """Least step size that `target_kl` steers to: at 3e-5, which Brax's own 1e-5 allows, PPO from nothing stayed
@@ -186,22 +191,40 @@ def with_evaluation(state: LearnerState, good: bool) -> LearnerState:
     return replace(state, good_evaluations=count)
 
 
-def iteration(
+# One iteration: three pure functions; jit them with config and env (or its mesh) static.
+
+
+def refresh(config: TeacherConfig, env: AutoReset, state: LearnerState) -> LearnerState:
+    """`state` with the episodes that its environments start next."""
+    exploring = jnp.where(settling(config, state.iteration) > 0, 0.0, 1.0)
+    return replace(state, env_state=env.refresh(state.env_state, exploring))
+
+
+def collect(
     config: TeacherConfig, env: AutoReset, state: LearnerState
+) -> tuple[LearnerState, types.Transition, dict[str, jax.Array]]:
+    """`unroll_steps` of exploring: the state after them, transitions (B, T, ...), scalars for the curves."""
+    policy = ppo_networks.make_inference_fn(make_networks(config))((state.normalizer, state.params.policy))
+    k_unroll, _ = _keys(state)
+    env_state, data, outcome = _unroll(env, state.env_state, policy, k_unroll, config.unroll_steps)
+    data = jax.lax.with_sharding_constraint(data, devices.over_envs(env.mesh))
+    return replace(state, env_state=env_state), data, outcome
+
+
+def improve(
+    config: TeacherConfig,
+    mesh: Mesh,
+    state: LearnerState,
+    data: types.Transition,
+    outcome: dict[str, jax.Array],
 ) -> tuple[LearnerState, dict[str, jax.Array], dict[str, jax.Array]]:
-    """One batch of experience and the gradient steps on it. Pure; jit with config and env static.
+    """The gradient steps on what `collect` returned, which ends the iteration.
 
     Returns the new state, scalars for the curves, and scalars for the NaN guard (`ppo.health.watch`).
     """
-    networks = make_networks(config)
-    key = jax.random.fold_in(state.key, state.iteration)
-    k_unroll, k_sgd = jax.random.split(key)
-    env_state = env.refresh(state.env_state)
-    policy = ppo_networks.make_inference_fn(networks)((state.normalizer, state.params.policy))
-    env_state, data, outcome = _unroll(env, env_state, policy, k_unroll, config.unroll_steps)
-    data = jax.lax.with_sharding_constraint(data, devices.over_envs(env.mesh))
-    normalizer = state.normalizer
-    (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state, env.mesh)
+    networks, normalizer = make_networks(config), state.normalizer
+    _, k_sgd = _keys(state)
+    (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state, mesh)
     losses |= diagnostics.of_update(config, networks, normalizer, data, state.params.value, params.policy)
     if config.target_kl:
         losses["policy/learning_rate"] = optax.tree_utils.tree_get(opt_state, "learning_rate")
@@ -211,11 +234,15 @@ def iteration(
             normalizer, data.observation, std_min_value=OBSERVATION_STD_MIN
         )
     new = replace(
-        state, params=params, normalizer=normalizer, opt_state=opt_state, env_state=env_state,
-        iteration=state.iteration + 1,
-    )  # fmt: skip
+        state, params=params, normalizer=normalizer, opt_state=opt_state, iteration=state.iteration + 1
+    )
     metrics = losses | outcome
     return new, metrics, health.watch(data.next_observation, data.action, metrics, new)
+
+
+def _keys(state: LearnerState) -> jax.Array:
+    """Keys of an iteration's exploration and of its gradient steps."""
+    return jax.random.split(jax.random.fold_in(state.key, state.iteration))
 
 
 def _unroll(env, env_state, policy, key, length):
@@ -236,11 +263,23 @@ def _unroll(env, env_state, policy, key, length):
     return env_state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data), outcome
 
 
-def steered(opt_state: Any, kl: jax.Array, target_kl: float) -> Any:
+def settling(config: TeacherConfig, iteration: jax.Array) -> jax.Array:
+    """() how much of the time that `settle_from` leaves for settling is over: 0 before, 1 at the end."""
+    total = iterations(config)
+    start = round(config.settle_from * total)
+    return jnp.clip((iteration + 1 - start) / max(1, total - start), 0.0, 1.0)
+
+
+def steered(
+    opt_state: Any,
+    kl: jax.Array,
+    target_kl: jax.Array | float,
+    least_rate: jax.Array | float = STEERED_RATE_MIN,
+) -> Any:
     """`opt_state` with the actor's step size lowered where `kl` () is twice its target, raised where it is
-    half of it."""
+    half of it, never below `least_rate`."""
     actor = opt_state.inner_states["policy"]
-    chain, _ = adaptive_kl_learning_rate(actor.inner_state, kl, target_kl, STEERED_RATE_MIN)
+    chain, _ = adaptive_kl_learning_rate(actor.inner_state, kl, target_kl, least_rate)
     return opt_state._replace(
         inner_states=opt_state.inner_states | {"policy": actor._replace(inner_state=chain)}
     )
@@ -249,6 +288,7 @@ def steered(opt_state: Any, kl: jax.Array, target_kl: float) -> Any:
 def _improve(config, networks, normalizer, data, key, state, mesh):
     """`epochs` passes of minibatch gradient steps; new (params, opt_state), mean loss terms and gradients."""
     optimizer = make_optimizer(config)
+    calm = 1.0 - (1.0 - SETTLED) * settling(config, state.iteration)
     loss_fn = partial(
         ppo_losses.compute_ppo_loss,
         ppo_network=networks,
@@ -269,7 +309,8 @@ def _improve(config, networks, normalizer, data, key, state, mesh):
         grads = network_params(policy_grads, grads.value)
         updates, opt_state = optimizer.update(grads, opt_state, params)
         if config.target_kl:
-            opt_state = steered(opt_state, terms["kl_mean"], config.target_kl)
+            kl = terms["kl_mean"]
+            opt_state = steered(opt_state, kl, calm * config.target_kl, calm * STEERED_RATE_MIN)
         params = cast(ppo_losses.PPONetworkParams, optax.apply_updates(params, updates))
         return (params, opt_state), terms
 

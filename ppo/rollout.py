@@ -47,7 +47,7 @@ def roll_out(env: GraspEnv, policy: TeacherPolicy, keys: jax.Array | np.ndarray,
     mesh, keys = devices.make_mesh(), np.asarray(keys)
     surplus = -len(keys) % mesh.size  # the devices share evenly: some repeat the last episode
     padded = np.concatenate([keys, np.repeat(keys[-1:], surplus, axis=0)])
-    made = _roll_out(env, mesh, keep, policy.layers, policy.mean, policy.std, padded)
+    made = _roll_out(env, mesh, keep, policy.layers, policy.mean, policy.std, begin(env, mesh, padded))
     (params, index, success), (running, kept, lost) = jax.tree.map(np.asarray, made)
     first = partial(jax.tree.map, lambda values: values[: len(keys)])
     running, kept, lost = jax.tree.map(lambda values: values[:, : len(keys)], (running, kept, lost))
@@ -57,11 +57,17 @@ def roll_out(env: GraspEnv, policy: TeacherPolicy, keys: jax.Array | np.ndarray,
     return Rollout(first(params), first(index), first(success), running, kept, dropped)
 
 
+@partial(jax.jit, static_argnums=(0, 1))
+def begin(env: GraspEnv, mesh: Mesh, keys) -> State:
+    """The first states of the episodes of `keys` (N, 2). A program of its own: it calls no host, so it stays
+    in JAX's cache on disk, which the episodes on the C engine do not."""
+    return devices.each(mesh, env.reset)(keys)
+
+
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _roll_out(env: GraspEnv, mesh: Mesh, keep: Keep, layers, mean, std, keys) -> Any:
+def _roll_out(env: GraspEnv, mesh: Mesh, keep: Keep, layers, mean, std, state: State) -> Any:
     policy = TeacherPolicy(mean, std, layers)
-    state = devices.each(mesh, env.reset)(keys)
-    episode = state.info["episode"]
+    episode, count = state.info["episode"], len(state.done)
 
     def step(carry, _):
         state, alive, success = carry
@@ -70,7 +76,7 @@ def _roll_out(env: GraspEnv, mesh: Mesh, keep: Keep, layers, mean, std, keys) ->
         success = jnp.where(alive, new.metrics["success"] > 0, success)
         return (new, alive & (new.done == 0), success), (alive, keep(state, action, new), new.data.dropped)
 
-    start = (state, jnp.ones(len(keys), bool), jnp.zeros(len(keys), bool))
+    start = (state, jnp.ones(count, bool), jnp.zeros(count, bool))
     (*_, success), per_step = jax.lax.scan(step, start, None, env.config.episode_steps)
     outcome = (episode.params, episode.object_index, success), per_step
     return jax.lax.with_sharding_constraint(outcome, devices.replicated(mesh))

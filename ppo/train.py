@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -79,22 +80,60 @@ def initial(config: Config, env: AutoReset) -> Callable[[], learner.LearnerState
     return partial(jax.jit(partial(learner.init, config.teacher, env), out_shardings=places), key)
 
 
-def compile_iteration(config: Config, env: AutoReset) -> jax.stages.Compiled:
-    """`learner.iteration` on the mesh of `env`; UserError if what it needs is more than the memory there is.
+Programs = dict[str, tuple[jax.stages.Wrapped, tuple[Any, ...]]]
+"""Jitted functions by name, each with the shapes of its arguments."""
+
+
+def programs(config: Config, env: AutoReset) -> Programs:
+    """What an iteration calls, in this order, on the mesh of `env`: each takes what the last one returned."""
+    places, everywhere = learner.shardings(env.mesh), devices.replicated(env.mesh)
+    over_envs = devices.over_envs(env.mesh)
+    state = jax.eval_shape(initial(config, env))
+    collect = partial(learner.collect, config.teacher, env)
+    collected = (places, over_envs, everywhere)
+    improved = (places, everywhere, everywhere)
+    return {
+        "refresh": (
+            jax.jit(
+                partial(learner.refresh, config.teacher, env),
+                in_shardings=(places,), out_shardings=places, donate_argnums=0,
+            ),
+            (state,),
+        ),
+        "collect": (
+            jax.jit(collect, in_shardings=(places,), out_shardings=collected, donate_argnums=0), (state,)
+        ),
+        "improve": (
+            jax.jit(
+                partial(learner.improve, config.teacher, env.mesh),
+                in_shardings=collected, out_shardings=improved, donate_argnums=0,
+            ),
+            jax.eval_shape(collect, state),
+        ),
+    }  # fmt: skip
+
+
+Iterate = Callable[
+    [learner.LearnerState], tuple[learner.LearnerState, dict[str, jax.Array], dict[str, jax.Array]]
+]
+
+
+def compile_iteration(config: Config, env: AutoReset) -> Iterate:
+    """state -> (state, scalars for the curves, scalars for the NaN guard), an iteration later; UserError if
+    that needs more than the memory there is.
 
     Compiled before anything else is done, so that a batch that does not fit is refused at once.
     """
-    places = learner.shardings(env.mesh)
-    everywhere = devices.replicated(env.mesh)
-    jitted = jax.jit(
-        partial(learner.iteration, config.teacher, env),
-        in_shardings=(places,),
-        out_shardings=(places, everywhere, everywhere),
-        donate_argnums=0,
-    )
-    compiled = jitted.lower(jax.eval_shape(initial(config, env))).compile()
-    memory.check_compiled(config, env, compiled)
-    return compiled
+    compiled = {
+        name: jitted.lower(*shapes).compile() for name, (jitted, shapes) in programs(config, env).items()
+    }
+    for program in compiled.values():
+        memory.check_compiled(config, env, program)
+
+    def iterate(state):
+        return compiled["improve"](*compiled["collect"](compiled["refresh"](state)))
+
+    return iterate
 
 
 def restore(config: Config, env: AutoReset, saved: Checkpoints) -> learner.LearnerState:
@@ -146,7 +185,10 @@ def training_world(config: Config) -> WorldConfig:
     """The world with the exploring starts that only training has."""
     teacher = config.teacher
     random = dataclasses.replace(
-        config.world.random, pregrasp_share=teacher.pregrasp_share, held_share=teacher.held_share
+        config.world.random,
+        pregrasp_share=teacher.pregrasp_share,
+        pregrasp_turn_rad=teacher.pregrasp_turn_rad,
+        held_share=teacher.held_share,
     )
     return dataclasses.replace(config.world, random=random)
 

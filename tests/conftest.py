@@ -20,6 +20,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 os.environ.setdefault("WARP_CACHE_PATH", str(_CACHE.with_name("warp")))
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Compiling is most of the suite's time, and half of that goes into making small programs faster.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 SLOW = (
     "test_flow_debug", "test_teacher_devices", "test_teacher_learner", "test_world_physics", "test_gpu_check",

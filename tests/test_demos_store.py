@@ -27,6 +27,19 @@ def test_round_trip_in_replay_buffer_layout(tmp_path):
     np.testing.assert_array_equal(again.episodes("object_index"), [7, 9])
 
 
+def test_an_end_that_was_not_written_any_more_does_not_count(tmp_path):
+    """Killed between the growth of the index and its row."""
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    store.append(*episode(3, 7))
+    ends = store._meta["episode_ends"]
+    ends.resize((2,))
+    again = EpisodeStore(tmp_path / "s.zarr", create=True)
+    np.testing.assert_array_equal(again.ends, [3])
+    again.append(*episode(2, 9))
+    np.testing.assert_array_equal(again.ends, [3, 5])
+    np.testing.assert_array_equal(again.steps("action")[:, 0], [7, 7, 7, 9, 9])
+
+
 def test_a_half_written_episode_is_not_seen_and_is_overwritten(tmp_path, monkeypatch):
     import demos.store as module
 

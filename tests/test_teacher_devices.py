@@ -27,11 +27,10 @@ ABSOLUTE_WARMSTART = 0.05
 
 
 def _start(*command: str, devices: int = 1) -> subprocess.Popen:
-    """`command` on so many CPU devices; compiled with few optimisations, since compiling is what costs."""
+    """`command` on so many CPU devices."""
     env = os.environ | {
         "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
         "JAX_PLATFORMS": "cpu",
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
         "PYTHONPATH": str(ROOT),
     }
     return subprocess.Popen(

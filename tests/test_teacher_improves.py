@@ -1,17 +1,16 @@
 """PPO from nothing improves a policy: a small problem, from 1 of 64 to nearly always in 160,000 steps."""
 
-from functools import partial
+from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import optax
 import pytest
 
-from ddgrasp.config import RandomConfig, RewardConfig, TeacherConfig, WorldConfig
+from ddgrasp.config import Config, RandomConfig, RewardConfig, TeacherConfig, WorldConfig
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import learner
 from ppo.evaluate import evaluate
-from ppo.train import policy_of
+from ppo.train import compile_iteration, initial, policy_of
 
 TEACHER = TeacherConfig(
     start="nothing", total_steps=160_000, num_envs=256, unroll_steps=10, minibatches=4, learning_rate=6e-4,
@@ -27,9 +26,9 @@ TRIALS = 64
 
 
 def test_ppo_from_nothing_learns_to_lift_and_hold():
+    config = Config("test", world=WORLD, teacher=TEACHER)
     env = AutoReset(GraspEnv(WORLD))
-    state = jax.jit(partial(learner.init, TEACHER, env))(jax.random.PRNGKey(0))
-    iterate = jax.jit(partial(learner.iteration, TEACHER, env), donate_argnums=0)
+    state, iterate = initial(config, env)(), compile_iteration(config, env)
 
     def successes() -> int:
         return evaluate(env.env, policy_of(state), TRIALS, seed=1)["success"]["successes"]
@@ -55,3 +54,14 @@ def test_the_step_size_follows_the_divergence_of_an_update(kl, expected):
     for _ in range(20):
         state = learner.steered(state, jnp.asarray(1.0), TEACHER.target_kl)
     assert float(optax.tree_utils.tree_get(state, "learning_rate")) == pytest.approx(learner.STEERED_RATE_MIN)
+
+
+@pytest.mark.parametrize(
+    ("settle_from", "expected"),
+    [(1.0, [0, 0, 0, 0, 0]), (0.6, [0, 0, 0, 0.5, 1]), (0.0, [0.2, 0.4, 0.6, 0.8, 1])],
+)
+def test_training_settles_in_its_last_iterations(settle_from, expected):
+    teacher = replace(
+        TEACHER, total_steps=5 * TEACHER.num_envs * TEACHER.unroll_steps, settle_from=settle_from
+    )
+    assert [float(learner.settling(teacher, jnp.asarray(i))) for i in range(5)] == pytest.approx(expected)

@@ -9,10 +9,10 @@ import pytest
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig, WorldConfig
-from ddgrasp.layout import QPOS
+from ddgrasp.layout import OBSERVATION, QPOS
 from mjx_envs import grasp_math, kinematics, randomize, scene
 from mjx_envs.camera import nominal_camera
-from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.grasp_env import AutoReset, GraspEnv
 from mjx_envs.objects import OBJECTS
 from mjx_envs.physics import interface as physics
 from rig.world import RigWorld
@@ -62,7 +62,9 @@ def sampler(table):
             params, size = randomize.sample_params(k_params, config, table, 0)
             qpos = randomize.sample_qpos(k_qpos, config, jnp.asarray(CUBE.rest_height_m))
             grasp = grasp_math.grasp_pose(qpos[9:12], qpos[12:16], jnp.asarray(4), 0.0, jnp)
-            qpos = randomize.maybe_pregrasp(k_start, config, qpos, *grasp)
+            qpos = randomize.maybe_pregrasp(
+                k_start, config.pregrasp_share, config.pregrasp_turn_rad, qpos, *grasp
+            )
             turn = CAMERA[:3, :3].T @ randomize.sample_camera(k_camera, config, CAMERA)[:3, :3]
             return {
                 "size": size,
@@ -96,6 +98,7 @@ def test_every_range_is_listed():
         "held_share",
         "latency_share",
         "other_pose_share",
+        "pregrasp_turn_rad",
     }
 
 
@@ -150,6 +153,20 @@ def test_pregrasp_share_is_a_share(sampler):
     assert 1 - home.mean() == pytest.approx(0.25, abs=0.06)
 
 
+@pytest.mark.parametrize("turn_rad", [0.0, 1.0])
+def test_the_hand_above_the_object_is_turned_from_the_grasp(turn_rad):
+    random = replace(NOTHING, pregrasp_share=1, pregrasp_turn_rad=turn_rad)
+    env = GraspEnv(WorldConfig(objects=("cube",), random=random))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 200))
+    _, hand = kinematics.grip_pose(state.data.qpos[:, QPOS.arm], jnp)
+    grasp = state.obs[:, OBSERVATION.grasp_quat]
+    turn = np.asarray(kinematics.quat_mul(hand, kinematics.quat_conj(grasp, jnp), jnp))
+    angle = 2 * np.arctan2(turn[:, 3] * np.sign(turn[:, 0]), np.abs(turn[:, 0]))
+    assert np.abs(turn[:, 1:3]).max() < 0.02
+    quartiles = np.quantile(angle, np.linspace(0, 1, 5))
+    np.testing.assert_allclose(quartiles, np.linspace(-turn_rad, turn_rad, 5), atol=0.02 + 0.15 * turn_rad)
+
+
 @pytest.mark.parametrize("share", [0.25, 1.0])
 def test_episodes_start_with_the_object_in_the_hand_in_their_share(share):
     """A gripper that is told to close then holds it, whichever it is."""
@@ -166,6 +183,19 @@ def test_episodes_start_with_the_object_in_the_hand_in_their_share(share):
         state = step(state, close)
     assert np.asarray(state.info["episode"].grasped)[raised].mean() > 0.97
     assert not np.asarray(state.info["episode"].grasped)[~raised].any()
+
+
+@pytest.mark.parametrize("exploring", [0.0, 0.5])
+def test_shares_of_exploring_starts_are_turned_down(exploring):
+    """Of pregrasps and of held objects alike, in a running batch."""
+    random = replace(NOTHING, pregrasp_share=0.5, held_share=0.5)
+    env = AutoReset(GraspEnv(WorldConfig(objects=("cube",), random=random)))
+    state = env.reset(jax.random.split(jax.random.PRNGKey(0), 400))
+    qpos = np.asarray(env.refresh(state, exploring).info["next"][0].qpos)
+    held = qpos[:, QPOS.object_pos][:, 2] > 0.026
+    moved = np.abs(qpos[:, QPOS.arm] - scene.HOME_RAD).max(axis=1) > 1e-6
+    assert held.mean() == pytest.approx(0.5 * exploring, abs=0.08)
+    assert moved[~held].mean() == pytest.approx(0.5 * exploring, abs=0.08)
 
 
 MODEL_FIELDS = {

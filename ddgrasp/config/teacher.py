@@ -69,8 +69,14 @@ class TeacherConfig(Section, name="teacher"):
     """Layers of policy and value networks."""
     pregrasp_share: Share = 0.2
     """Share of training episodes that start with the hand above the object (exploring starts)."""
+    pregrasp_turn_rad: Annotated[float, Range(0, 1.5)] = 0.0
+    """The hand's yaw there, off the grasp's by up to this: how to turn to either side is found near the
+    object."""
     held_share: Share = 0.0
     """Share of training episodes that start with the object in the hand, anywhere up to the lift target."""
+    settle_from: Share = 1.0
+    """From this share of the iterations on PPO settles: episodes start as the world's do, without the two
+    shares above, and target_kl with the least step size shrinks linearly to a tenth; 1 for never."""
     clone_rounds: Count = 8
     """DAgger rounds in which the policy network learns the guide before PPO; for start guide alone."""
     clone_envs: Count = 192

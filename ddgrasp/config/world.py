@@ -70,6 +70,8 @@ class RandomConfig(Section, name="world.random"):
     """Initial arm joints around home."""
     pregrasp_share: Share = 0.0
     """Share of episodes that start with the hand above the object (exploring starts, for training only)."""
+    pregrasp_turn_rad: Annotated[float, Range(0, math.pi / 2)] = 0.0
+    """The hand's yaw there, off the grasp's by up to this."""
     held_share: Share = 0.0
     """Share of episodes that start with the object in the hand, anywhere up to the lift target (exploring
     starts, for training only)."""

@@ -3,14 +3,13 @@
 Numbers come from the stages' manifests as they were measured; this module only adds Wilson intervals.
 """
 
-import os
 import platform
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts, contract
+from ddgrasp import artifacts, contract, cores
 from ddgrasp.errors import UserError
 from ddgrasp.stages import ON_REQUEST, STAGES
 from evaluation import backends, teacher_trials, wilson
@@ -90,8 +89,11 @@ def describe_machine() -> dict[str, Any]:
             line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line
         ]
         processor = names[0] if names else processor
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"processor": processor, "cores": cores, "system": f"{platform.system()} {platform.machine()}"}
+    return {
+        "processor": processor,
+        "cores": cores.available(),
+        "system": f"{platform.system()} {platform.machine()}",
+    }
 
 
 # --- for people ----------------------------------------------------------------------------------

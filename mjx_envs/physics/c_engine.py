@@ -1,6 +1,5 @@
 """MuJoCo's C engine on all cores, called from jitted JAX code."""
 
-import os
 from typing import Any
 
 import jax
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from mujoco.batch import Batch
 
+from ddgrasp import cores
 from mjx_envs import devices, scene
 from mjx_envs.object_spec import SlotLayout
 from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
@@ -43,8 +43,8 @@ class CpuPhysics:
 
 
 def _threads(shard: int) -> int:
-    """Threads of a share's batch: this host's devices divide its cores; 0 (all) for the whole."""
-    return 0 if shard < 0 else max(1, (os.cpu_count() or 1) // jax.local_device_count())
+    """Threads of a share's batch: this host's devices divide its cores; the whole has all."""
+    return cores.available() if shard < 0 else max(1, cores.available() // jax.local_device_count())
 
 
 class _HostBatch:
