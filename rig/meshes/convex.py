@@ -18,14 +18,16 @@ from rig.meshes.solids import Part
 
 SHIPPED = Path(__file__).with_name("convex.npz")
 SETTINGS = {
-    "threshold": 0.05, "preprocess_mode": "off", "mcts_iterations": 40, "mcts_nodes": 10, "mcts_max_depth": 2,
-    "seed": 0,
+    "threshold": 0.05, "max_convex_hull": 24, "preprocess_mode": "off", "mcts_iterations": 40, "mcts_nodes": 10,
+    "mcts_max_depth": 2, "seed": 0,
 }  # fmt: skip
 """For `coacd.run_coacd`; `threshold` is its concavity, about a share of the shape's size."""
 MAX_VERTICES = 200
 """Per part; smooth hulls have more, and keep those that stick out furthest in evenly spread directions."""
 _SIMPLIFY_MM = 0.3
 """CoACD's time goes with the number of faces."""
+_STORED_MM = 0.01
+"""What a unit of the stored 16-bit integers is."""
 
 Hull = Float64[np.ndarray, "v 3"]
 
@@ -38,8 +40,9 @@ def convex_parts(part: Part) -> list[Hull]:
     for file in (SHIPPED, _cached(key)):
         if (found := _read(file, key)) is not None:
             return found
-    found = _decompose(part)
-    _write(_cached(key), {key: found})
+    _write(_cached(key), {key: _decompose(part)})
+    found = _read(_cached(key), key)
+    assert found is not None
     return found
 
 
@@ -94,15 +97,17 @@ def _read(file: Path, key: str) -> list[Hull] | None:
     if not file.exists():
         return None
     with np.load(file) as stored:
-        if f"{key}-0" not in stored:
+        if key not in stored:
             return None
-        count = sum(name.startswith(key) for name in stored)
-        return [stored[f"{key}-{i}"].astype(np.float64) for i in range(count)]
+        ends = np.cumsum(stored[f"{key}-counts"])[:-1]
+        return np.split(_STORED_MM * stored[key], ends)
 
 
 def _write(file: Path, found: dict[str, list[Hull]]) -> None:
-    """Atomic; float16 would be too coarse, float32 is finer than the key."""
-    arrays = {f"{key}-{i}": hull.astype(np.float32) for key, hulls in found.items() for i, hull in enumerate(hulls)}
+    arrays: dict[str, np.ndarray] = {}
+    for key, hulls in found.items():
+        arrays[key] = np.rint(np.concatenate(hulls) / _STORED_MM).astype(np.int16)
+        arrays[f"{key}-counts"] = np.array([len(hull) for hull in hulls])
     with atomic_path(file) as temporary:
         np.savez_compressed(temporary, **arrays)
 

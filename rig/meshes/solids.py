@@ -14,8 +14,7 @@ from scipy.interpolate import CubicSpline
 SIDES = 48
 """Points around a ring."""
 
-Points2 = Sequence[tuple[float, float]]
-Points3 = Sequence[tuple[float, float, float]]
+Points = Sequence[Sequence[float]]
 Vector = tuple[float, float, float]
 Angles = Float64[np.ndarray, " n"]
 
@@ -39,7 +38,7 @@ class Part:
         return replace(self, mesh=self.mesh.copy().apply_transform(transform))
 
 
-def spline(points: Points2, count: int = 40) -> Float64[np.ndarray, "k 2"]:
+def spline(points: Points, count: int = 40) -> Float64[np.ndarray, "k 2"]:
     """(count, 2) along a cubic spline through `points`, by length of chord."""
     knots = np.asarray(points, float)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
@@ -84,12 +83,12 @@ def turned(
     return loft(np.stack([radii * np.cos(angle), radii * np.sin(angle), heights], axis=-1))
 
 
-def tube(path: Points3, radii: Sequence[float], sides: int = 16) -> trimesh.Trimesh:
+def tube(path: Points, radii: Sequence[float], sides: int = 16) -> trimesh.Trimesh:
     """A round rod whose axis runs through `path`, thick as `radii` say at each point."""
     return sweep(path, radii, np.stack([np.cos(around(sides)), np.sin(around(sides))], axis=1))
 
 
-def sweep(path: Points3, scales: Sequence[float], section: Float64[np.ndarray, "n 2"]) -> trimesh.Trimesh:
+def sweep(path: Points, scales: Sequence[float], section: Float64[np.ndarray, "n 2"]) -> trimesh.Trimesh:
     """`section` (N, 2) times `scales`, carried along a smooth curve through `path` which lies in a plane."""
     knots = np.asarray(path, float)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
@@ -112,7 +111,7 @@ def rounded_box(size: Vector, radius: float) -> trimesh.Trimesh:
     return trimesh.convex.convex_hull((centres[:, None] + ball).reshape(-1, 3))
 
 
-def lathe(profile: Points2, transform: Float64[np.ndarray, "4 4"] | None = None) -> trimesh.Trimesh:
+def lathe(profile: Points, transform: Float64[np.ndarray, "4 4"] | None = None) -> trimesh.Trimesh:
     """The surface of revolution about z of `profile` (radius, height): from axis to axis, or a closed curve."""
     mesh = trimesh.creation.revolve(np.asarray(profile, float), sections=SIDES, transform=transform)
     mesh.fix_normals()

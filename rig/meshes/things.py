@@ -33,14 +33,10 @@ def can() -> tuple[Part, ...]:
     r, half = 33.0, 50.5
     lower = [(0, -half + 3), (29, -half + 3), (30, -half), (r, -half), (r, -half + 3), (31.8, -half + 4.5)]
     profile = [*lower, *((x, -z) for x, z in reversed(lower))]
-    ribs = [
-        trimesh.creation.annulus(r_min=30, r_max=32.6, height=2.0, sections=SIDES).apply_translation((0, 0, z))
-        for z in (-9, -3, 3, 9)
-    ]
     tab = rounded_box((22, 13, 1.6), 0.7).apply_transform(turn((0, 1, 0), 3, at=(12, 0, half - 1.9)))
     label = trimesh.creation.cylinder(radius=32.2, height=84, sections=SIDES)
     return (
-        Part("tin", lathe(profile), _STEEL), Part("label", union([label, *ribs]), (0.75, 0.10, 0.12)),
+        Part("tin", lathe(profile), _STEEL), Part("label", label, (0.75, 0.10, 0.12)),
         Part("tab", tab, _STEEL),
     )  # fmt: skip
 
@@ -75,13 +71,13 @@ def wheel() -> tuple[Part, ...]:
 def bread() -> tuple[Part, ...]:
     """A hot-dog roll: flat below, domed above, split along the top."""
     rings = []
-    angle = around(64)
+    angle = around(120)
     for x in np.linspace(-69, 69, 41):
         size = max(0.02, 1 - (abs(x) / 69.3) ** 3.2) ** 0.5
         y = 27 * size * np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** 0.85
-        z = np.where(np.sin(angle) > 0, 25.5, 17.0) * size**0.8 * np.sin(angle)
+        z = np.where(np.sin(angle) > 0, 28.5, 17.0) * size**0.8 * np.sin(angle)
         z = np.sign(z) * np.abs(z) ** np.where(z < 0, 0.8, 1.0) * np.where(z < 0, 17.0**0.2, 1.0)
-        z = z - 6.0 * size * np.exp(-((y / 3.2) ** 2)) * (z > 0)
+        z = np.maximum(z - 7.0 * size * np.exp(-((y / 3.5) ** 2)) * (z > 0), -14.0)
         rings.append(np.column_stack([np.full_like(angle, x), y, z]))
     return (Part("crust", loft(np.stack(rings)), (0.72, 0.48, 0.22)),)
 
@@ -132,14 +128,14 @@ def screwdriver() -> tuple[Part, ...]:
 
 
 def milk() -> tuple[Part, ...]:
-    """A gable-top carton with a screw cap on the roof's slope; standing, the ridge along x."""
+    """A gable-top carton with a screw cap on the roof's slope; standing, the ridge along y."""
     carton = trimesh.convex.convex_hull(
         [(x, y, z) for x in (-28, 28) for y in (-28, 28) for z in (0, 78)]
-        + [(x, y, 99) for x in (-28, 28) for y in (-1.5, 1.5)]
+        + [(x, y, 99) for x in (-1.5, 1.5) for y in (-28, 28)]
     )
-    ridge = trimesh.creation.box((56, 3, 14)).apply_translation((0, 0, 105))
+    ridge = trimesh.creation.box((3, 56, 14)).apply_translation((0, 0, 105))
     cap = trimesh.creation.cylinder(radius=9, height=9, sections=SIDES)
-    cap.apply_transform(turn((1, 0, 0), -51.6, at=(0, 17.3, 91.5)))
+    cap.apply_transform(turn((0, 1, 0), 51.6, at=(17.3, 0, 91.5)))
     white = (0.93, 0.94, 0.95)
     return (
         Part("carton", carton, white), Part("ridge", ridge, white), Part("cap", cap, (0.15, 0.35, 0.75))
