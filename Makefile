@@ -29,7 +29,7 @@ $(STAMP): requirements.lock pyproject.toml
 
 lock:  ## resolve requirements.lock anew (needs uv on PATH)
 	uv pip compile --universal --python-version 3.11 --fork-strategy requires-python --no-emit-index-url \
-		--no-annotate --no-header --upgrade --extra dev pyproject.toml --output-file requirements.lock
+		--no-annotate --no-header --upgrade --extra dev --extra fr3 pyproject.toml --output-file requirements.lock
 
 test: setup  ## run the tests (trains the debug preset end to end); with ARGS those tests alone
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)

@@ -112,6 +112,4 @@ def _add_primitives(world: mujoco.MjsBody, name: str, x_m: float) -> None:
     for kind, size, pos, quat, rgb in zip(
         layout.kinds, *spec.slot_arrays(layout), spec.slot_rgb(layout), strict=True
     ):
-        body.add_geom(
-            type=_KINDS[kind], size=size, pos=pos, quat=quat, rgba=[*rgb, 1.0], group=VISUAL_GROUP
-        )
+        body.add_geom(type=_KINDS[kind], size=size, pos=pos, quat=quat, rgba=[*rgb, 1.0], group=VISUAL_GROUP)

@@ -6,6 +6,7 @@ stable one nearest to the shape's own (`trimesh.poses`, Goldberg et al. 1999), f
 
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.util import find_spec
 
 import mujoco
 import numpy as np
@@ -76,6 +77,7 @@ def body_of(described: MeshObject) -> MeshBody:
     Raises UserError for a surface that is not closed, a shape that no two opposite sides of fit between the
     fingers, one that does not rest as described, and for a concave one where CoACD is not installed.
     """
+    _check_libraries()
     parts = described.shape()
     for part in parts:
         _check_closed(described.name, part)
@@ -165,10 +167,16 @@ def _rest_turn(
     if np.arccos(np.clip(up[2], -1, 1)) > MAX_TILT_RAD:
         degrees = np.degrees(np.arccos(up[2]))
         raise UserError(
-            f"{name!r} rests {degrees:.0f} degrees off from how its shape is given: turn the shape, z up, as it "
-            "should lie."
+            f"{name!r} rests {degrees:.0f} degrees off from how its shape is given: turn the shape, z up, as "
+            "it should lie."
         )
     return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
+
+
+def _check_libraries() -> None:
+    missing = [name for name in ("manifold3d", "networkx") if find_spec(name) is None]
+    if missing:
+        raise UserError(f"Mesh objects need {' and '.join(missing)}: pip install -e '.[fr3]'.")
 
 
 def _check_closed(name: str, part: Part) -> None:
@@ -177,8 +185,8 @@ def _check_closed(name: str, part: Part) -> None:
     edges = part.mesh.edges_sorted
     _, counts = np.unique(edges, axis=0, return_counts=True)
     raise UserError(
-        f"The surface {part.name!r} of {name!r} is not closed ({(counts != 2).sum()} of {len(counts)} edges do "
-        "not have two faces): mend it, for instance with trimesh.repair.fill_holes and fix_normals."
+        f"The surface {part.name!r} of {name!r} is not closed ({(counts != 2).sum()} of {len(counts)} edges "
+        "do not have two faces): mend it, for instance with trimesh.repair.fill_holes and fix_normals."
     )
 
 

@@ -18,8 +18,8 @@ from rig.meshes.solids import Part
 
 SHIPPED = Path(__file__).with_name("convex.npz")
 SETTINGS = {
-    "threshold": 0.05, "max_convex_hull": 24, "preprocess_mode": "off", "mcts_iterations": 40, "mcts_nodes": 10,
-    "mcts_max_depth": 2, "seed": 0,
+    "threshold": 0.05, "max_convex_hull": 24, "preprocess_mode": "off", "seed": 0,
+    "mcts_iterations": 40, "mcts_nodes": 10, "mcts_max_depth": 2,
 }  # fmt: skip
 """For `coacd.run_coacd`; `threshold` is its concavity, about a share of the shape's size."""
 MAX_VERTICES = 200
@@ -69,7 +69,7 @@ def _simplified(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _reduced(mesh: trimesh.Trimesh) -> Hull:
-    """(V, 3) vertices of the hull of `mesh`, at most about MAX_VERTICES; flat faces along the axes stay flat."""
+    """(V, 3) vertices of the hull of `mesh`, about MAX_VERTICES at most; faces across an axis stay flat."""
     vertices = np.asarray(mesh.convex_hull.vertices)
     if len(vertices) <= MAX_VERTICES:
         return vertices

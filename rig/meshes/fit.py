@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
@@ -25,16 +26,20 @@ class Fit:
 
 def fit(body: MeshBody) -> Fit:
     """Compares the unions of both; distances are to 30,000 points of a surface, so up to 1 mm too long."""
-    drawn = union([trimesh.Trimesh(surface.vertices_m, surface.faces) for surface in body.surfaces])
-    contact = union([trimesh.convex.convex_hull(vertices) for vertices in body.convex_m])
-    return Fit(contact.volume / drawn.volume, _beyond(contact, drawn), _beyond(drawn, contact))
+    drawn = union([
+        trimesh.Trimesh(1000 * surface.vertices_m, surface.faces, process=False) for surface in body.surfaces
+    ])  # fmt: skip
+    contact = union([trimesh.convex.convex_hull(1000 * vertices) for vertices in body.convex_m])
+    outside_mm, inside_mm = _beyond(contact, drawn), _beyond(drawn, contact)
+    return Fit(contact.volume / drawn.volume, outside_mm / 1000, inside_mm / 1000)
 
 
 def _beyond(solid: trimesh.Trimesh, other: trimesh.Trimesh) -> float:
-    """Largest distance of what `solid` has outside of `other` to the surface of `other`, at its corners."""
+    """Largest distance of what `solid` has outside of `other` to the surface of `other`."""
     excess = without(solid, [other])
     if excess.is_empty:
         return 0.0
     points, _ = trimesh.sample.sample_surface(other, _SAMPLES, seed=0)
-    away, _ = cKDTree(points).query(excess.vertices)
+    probes, _ = trimesh.sample.sample_surface(excess, _SAMPLES // 3, seed=1)
+    away, _ = cKDTree(points).query(np.concatenate([probes, excess.vertices]))
     return float(away.max())

@@ -43,7 +43,8 @@ def pear() -> tuple[Part, ...]:
 def peach() -> tuple[Part, ...]:
     """A cleft down one side, a dimple above, a point below."""
     profile = spline([
-        (0, -29.5), (3, -28.5), (12, -26), (24, -16), (30, -1), (27.5, 15), (19, 26), (9, 29.5), (3, 28), (0, 24),
+        (0, -29.5), (3, -28.5), (12, -26), (24, -16), (30, -1), (27.5, 15), (19, 26), (9, 29.5), (3, 28),
+        (0, 24),
     ])  # fmt: skip
 
     def cleft(angle: Angles, share: float) -> Angles:
@@ -115,9 +116,8 @@ def _star() -> Float64[np.ndarray, "n 2"]:
 
 def _beyond(angle: float, distance: float) -> tuple[float, float, float]:
     """A point `distance` past the banana's end at `angle`, straight on."""
-    return (
-        _BANANA_BEND_MM * np.sin(angle) + distance * np.cos(angle), -_BANANA_BEND_MM * np.cos(angle) + distance * np.sin(angle), 0.0
-    )  # fmt: skip
+    sin, cos = np.sin(angle), np.cos(angle)
+    return _BANANA_BEND_MM * sin + distance * cos, -_BANANA_BEND_MM * cos + distance * sin, 0.0
 
 
 def _wrapped(angle: Angles) -> Angles:

@@ -39,7 +39,11 @@ class MeshObject:
 
 
 def _as_trained(
-    name: str, shape: Callable[[], tuple[Part, ...]], source: str, symmetry: int, grasp_mm: Vector | None = None
+    name: str,
+    shape: Callable[[], tuple[Part, ...]],
+    source: str,
+    symmetry: int,
+    grasp_mm: Vector | None = None,
 ) -> MeshObject:
     """An object of training in another shape: mass and friction are those of `mjx_envs/objects.py`."""
     spec = OBJECTS[name]
@@ -62,7 +66,7 @@ MESH_OBJECTS: dict[str, MeshObject] = {
         _as_trained("wheel", things.wheel, "tyre with lugs, rim with five spokes and a bore", 0),
         _as_trained("bread", things.bread, "loft with a flat base and a split top", 2),
         MeshObject(
-            "mug", things.mug, 0.130, 0.4, 2, "espresso mug, 65 x 67 mm; stoneware of 2.4 g/cm3; our estimates",
+            "mug", things.mug, 0.130, 0.4, 2, "espresso mug, 65 x 67 mm, stoneware; our estimates",
             grasp_mm=(0.0, 0.0, 40.0),
         ),
         MeshObject(
@@ -78,7 +82,7 @@ MESH_OBJECTS: dict[str, MeshObject] = {
             grasp_mm=(0.0, 0.0, 80.0),
         ),
         MeshObject("hammer", things.hammer, 0.200, 0.5, 2, "a 200 g joiner's hammer; our estimates"),
-        MeshObject("bulb", things.bulb, 0.040, 0.4, 2, "A60 lamp, 60 x 108 mm (IEC 60630); mass: our estimate"),
+        MeshObject("bulb", things.bulb, 0.040, 0.4, 2, "A60 lamp, 60 x 108 mm; our estimates"),
     )
 }  # fmt: skip
 

@@ -78,7 +78,9 @@ def turned(
     """
     angle = around()
     shares = np.linspace(0.0, 1.0, len(profile))
-    radii = np.stack([max(r, 1e-3) * shape(angle, share) for (r, _), share in zip(profile, shares, strict=True)])
+    radii = np.stack(
+        [max(r, 1e-3) * shape(angle, share) for (r, _), share in zip(profile, shares, strict=True)]
+    )
     heights = np.broadcast_to(profile[:, 1:], radii.shape)
     return loft(np.stack([radii * np.cos(angle), radii * np.sin(angle), heights], axis=-1))
 
@@ -112,7 +114,7 @@ def rounded_box(size: Vector, radius: float) -> trimesh.Trimesh:
 
 
 def lathe(profile: Points, transform: Float64[np.ndarray, "4 4"] | None = None) -> trimesh.Trimesh:
-    """The surface of revolution about z of `profile` (radius, height): from axis to axis, or a closed curve."""
+    """The surface of revolution about z of `profile` (radius, height), closed or ending on the axis."""
     mesh = trimesh.creation.revolve(np.asarray(profile, float), sections=SIDES, transform=transform)
     mesh.fix_normals()
     return mesh

@@ -8,7 +8,19 @@ import numpy as np
 import trimesh
 
 from rig.meshes.solids import (
-    SIDES, Part, Vector, around, lathe, loft, rounded_box, spline, sweep, tube, turn, turned, union, without,
+    SIDES,
+    Part,
+    around,
+    lathe,
+    loft,
+    rounded_box,
+    spline,
+    sweep,
+    tube,
+    turn,
+    turned,
+    union,
+    without,
 )  # fmt: skip
 
 _STEEL, _BLACK = (0.72, 0.73, 0.75), (0.12, 0.12, 0.13)
@@ -101,7 +113,9 @@ def mug() -> tuple[Part, ...]:
 
 def bottle() -> tuple[Part, ...]:
     """A small juice bottle with a waist, a neck and a screw cap; standing."""
-    glass = spline([(27, 3), (28.5, 12), (28, 40), (25.5, 58), (28, 76), (27, 92), (19, 108), (13.5, 118)], 36)
+    glass = spline(
+        [(27, 3), (28.5, 12), (28, 40), (25.5, 58), (28, 76), (27, 92), (19, 108), (13.5, 118)], 36
+    )
     body = lathe([(0, 0), (24, 0), *glass.tolist(), (13.5, 128), (0, 128)])
     ridges = 1 + 0.03 * np.sign(np.sin(24 * around()))
     cap = turned(
