@@ -17,7 +17,7 @@ from mjx_envs.objects import OBJECTS
 from rig.meshes.bodies import CONTACT_GROUP, VISUAL_GROUP, MeshBody, make_body, place
 from rig.meshes.objects import MESH_OBJECTS
 
-HEIGHT_PX, WIDTH_PX = 300, 400
+HEIGHT_PX, WIDTH_PX = 210, 280
 STEP_M = 1.0
 """Between two objects of the scene."""
 DISTANCE_M, FIELD_DEG = 0.62, 18.5
@@ -36,7 +36,7 @@ def draw(names: Sequence[str] = tuple(MESH_OBJECTS)) -> bytes:
     bodies = [make_body(name) for name in names]
     model = _scene(bodies)
     rows = -(-len(bodies) // PER_ROW)
-    panel_in = 1.7
+    panel_in = 1.5
     size = (panel_in * PER_ROW * PANELS, panel_in * 0.88 * rows)
     figure = Figure(figsize=size, layout="constrained")
     with mujoco.Renderer(model, HEIGHT_PX, WIDTH_PX) as renderer:
@@ -83,8 +83,9 @@ def _scene(bodies: Sequence[MeshBody]) -> mujoco.MjModel:
     """All objects on one table, the primitives of the same name `_PRIMITIVE_ROW_M` behind."""
     spec = mujoco.MjSpec()
     spec.visual.map.znear, spec.visual.map.zfar = 0.005, 30.0
-    spec.visual.quality.shadowsize = 8192
-    spec.visual.map.shadowclip = 0.5
+    spec.visual.quality.shadowsize = 1024
+    spec.visual.map.shadowclip = 0.3
+    spec.visual.quality.offsamples = 2
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35] * 3, [0.35] * 3
     spec.worldbody.add_light(
         pos=[0, 0, 3], dir=[0.4, 0.3, -1], diffuse=[0.5] * 3, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL

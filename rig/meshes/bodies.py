@@ -20,7 +20,7 @@ from rig.meshes.convex import convex_parts
 from rig.meshes.objects import MeshObject, get_mesh_object
 from rig.meshes.solids import Part, Vector, union
 
-Points = Float64[np.ndarray, "v 3"]
+Points = Float64[np.ndarray, "_ 3"]
 MAX_TILT_RAD = 0.5
 """Between the shape as described and as it rests."""
 CONTACT_SOLREF = (0.005, 1.0)

@@ -29,7 +29,7 @@ _SIMPLIFY_MM = 0.3
 _STORED_MM = 0.01
 """What a unit of the stored 16-bit integers is."""
 
-Hull = Float64[np.ndarray, "v 3"]
+Hull = Float64[np.ndarray, "_ 3"]
 
 
 def convex_parts(part: Part) -> list[Hull]:
