@@ -83,12 +83,13 @@ def _scene(bodies: Sequence[MeshBody]) -> mujoco.MjModel:
     """All objects on one table, the primitives of the same name `_PRIMITIVE_ROW_M` behind."""
     spec = mujoco.MjSpec()
     spec.visual.map.znear, spec.visual.map.zfar = 0.005, 30.0
-    spec.visual.quality.shadowsize = 1024
-    spec.visual.map.shadowclip = 0.3
-    spec.visual.quality.offsamples = 2
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35] * 3, [0.35] * 3
     spec.worldbody.add_light(
-        pos=[0, 0, 3], dir=[0.4, 0.3, -1], diffuse=[0.5] * 3, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        pos=[0, 0, 3],
+        dir=[0.4, 0.3, -1],
+        diffuse=[0.5] * 3,
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=False,
     )
     spec.worldbody.add_geom(
         name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], rgba=[0.86, 0.85, 0.83, 1]
