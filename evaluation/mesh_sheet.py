@@ -100,9 +100,9 @@ def _scene(bodies: Sequence[MeshBody]) -> mujoco.MjModel:
             _add_primitives(spec.worldbody, body.name, STEP_M * i)
     model = spec.compile()
     model.vis.global_.fovy = FIELD_DEG
-    colors = colormaps["tab20"].colors
+    colors = colormaps["tab20"]
     for geom in np.flatnonzero(model.geom_group == CONTACT_GROUP):
-        model.geom_rgba[geom] = (*colors[geom % len(colors)], 1.0)
+        model.geom_rgba[geom] = colors(int(geom) % colors.N)
     return model
 
 

@@ -91,7 +91,7 @@ def body_of(described: MeshObject) -> MeshBody:
     convex_m = tuple(trimesh.transform_points(hull, transform) for hull in hulls)
     at_rest = solid.copy().apply_transform(transform)
     grasp_mm = solid.center_mass if described.grasp_mm is None else described.grasp_mm
-    x, y, z = trimesh.transform_points([grasp_mm], transform)[0]
+    x, y, z = trimesh.transform_points(np.array([grasp_mm]), transform)[0]
     return MeshBody(
         described.name, tuple(_surface(part, transform) for part in parts), convex_m,
         described.mass_kg, described.friction,

@@ -109,7 +109,7 @@ def _write(file: Path, found: dict[str, list[Hull]]) -> None:
         arrays[key] = np.rint(np.concatenate(hulls) / _STORED_MM).astype(np.int16)
         arrays[f"{key}-counts"] = np.array([len(hull) for hull in hulls])
     with atomic_path(file) as temporary:
-        np.savez_compressed(temporary, **arrays)
+        np.savez_compressed(temporary, allow_pickle=False, **arrays)
 
 
 def main() -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from rig.meshes.bodies import MeshBody
 from rig.meshes.solids import union, without
@@ -39,7 +39,7 @@ def _beyond(solid: trimesh.Trimesh, other: trimesh.Trimesh) -> float:
     excess = without(solid, [other])
     if excess.is_empty:
         return 0.0
-    points, _ = trimesh.sample.sample_surface(other, _SAMPLES, seed=0)
-    probes, _ = trimesh.sample.sample_surface(excess, _SAMPLES // 3, seed=1)
-    away, _ = cKDTree(points).query(np.concatenate([probes, excess.vertices]))
+    points = trimesh.sample.sample_surface(other, _SAMPLES, seed=0)[0]
+    probes = trimesh.sample.sample_surface(excess, _SAMPLES // 3, seed=1)[0]
+    away, _ = KDTree(points).query(np.concatenate([probes, excess.vertices]))
     return float(away.max())

@@ -143,10 +143,9 @@ def screwdriver() -> tuple[Part, ...]:
 
 def milk() -> tuple[Part, ...]:
     """A gable-top carton with a screw cap on the roof's slope; standing, the ridge along y."""
-    carton = trimesh.convex.convex_hull(
-        [(x, y, z) for x in (-28, 28) for y in (-28, 28) for z in (0, 78)]
-        + [(x, y, 99) for x in (-1.5, 1.5) for y in (-28, 28)]
-    )
+    walls = [(x, y, z) for x in (-28.0, 28.0) for y in (-28.0, 28.0) for z in (0.0, 78.0)]
+    roof = [(x, y, 99.0) for x in (-1.5, 1.5) for y in (-28.0, 28.0)]
+    carton = trimesh.convex.convex_hull(np.array(walls + roof))
     ridge = trimesh.creation.box((3, 56, 14)).apply_translation((0, 0, 105))
     cap = trimesh.creation.cylinder(radius=9, height=9, sections=SIDES)
     cap.apply_transform(turn((0, 1, 0), 51.6, at=(17.3, 0, 91.5)))
@@ -185,9 +184,9 @@ def bulb() -> tuple[Part, ...]:
 
 def _tapered(near: tuple[float, float], far: tuple[float, float], z0: float, z1: float) -> trimesh.Trimesh:
     """The hull of a rectangle `near` (x, y) at height `z0` and a rectangle `far` at `z1`."""
-    return trimesh.convex.convex_hull(
-        [(x * w / 2, y * d / 2, z) for (w, d), z in ((near, z0), (far, z1)) for x in (-1, 1) for y in (-1, 1)]
-    )
+    ends = ((near, z0), (far, z1))
+    corners = [(x * w / 2, y * d / 2, z) for (w, d), z in ends for x in (-1, 1) for y in (-1, 1)]
+    return trimesh.convex.convex_hull(np.array(corners))
 
 
 def _ring_surface(rings: np.ndarray) -> trimesh.Trimesh:
