@@ -7,7 +7,6 @@ import errno
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -17,8 +16,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     # JAX's GPU build takes most of the device's memory at its start unless told otherwise.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     # Compiled programs are kept: the second run of a stage starts in seconds.
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "ddgrasp" / "jax"
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+    from ddgrasp.files import user_cache
+
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(user_cache("jax")))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     try:
         return _dispatch(list(sys.argv[1:] if argv is None else argv))

@@ -16,14 +16,47 @@ CONTRACT_VERSION = 1
 CONTROL_HZ = 10.0
 CONTROL_DT_S = 1.0 / CONTROL_HZ
 
-# --- robot (Franka Emika Panda; limits from Franka's published interface specification) -------
+
+# --- robot: limits from Franka's published interface specification ---------------------------
+@dataclass(frozen=True)
+class Arm:
+    """A Franka arm with its hand. Both have the same kinematics, and differ in what their joints may do."""
+
+    name: str
+    """As `deploy.franka.model` names it."""
+    joint_lower_rad: tuple[float, ...]
+    joint_upper_rad: tuple[float, ...]
+    joint_velocity_rad_s: tuple[float, ...]
+    joint_acceleration_rad_s2: tuple[float, ...]
+    hand_width_m: float = 0.08
+    """Largest opening between the pads of the Franka Hand."""
+
+
+PANDA = Arm(
+    name="panda",
+    joint_lower_rad=(-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973),
+    joint_upper_rad=(2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973),
+    joint_velocity_rad_s=(2.1750, 2.1750, 2.1750, 2.1750, 2.6100, 2.6100, 2.6100),
+    joint_acceleration_rad_s2=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
+)
+"""Franka Emika Panda: what training and the development rig drive."""
+FR3 = Arm(
+    name="fr3",
+    joint_lower_rad=(-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159),
+    joint_upper_rad=(2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159),
+    joint_velocity_rad_s=(2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
+    joint_acceleration_rad_s2=(10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0),
+)
+"""Franka Research 3. Within a few hundredths of a radian of a position limit it allows less speed."""
+ARMS = {arm.name: arm for arm in (PANDA, FR3)}
+
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
-JOINT_LOWER_RAD = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)
-JOINT_UPPER_RAD = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
-JOINT_VELOCITY_LIMIT_RAD_S = (2.1750, 2.1750, 2.1750, 2.1750, 2.6100, 2.6100, 2.6100)
-JOINT_ACCELERATION_LIMIT_RAD_S2 = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
-GRIPPER_MAX_WIDTH_M = 0.08
+JOINT_LOWER_RAD = PANDA.joint_lower_rad
+JOINT_UPPER_RAD = PANDA.joint_upper_rad
+JOINT_VELOCITY_LIMIT_RAD_S = PANDA.joint_velocity_rad_s
+JOINT_ACCELERATION_LIMIT_RAD_S2 = PANDA.joint_acceleration_rad_s2
+GRIPPER_MAX_WIDTH_M = PANDA.hand_width_m
 
 OBSERVATION_PARTS = {
     "joint_position": 9, "joint_velocity": 9, "hand_pose": 7,

@@ -38,6 +38,12 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         raise
 
 
+def user_cache(name: str) -> Path:
+    """Where what can be made again is kept: `name` in DDGRASP_CACHE, or in ddgrasp/ of the user's caches."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return Path(os.environ.get("DDGRASP_CACHE", caches / "ddgrasp")) / name
+
+
 def atomic_write_bytes(path: Path | str, data: bytes) -> None:
     """Writes `data` to `path`; on an error (full disk, Ctrl-C) the previous file survives."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:

@@ -1,6 +1,9 @@
-"""The two clocks a loop can run on."""
+"""The clocks a loop can run on."""
 
 import time
+from collections.abc import Callable
+
+from deploy.interfaces import RobotError
 
 _SPIN_S = 0.0005
 """The last half millisecond is waited for awake: the scheduler wakes sleepers tens of microseconds late."""
@@ -20,6 +23,44 @@ class RealClock:
             time.sleep(remaining - _SPIN_S)
         while time.monotonic() < deadline_s:
             pass
+
+
+class RobotClock:
+    """A robot's own time: an arm that is slower than real (a simulated one) still sees 10 Hz.
+
+    `follow` first; until then, and while the robot does not answer, no time passes.
+    """
+
+    def __init__(self, stalled_after_s: float = 5.0):
+        """`stalled_after_s` of the machine's time without any of the robot's is an error."""
+        self._stalled_after_s = stalled_after_s
+        self._read: Callable[[], float | None] = lambda: None
+        self._before_s = 0.0
+        self._robot_s = 0.0
+
+    def follow(self, read: Callable[[], float | None]) -> None:
+        """Keep the time that `read` tells, in seconds; None where there is none."""
+        self._read = read
+
+    def now(self) -> float:
+        """Seconds, monotonic: a robot that counts anew after a new connection goes on from where it was."""
+        seconds = self._read()
+        if seconds is not None:
+            if seconds < self._robot_s:
+                self._before_s += self._robot_s
+            self._robot_s = seconds
+        return self._before_s + self._robot_s
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Returns when `now` has reached the deadline. Raises RobotError if the robot's time stands still."""
+        now_s, moved_at = self.now(), time.monotonic()
+        while now_s < deadline_s:
+            time.sleep(max(deadline_s - now_s - _SPIN_S, _SPIN_S))  # robots are not faster than the machine
+            before_s, now_s = now_s, self.now()
+            if now_s > before_s:
+                moved_at = time.monotonic()
+            elif time.monotonic() - moved_at > self._stalled_after_s:
+                raise RobotError(f"the robot's clock has stood still for {self._stalled_after_s:g} s")
 
 
 class SimClock:

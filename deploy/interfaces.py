@@ -41,6 +41,10 @@ class CameraError(Exception):
     """A camera gave no frame (unplugged, timed out). The loop holds position and tries again."""
 
 
+class RobotError(Exception):
+    """A robot stopped by itself or fell silent (reflex, lost connection): one line. The run ends with it."""
+
+
 @runtime_checkable
 class Camera(Protocol):
     """A depth camera that always hands out its newest frame."""
@@ -67,7 +71,7 @@ class Robot(Protocol):
         ...
 
     def read_state(self) -> RobotState:
-        """Measured joints and gripper width."""
+        """Measured joints and gripper width. Raises RobotError, as the next two do."""
         ...
 
     def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
@@ -80,6 +84,15 @@ class Robot(Protocol):
 
     def stop(self) -> None:
         """Stop any motion and disconnect; also called where `start` failed or was never reached."""
+        ...
+
+
+@runtime_checkable
+class TimedRobot(Robot, Protocol):
+    """A robot with a clock of its own."""
+
+    def time_s(self) -> float | None:
+        """Seconds since it began to answer, None while it does not. Raises RobotError."""
         ...
 
 

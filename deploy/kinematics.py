@@ -1,4 +1,7 @@
-"""Where the Franka's hand is, in NumPy. Source: Franka's published modified Denavit-Hartenberg table."""
+"""Where a Franka's arm and hand are, in NumPy.
+
+Source: Franka's published modified Denavit-Hartenberg table, the same for Panda and FR3.
+"""
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -11,13 +14,33 @@ HAND_YAW_RAD = -np.pi / 4
 GRIP_D_M = 0.1034
 """From the hand's mounting face to the middle of the finger pads."""
 
+_PARTS = (
+    (3, (0.0, 0.0, 0.0), 0.07),
+    (4, (0.0, 0.0, -0.25), 0.052),
+    (4, (0.0, 0.03, -0.12), 0.052),
+    (4, (0.0, 0.06, -0.1), 0.045),
+    (4, (0.0, 0.02, 0.0), 0.045),
+    (5, (0.0, 0.0, -0.03), 0.047),
+    (5, (0.07, 0.0, 0.0), 0.047),
+    (6, (0.0, 0.0, FLANGE_D_M), 0.042),
+    (7, (0.0, 0.0, 0.045), 0.033),
+    (7, (0.0, 0.07, 0.045), 0.033),
+    (7, (0.0, -0.07, 0.045), 0.033),
+)
+"""Spheres around what can hit a table or a wall before the fingers do: elbow, forearm, wrist, flange, hand.
+(joint counted from 0, point in its frame, radius; metres), 7 being the hand. Sizes: mjx_envs/scene.py."""
+PART_RADII_M = np.array([radius for *_, radius in _PARTS])
+
+
+def part_centers(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "11 3"]:
+    """(11, 3) centres of the spheres of `PART_RADII_M` in the robot's base frame, metres."""
+    frames = _frames(q_rad)
+    return np.array([frames[i][:3, :3] @ point + frames[i][:3, 3] for i, point, _ in _PARTS])
+
 
 def grip_pose(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "4 4"]:
     """(4, 4) T_base_grip for (7,) joint positions: z points out of the hand, the fingers open along y."""
-    pose = np.eye(4)
-    for a, d, alpha, theta in zip(DH_A_M, DH_D_M, DH_ALPHA_RAD, q_rad, strict=True):
-        pose = pose @ _modified_dh(a, d, alpha, theta)
-    return pose @ _modified_dh(0.0, FLANGE_D_M, 0.0, HAND_YAW_RAD) @ _modified_dh(0.0, GRIP_D_M, 0.0, 0.0)
+    return _frames(q_rad)[-1] @ _modified_dh(0.0, GRIP_D_M, 0.0, 0.0)
 
 
 def grip_position(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "3"]:
@@ -27,12 +50,17 @@ def grip_position(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "3"]:
 
 def position_jacobian(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "3 7"]:
     """(3, 7) derivative of `grip_position` by the joints: z_i x (grip - origin_i)."""
-    pose, axes, origins = np.eye(4), [], []
+    joints = np.array(_frames(q_rad)[:7])
+    return np.cross(joints[:, :3, 2], grip_position(q_rad) - joints[:, :3, 3]).T
+
+
+def _frames(q_rad: np.ndarray) -> list[np.ndarray]:
+    """(4, 4) poses of the seven joints' frames, then of the hand's mounting face."""
+    pose, frames = np.eye(4), []
     for a, d, alpha, theta in zip(DH_A_M, DH_D_M, DH_ALPHA_RAD, q_rad, strict=True):
         pose = pose @ _modified_dh(a, d, alpha, theta)
-        axes.append(pose[:3, 2])
-        origins.append(pose[:3, 3])
-    return np.cross(axes, grip_position(q_rad) - np.array(origins)).T
+        frames.append(pose)
+    return [*frames, pose @ _modified_dh(0.0, FLANGE_D_M, 0.0, HAND_YAW_RAD)]
 
 
 def _modified_dh(a_m: float, d_m: float, alpha_rad: float, theta_rad: float) -> np.ndarray:

@@ -10,11 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ddgrasp.errors import UserError
-from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotState
+from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotError, RobotState
 from deploy.policy import OnnxPolicy
 from deploy.safety import NonFiniteAction, SafetyCounts, SafetyFilter
 from deploy.timing import Timings
 
+EMPTY_WIDTH_M = 0.002
+"""A closed hand narrower than this holds nothing."""
 KEPT_EVENTS = 1000
 """Events kept in a report; later ones are counted only."""
 
@@ -36,7 +38,7 @@ class Event:
     time_s: float
     """Since the loop's start."""
     kind: str
-    """hold, recover, missed, stop."""
+    """hold, recover, missed, empty, fault, stop."""
     reason: str
 
     def __str__(self) -> str:
@@ -66,6 +68,10 @@ class LoopReport:
     """Steps that held position instead of following the policy."""
     interrupted: bool = False
     """Ended by Ctrl-C, or by SIGTERM in `ddgrasp deploy`."""
+    fault: str = ""
+    """What ended the run where the robot did: a reflex, a lost connection."""
+    width_m: float | None = None
+    """The gripper's opening at the last step."""
     timings: Timings = field(default_factory=Timings)
     safety: SafetyCounts = field(default_factory=SafetyCounts)
     events: list[Event] = field(default_factory=list)
@@ -77,6 +83,8 @@ class LoopReport:
             "steps": self.steps,
             "holds": self.holds,
             "interrupted": self.interrupted,
+            "fault": self.fault,
+            "width_m": self.width_m,
             "safety": self.safety.as_dict(),
             "events": [str(event) for event in self.events],
             "events_dropped": self.events_dropped,
@@ -103,14 +111,17 @@ class ControlLoop:
         self._report = LoopReport(settings.period_s, safety=safety.counts)
         self._last_frame_s = -math.inf
         self._held_for = ""
+        self._closed = False
+        self._start_s = self._last_s = 0.0
 
     def run(
         self, max_steps: int | None = None, on_step: Callable[[Step], bool | None] | None = None
     ) -> LoopReport:
-        """Run until `max_steps`, until `on_step` returns True, or until Ctrl-C.
+        """Run until `max_steps`, until `on_step` returns True, until Ctrl-C, or until the robot fails.
 
         The last command has its whole period before this returns. Camera and robot are started here
-        and stopped whatever happens; on Ctrl-C the arm is told to hold first and the report comes back.
+        and stopped whatever happens; on Ctrl-C the arm is told to hold first. The report comes back either
+        way: what the robot failed with is its `fault`, and an event.
         """
         self._start_s = self._clock.now()
         moving = False
@@ -123,10 +134,12 @@ class ControlLoop:
         except KeyboardInterrupt:
             self._report.interrupted = True
             if moving:
-                self._robot.hold()
+                self._hold_quietly()
             self._log("stop", "interrupted; the robot holds position")
+        except RobotError as error:
+            self._fail(error)
         finally:
-            _stop_both(self._robot, self._camera)
+            self._stop_both()
         return self._report
 
     def _keep_time(self, max_steps: int | None, on_step: Callable[[Step], bool | None] | None) -> None:
@@ -145,6 +158,7 @@ class ControlLoop:
                 done = bool(on_step(step)) or done
             deadline = self._next_deadline(deadline)
         self._clock.sleep_until(deadline)
+        self._look_at_hand()
 
     def _next_deadline(self, deadline: float) -> float:
         """The next multiple of the period that is still ahead; skipped ones count as missed."""
@@ -164,6 +178,7 @@ class ControlLoop:
         state = self._robot.read_state()
         timings.sense_s.append(time.perf_counter() - started)
         problem = problem or _state_problem(state)
+        self._report.width_m = float(state.width_m)
         action = None
         started = time.perf_counter()
         if frame is not None and not problem:
@@ -220,6 +235,7 @@ class ControlLoop:
         except NonFiniteAction as error:
             return None, f"non-finite {error}"
         self._robot.command(target, close)
+        self._closed = close
         return target, ""
 
     def _hold(self, reason: str) -> None:
@@ -238,23 +254,51 @@ class ControlLoop:
             self._log("recover", f"after {self._held_for}")
         self._held_for = ""
 
+    def _look_at_hand(self) -> None:
+        """Says so if the hand was told to close and has nothing in it."""
+        if not self._closed:
+            return
+        width_m = self._report.width_m = float(self._robot.read_state().width_m)
+        if width_m < EMPTY_WIDTH_M:
+            self._log("empty", f"the gripper closed to {1e3 * width_m:.1f} mm: nothing in the hand")
+
+    def _hold_quietly(self) -> None:
+        try:
+            self._robot.hold()
+        except RobotError as error:
+            self._fail(error)
+
+    def _fail(self, error: RobotError) -> None:
+        """The first fault ends the run; what comes after it is its consequence."""
+        self._report.fault = self._report.fault or str(error)
+        self._log("fault", str(error))
+
+    def _stop_both(self) -> None:
+        try:
+            self._robot.stop()
+        except RobotError as error:
+            self._fail(error)
+        finally:
+            self._camera.stop()
+
     def _log(self, kind: str, reason: str) -> None:
-        event = Event(self._report.steps, self._clock.now() - self._start_s, kind, reason)
+        event = Event(self._report.steps, self._now_s(), kind, reason)
         if len(self._report.events) < KEPT_EVENTS:
             self._report.events.append(event)
         else:
             self._report.events_dropped += 1
         self._say(str(event))
 
+    def _now_s(self) -> float:
+        """Since the start; of the last step where the clock went with the robot."""
+        try:
+            self._last_s = self._clock.now() - self._start_s
+        except RobotError:
+            pass
+        return self._last_s
+
 
 def _state_problem(state: RobotState) -> str:
     if state.q_rad.shape != (7,) or not np.isfinite(state.q_rad).all() or not np.isfinite(state.width_m):
         return f"bad joint state: {np.array2string(np.asarray(state.q_rad), precision=3)}"
     return ""
-
-
-def _stop_both(robot: Robot, camera: Camera) -> None:
-    try:
-        robot.stop()
-    finally:
-        camera.stop()

@@ -5,6 +5,7 @@ measured joints, so it holds for any robot driver and in simulation alike.
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,12 +28,15 @@ class SafetyLimits:
     lower_rad: tuple[float, ...] = contract.JOINT_LOWER_RAD
     upper_rad: tuple[float, ...] = contract.JOINT_UPPER_RAD
     velocity_rad_s: tuple[float, ...] = contract.JOINT_VELOCITY_LIMIT_RAD_S
-    """Largest step per control period, divided by the period."""
+    """Largest step per control period, divided by the period; no more than the driver will let the arm do."""
     acceleration_rad_s2: tuple[float, ...] = contract.JOINT_ACCELERATION_LIMIT_RAD_S2
     """Largest change between two steps that follow each other, divided by the period squared."""
     workspace_lower_m: tuple[float, float, float] = (0.15, -0.45, 0.012)
     workspace_upper_m: tuple[float, float, float] = (0.80, 0.45, 0.80)
     """Box for the point between the finger pads, robot base frame; 12 mm = fingertips on the table."""
+    arm_lower_m: tuple[float, float, float] = (-0.55, -0.80, 0.0)
+    arm_upper_m: tuple[float, float, float] = (0.95, 0.80, 1.30)
+    """Box that elbow, forearm, wrist and hand stay inside: table and walls."""
     period_s: float = contract.CONTROL_DT_S
 
 
@@ -45,12 +49,24 @@ class SafetyCounts:
 
     def as_dict(self) -> dict[str, int]:
         """Commands in all, and how many were changed for which cause."""
-        causes = ("action", "joint_position", "joint_velocity", "joint_acceleration", "workspace")
+        causes = ("action", "joint_position", "joint_velocity", "joint_acceleration", "workspace", "arm")
         return {"commands": self.commands} | {cause: self.by_cause[cause] for cause in causes}
 
 
 class NonFiniteAction(Exception):
     """The policy answered NaN or infinity."""
+
+
+def _shorten(step: np.ndarray, allowed: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """(7,) the longest part of `step` that bisection finds allowed; standing still is."""
+    inside, beyond = 0.0, 1.0
+    for _ in range(_BISECTIONS):
+        middle = (inside + beyond) / 2
+        if allowed(middle * step):
+            inside = middle
+        else:
+            beyond = middle
+    return inside * step
 
 
 class SafetyFilter:
@@ -89,6 +105,7 @@ class SafetyFilter:
         step = unit.astype(float) * self.action_scale_rad
         step = self._limit_step(q_rad, step, causes)
         step = self._limit_workspace(q_rad, step, causes)
+        step = self._limit_arm(q_rad, step, causes)
         self._last_step_rad = step
         self.counts.commands += 1
         self.counts.by_cause.update(causes)
@@ -116,7 +133,21 @@ class SafetyFilter:
         slid = self._slide(q_rad, step)
         if self._outside_m(q_rad + slid) <= max(allowed, _SLIDE_TOLERANCE_M):
             return slid
-        return self._shorten(q_rad, step, allowed)
+        return _shorten(step, lambda part: self._outside_m(q_rad + part) <= allowed)
+
+    def _limit_arm(self, q_rad: np.ndarray, step: np.ndarray, causes: list[str]) -> np.ndarray:
+        """(7,) `step`, shortened so that no part of the arm ends outside its box, or further than it is."""
+        allowed = self._arm_outside_m(q_rad)
+        if self._arm_outside_m(q_rad + step) <= allowed:
+            return step
+        causes.append("arm")
+        grip = max(self._outside_m(q_rad), _SLIDE_TOLERANCE_M)
+        return _shorten(
+            step,
+            lambda part: (
+                self._arm_outside_m(q_rad + part) <= allowed and self._outside_m(q_rad + part) <= grip
+            ),
+        )
 
     def _slide(self, q_rad: np.ndarray, step: np.ndarray) -> np.ndarray:
         """(7,) `step` without what leads out of the box (Newton steps), within the other limits."""
@@ -128,17 +159,6 @@ class SafetyFilter:
             step = np.clip(target - q_rad, -largest, largest)
         return step
 
-    def _shorten(self, q_rad: np.ndarray, step: np.ndarray, allowed_m: float) -> np.ndarray:
-        """(7,) the longest part of `step` that leaves the grip point no further outside the box."""
-        inside, beyond = 0.0, 1.0
-        for _ in range(_BISECTIONS):
-            middle = (inside + beyond) / 2
-            if self._outside_m(q_rad + middle * step) <= allowed_m:
-                inside = middle
-            else:
-                beyond = middle
-        return inside * step
-
     def _overshoot_m(self, q_rad: np.ndarray) -> np.ndarray:
         """(3,) vector from the nearest point of the workspace box to the grip point."""
         position = kinematics.grip_position(q_rad)
@@ -147,6 +167,13 @@ class SafetyFilter:
     def _outside_m(self, q_rad: np.ndarray) -> float:
         """Distance from the workspace box to the grip point, 0 inside."""
         return float(np.linalg.norm(self._overshoot_m(q_rad)))
+
+    def _arm_outside_m(self, q_rad: np.ndarray) -> float:
+        """How far the part that reaches furthest is outside the arm's box, 0 with all inside."""
+        centers, radii = kinematics.part_centers(q_rad), kinematics.PART_RADII_M[:, None]
+        below = np.array(self.limits.arm_lower_m) - (centers - radii)
+        above = (centers + radii) - np.array(self.limits.arm_upper_m)
+        return float(max(below.max(), above.max(), 0.0))
 
     @staticmethod
     def _noted(limited: np.ndarray, wanted: np.ndarray, cause: str, causes: list[str]) -> np.ndarray:

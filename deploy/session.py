@@ -1,34 +1,43 @@
 """`ddgrasp deploy`: an exported policy on a robot and a camera chosen by name."""
 
+import json
 import math
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
-from deploy.clock import RealClock
+from ddgrasp.files import atomic_write_bytes, atomic_write_text
+from deploy import dry_run
+from deploy.clock import RealClock, RobotClock
 from deploy.devices.options import SessionOptions, Setup
 from deploy.devices.registry import check_devices, make_devices
+from deploy.dry_run import DryRun
+from deploy.interfaces import Clock, Robot, TimedRobot
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
-from deploy.setup import loop_settings, safety_filter
+from deploy.setup import loop_settings, safety_filter, speed_notice
 
 
 def deploy(
     config: Config, policy_path: Path, options: SessionOptions, say: Callable[[str], None] = print
 ) -> LoopReport:
-    """Run the loop on the machine's clock; events go to `say` as they happen.
+    """Run the loop; events go to `say` as they happen, the report into a file of `options.out`.
 
-    SIGTERM ends it as Ctrl-C does: the robot holds, both devices are stopped, the report comes back.
+    SIGTERM ends it as Ctrl-C does: the robot holds, both devices are stopped, the report comes back. So it
+    does when the robot fails; its `fault` says with what.
 
     Raises UserError for an unknown name, a combination that cannot work, or a device that is absent.
     """
     _check(options)
     with _terminable():
-        return _run(config, policy_path, options, say)
+        return _run(_for_devices(config, options), policy_path, options, say)
 
 
 def _run(
@@ -40,12 +49,63 @@ def _run(
         seed=config.seed,
         execute_steps=config.deploy.execute_steps or None,
     )
-    clock = RealClock()
-    robot, camera = make_devices(Setup(config, options, policy.info, clock))
-    settings = loop_settings(config.deploy, policy.info)
-    loop = ControlLoop(camera, robot, policy, safety_filter(config.deploy, policy.info), clock, settings, say)
+    clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
+    confirm = _agreed if options.yes else ask_person
+    robot, camera = make_devices(Setup(config, options, policy.info, clock, confirm, say))
+    _keep_time_of(robot, clock, options)
+    safety = safety_filter(config.deploy, policy.info, options.robot)
+    if options.robot == "franka" and (notice := speed_notice(config.deploy, policy.info)):
+        say(notice)
+    driven = DryRun(robot, say) if options.dry_run else robot
+    loop = ControlLoop(camera, driven, policy, safety, clock, loop_settings(config.deploy, policy.info), say)
     steps = round(options.seconds * policy.info.control_hz) if math.isfinite(options.seconds) else None
-    return loop.run(steps)
+    report = loop.run(steps)
+    _write(options.out, report, say)
+    if isinstance(driven, DryRun):
+        path = options.out / f"{_stamp()}-dry-run.png"
+        atomic_write_bytes(path, dry_run.draw(driven.sent, safety.limits, 1.0 / policy.info.control_hz))
+        say(f"drawn: {path}")
+    return report
+
+
+def ask_person(question: str) -> None:
+    """Ask on the terminal. Raises UserError unless the answer is yes, or if nobody can be asked."""
+    if not sys.stdin.isatty():
+        raise UserError(f"{question} Nobody can be asked here: give --yes.")
+    if input(f"{question} [y/N] ").strip().lower() not in ("y", "yes"):
+        raise UserError("not confirmed: nothing has moved.")
+
+
+def _agreed(question: str) -> None:
+    """`--yes`."""
+
+
+def _for_devices(config: Config, options: SessionOptions) -> Config:
+    """The command line's host; before the FR3 rig, a process of this machine, its own time and any kernel."""
+    section = config.deploy
+    if options.host:
+        section = replace(section, franka=replace(section.franka, host=options.host))
+    if options.camera == "rig":
+        section = replace(section, clock="robot", franka=replace(section.franka, kernel="any"))
+    return replace(config, deploy=section)
+
+
+def _keep_time_of(robot: Robot, clock: Clock, options: SessionOptions) -> None:
+    if not isinstance(clock, RobotClock):
+        return
+    if not isinstance(robot, TimedRobot):
+        raise UserError(f"robot {options.robot!r} has no clock of its own: set deploy.clock machine.")
+    clock.follow(robot.time_s)
+
+
+def _write(folder: Path, report: LoopReport, say: Callable[[str], None]) -> None:
+    path = folder / f"{_stamp()}.json"
+    atomic_write_text(path, json.dumps(report.as_dict(), indent=1, allow_nan=False) + "\n")
+    say(f"report: {path}")
+
+
+def _stamp() -> str:
+    return time.strftime("%Y%m%d-%H%M%S")
 
 
 @contextmanager
@@ -81,6 +141,7 @@ def describe(report: LoopReport) -> str:
         *rows,
         f"{report.steps} steps, {report.timings.missed_deadlines} missed deadlines, {report.holds} holds",
         f"safety filter: {safety}",
+        *([f"ended by: {report.fault}"] if report.fault else []),
     ])  # fmt: skip
 
 

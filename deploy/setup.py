@@ -6,21 +6,46 @@ from ddgrasp.policy_metadata import PolicyMetadata
 from deploy.loop import LoopSettings
 from deploy.safety import SafetyFilter, SafetyLimits
 
+JOINT_MARGIN_RAD = 0.02
+"""A real arm's targets stay this far inside its range: the planner that smooths them overshoots a little, and
+the control unit stops an arm that asks for more than its range."""
+
 
 def loop_settings(config: DeployConfig, info: PolicyMetadata) -> LoopSettings:
     """The policy's own rate, the configured patience."""
     return LoopSettings(period_s=1.0 / info.control_hz, stale_periods=config.stale_periods)
 
 
-def safety_filter(config: DeployConfig, info: PolicyMetadata) -> SafetyFilter:
-    """Joint limits narrow enough for both this robot and the policy; the rest from the configuration."""
-    acceleration = (config.acceleration_scale * a for a in contract.JOINT_ACCELERATION_LIMIT_RAD_S2)
+def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim") -> SafetyFilter:
+    """Limits narrow enough for both `robot` (as `--robot` names it) and the policy."""
+    arm = contract.ARMS[config.franka.model] if robot == "franka" else contract.PANDA
+    speed = config.franka.speed_rad_s if robot == "franka" else arm.joint_velocity_rad_s
+    margin = JOINT_MARGIN_RAD if robot == "franka" else 0.0
     limits = SafetyLimits(
-        lower_rad=tuple(map(max, contract.JOINT_LOWER_RAD, info.joint_lower_rad)),
-        upper_rad=tuple(map(min, contract.JOINT_UPPER_RAD, info.joint_upper_rad)),
-        acceleration_rad_s2=tuple(acceleration),
+        lower_rad=tuple(
+            max(a + margin, p) for a, p in zip(arm.joint_lower_rad, info.joint_lower_rad, strict=True)
+        ),
+        upper_rad=tuple(
+            min(a - margin, p) for a, p in zip(arm.joint_upper_rad, info.joint_upper_rad, strict=True)
+        ),
+        velocity_rad_s=speed,
+        acceleration_rad_s2=tuple(config.acceleration_scale * a for a in arm.joint_acceleration_rad_s2),
         workspace_lower_m=config.workspace_lower_m,
         workspace_upper_m=config.workspace_upper_m,
+        arm_lower_m=config.arm_lower_m,
+        arm_upper_m=config.arm_upper_m,
         period_s=1.0 / info.control_hz,
     )
     return SafetyFilter(limits, info.action_scale_rad)
+
+
+def speed_notice(config: DeployConfig, info: PolicyMetadata) -> str:
+    """One line where the policy may ask for more speed than `deploy.franka.dynamics` gives; else ""."""
+    asked, given = info.action_scale_rad * info.control_hz, min(config.franka.speed_rad_s)
+    if asked <= given:
+        return ""
+    enough = config.franka.dynamics * asked / given
+    return (
+        f"speed: the policy may ask for {asked:.2f} rad/s, deploy.franka.dynamics {config.franka.dynamics:g} "
+        f"gives {given:.2f}; steps are cut to that ({enough:.2f} gives all of it)"
+    )

@@ -19,6 +19,7 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 os.environ.setdefault("WARP_CACHE_PATH", str(_CACHE.with_name("warp")))
+os.environ.setdefault("DDGRASP_CACHE", str(_CACHE.parent))
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Compiling is most of the suite's time, and half of that goes into making small programs faster.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")

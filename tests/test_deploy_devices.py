@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ddgrasp import contract
-from ddgrasp.config import CAMERAS, ROBOTS
+from ddgrasp.config import CAMERAS, ROBOTS, FrankaConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy.clock import SimClock
@@ -121,7 +121,7 @@ def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
     ("module", "start", "extra"),
     [
         ("pyrealsense2", lambda: RealSenseCamera(SimClock(), contract.D455).start(), "realsense"),
-        ("franky", lambda: FrankaRobot("127.0.0.1", SimClock()).start(), "franka"),
+        ("franky", lambda: FrankaRobot(FrankaConfig(host="127.0.0.1"), SimClock(), None).start(), "franka"),
     ],
 )
 def test_missing_driver_names_the_extra(monkeypatch, module, start, extra):
@@ -133,9 +133,9 @@ def test_missing_driver_names_the_extra(monkeypatch, module, start, extra):
 
 def test_drivers_that_never_started_can_be_stopped():
     RealSenseCamera(SimClock(), contract.D455).stop()
-    FrankaRobot("127.0.0.1", SimClock()).stop()
+    FrankaRobot(FrankaConfig(host="127.0.0.1"), SimClock(), None).stop()
     with pytest.raises(UserError, match="franka.dynamics is 1.5"):
-        FrankaRobot("127.0.0.1", SimClock(), dynamics=1.5)
+        FrankaConfig(dynamics=1.5)
 
 
 @pytest.mark.parametrize(
@@ -145,6 +145,7 @@ def test_drivers_that_never_started_can_be_stopped():
         (SessionOptions(camera="stero"), "Unknown camera 'stero'. Did you mean 'stereo'"),
         (SessionOptions(robot="franka", camera="stereo"), "use --camera realsense"),
         (SessionOptions(robot="franka", camera="replay", recording=Path("r")), "would move blindly"),
+        (SessionOptions(camera="rig"), "camera 'rig' sees the FR3 rig, not robot 'sim'"),
         (SessionOptions(camera="replay"), "needs --recording"),
         (SessionOptions(seconds=-1.0), "--seconds is -1: choose more than 0"),
         (SessionOptions(seconds=0.0), "--seconds is 0: choose more than 0"),
@@ -170,13 +171,14 @@ def test_every_pair_is_refused_or_can_be_made(recording):
                 continue
             made[robot, camera] = registry.make_devices(Setup(preset, options, info, SimClock()))
     assert set(registry.ROBOTS) == set(ROBOTS) and set(registry.CAMERAS) == set(CAMERAS)
-    assert refused == set(registry.REFUSED) == {("franka", "stereo"), ("franka", "replay")}
+    assert refused == set(registry.REFUSED) == {("franka", "stereo"), ("franka", "replay"), ("sim", "rig")}
     names = {pair: tuple(type(device).__name__ for device in devices) for pair, devices in made.items()}
     assert names == {
         ("sim", "stereo"): ("SimRobot", "StereoCamera"),
         ("sim", "realsense"): ("SimRobot", "RealSenseCamera"),
         ("sim", "replay"): ("SimRobot", "ReplayCamera"),
         ("franka", "realsense"): ("FrankaRobot", "RealSenseCamera"),
+        ("franka", "rig"): ("FrankaRobot", "Fr3Camera"),
     }
     robot, camera = made["sim", "stereo"]
     camera.start()
@@ -201,9 +203,10 @@ def test_sigterm_holds_and_stops_the_robot_as_ctrl_c_does(tmp_path, monkeypatch)
     before, said = signal.getsignal(signal.SIGTERM), []
     path = write_policy(tmp_path / "p.onnx", describe(), bias=constant_bias(0.2))
     threading.Timer(0.5, terminate_twice).start()
-    report = deploy(get_preset("debug"), path, SessionOptions(seconds=math.inf), said.append)
+    report = deploy(get_preset("debug"), path, SessionOptions(seconds=math.inf, out=tmp_path), said.append)
     robot, camera = devices
     assert report.interrupted and 0 < report.steps < 300
     assert robot.calls[-2:] == ["hold", "stop"] and camera.stopped
-    assert said[-1].endswith("stop: interrupted; the robot holds position")
+    assert said[-2].endswith("stop: interrupted; the robot holds position")
+    assert said[-1] == f"report: {next(tmp_path.glob('*.json'))}"
     assert signal.getsignal(signal.SIGTERM) is before

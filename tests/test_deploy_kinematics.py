@@ -45,3 +45,26 @@ def test_jacobian_is_the_derivative(seed):
         for e in np.eye(7)
     ]
     np.testing.assert_allclose(kinematics.position_jacobian(q), np.stack(columns, axis=1), atol=1e-8)
+
+
+def test_spheres_reach_as_far_as_the_arm_s_own_geoms():
+    model = scene.build_model()
+    data = mujoco.MjData(model)
+    bodies = [model.body(name).id for name in ("link5", "link6", "hand")]
+    capsules = [
+        g
+        for g in range(model.ngeom)
+        if model.geom_bodyid[g] in bodies and model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CAPSULE
+    ]
+    gaps = []
+    for q in np.random.default_rng(1).uniform(LOWER, UPPER, (200, 7)):
+        data.qpos[:7] = q
+        mujoco.mj_kinematics(model, data)
+        axes = data.geom_xmat[capsules].reshape(-1, 3, 3)[:, :, 2] * model.geom_size[capsules, 1:2]
+        ends = np.stack([data.geom_xpos[capsules] + axes, data.geom_xpos[capsules] - axes])
+        lowest = (ends[..., 2] - model.geom_size[capsules, 0]).min()
+        box = data.geom("hand_box")
+        lowest = min(lowest, box.xpos[2] - np.abs(box.xmat.reshape(3, 3)[2]) @ model.geom("hand_box").size)
+        parts = kinematics.part_centers(q)[1:, 2] - kinematics.PART_RADII_M[1:]
+        gaps.append(parts.min() - lowest)
+    assert max(gaps) < 0.016, "something of the arm hangs lower than every sphere"

@@ -13,6 +13,8 @@ FREE = SafetyLimits(
     acceleration_rad_s2=(1e6,) * 7,
     workspace_lower_m=(-9.0, -9.0, -9.0),
     workspace_upper_m=(9.0, 9.0, 9.0),
+    arm_lower_m=(-9.0, -9.0, -9.0),
+    arm_upper_m=(9.0, 9.0, 9.0),
 )
 """Position and velocity limits of the robot, nothing else."""
 
@@ -28,7 +30,7 @@ def test_harmless_action_passes_unchanged():
     assert close and causes == []
     assert filter_.counts.as_dict() == {
         "commands": 1, "action": 0, "joint_position": 0, "joint_velocity": 0, "joint_acceleration": 0,
-        "workspace": 0,
+        "workspace": 0, "arm": 0,
     }  # fmt: skip
 
 
@@ -119,6 +121,29 @@ def test_no_action_leads_out_of_the_workspace():
         assert np.all(position >= lower - 2e-4) and np.all(position <= upper + 2e-4)
         assert np.all(q >= contract.JOINT_LOWER_RAD) and np.all(q <= contract.JOINT_UPPER_RAD)
     assert filter_.counts.by_cause["workspace"] > 0, "the walk never met a wall: the test says nothing"
+
+
+def test_the_hand_s_side_stays_off_the_table_though_the_grip_point_may_go_there():
+    low = HOME + np.array([0, 0.45, 0, 0, 0, 0.45, 0])
+    limits = SafetyLimits(acceleration_rad_s2=(1e6,) * 7, workspace_lower_m=(0.15, -0.45, -0.3))
+    filter_, q = SafetyFilter(limits, 0.1), low
+    causes: list[str] = []
+    for _ in range(60):  # down, and the wrist turned so that a side of the hand comes lowest
+        q, _, why = filter_.target(q, action(0.0, 0.3, 0.0, 0.0, 0.8, 0.1, 0.0))
+        causes += why
+        lowest = kinematics.part_centers(q)[:, 2] - kinematics.PART_RADII_M
+        assert lowest.min() >= -1e-9
+    assert "arm" in causes and np.argmin(lowest) >= 7, "no part of the hand met the table: this says nothing"
+
+
+def test_the_elbow_stays_off_a_wall():
+    limits = SafetyLimits(acceleration_rad_s2=(1e6,) * 7, arm_lower_m=(-0.55, -0.25, 0.0))
+    filter_, q, causes = SafetyFilter(limits, 0.1), HOME, []
+    for _ in range(40):
+        q, _, why = filter_.target(q, action(-0.3, 0.0, -0.5))
+        causes += why
+    reach = kinematics.part_centers(q)[:, 1] - kinematics.PART_RADII_M
+    assert reach.min() == pytest.approx(-0.25, abs=0.02) and reach.min() >= -0.25 and "arm" in causes
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

@@ -19,6 +19,7 @@ from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThres
 from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
 from app.commands.parsing import parsed
+from app.commands.rig import RigFr3
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
@@ -66,6 +67,7 @@ COMMANDS: dict[str, type] = {
     "student eval": StudentEval,
     "export": Export,
     "deploy": Deploy,
+    "rig fr3": RigFr3,
     "weights convert": WeightsConvert,
     "weights list": WeightsList,
     "report": Report,

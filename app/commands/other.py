@@ -78,10 +78,16 @@ class Report:
 class ObjectsList:
     """Name the objects: category, size, mass, friction, where the numbers come from."""
 
+    meshes: bool = False
+    """Those of the test rig, which are meshes, instead of those of training."""
+
     def run(self) -> None:
         """Prints a line per object."""
         from mjx_envs.objects import OBJECTS
 
+        if self.meshes:
+            _list_meshes()
+            return
         for spec in OBJECTS.values():
             size = " x ".join(f"{1000 * extent:.0f}" for extent in spec.extents_m())
             numbers = f"{size:>14} mm {1000 * spec.mass_kg:>4.0f} g  friction {spec.friction}"
@@ -94,14 +100,38 @@ class ObjectsSheet:
 
     objects: tuple[str, ...] = ()
     """Names; none draws all of them, those that the paper trains on first."""
+    meshes: bool = False
+    """Those of the test rig instead: from two sides, their contact parts, and what training has."""
     out: Path = Path("objects.png")
     """The picture's file."""
 
     def run(self) -> None:
         """Writes the picture and prints where it is."""
+        atomic_write_bytes(self.out, self._mesh_sheet() if self.meshes else self._sheet())
+        print(self.out)
+
+    def _sheet(self) -> bytes:
         from evaluation.object_sheet import draw
         from mjx_envs.objects import OBJECTS
 
         everything = tuple(dict.fromkeys((*contract.SEEN_OBJECTS, *contract.UNSEEN_OBJECTS, *OBJECTS)))
-        atomic_write_bytes(self.out, draw(self.objects or everything))
-        print(self.out)
+        return draw(self.objects or everything)
+
+    def _mesh_sheet(self) -> bytes:
+        from evaluation.mesh_sheet import draw
+        from rig.meshes.objects import MESH_OBJECTS
+
+        return draw(self.objects or tuple(MESH_OBJECTS))
+
+
+def _list_meshes() -> None:
+    """Prints a line per mesh object: size at rest, mass, friction, height of the origin, source."""
+    from rig.meshes.bodies import make_body
+    from rig.meshes.objects import MESH_OBJECTS
+
+    for name, described in MESH_OBJECTS.items():
+        body = make_body(name)
+        size = " x ".join(f"{1000 * extent:.0f}" for extent in body.extents_m())
+        numbers = f"{size:>14} mm {1000 * body.mass_kg:>4.0f} g  friction {body.friction}"
+        rests = f"origin {1000 * body.rest_height_m:.0f} mm up"
+        print(f"{name:<11} {numbers}  {rests}  {described.source}")

@@ -71,21 +71,32 @@ class Deploy:
     """ONNX file that `ddgrasp export` wrote."""
     robot: Robot = "sim"
     """sim (the pseudo-real rig) or franka."""
+    host: str = ""
+    """Address of robot franka's control unit; empty takes deploy.franka.host."""
     camera: Camera = "stereo"
-    """stereo (the rig's own), realsense, or replay (a recording)."""
+    """stereo (the rig's own), realsense, replay (a recording), or rig (the FR3 rig at --host)."""
     recording: Path | None = None
     """Recording for camera replay."""
     object_name: str = ""
     """Object on the rig's table; empty takes the first configured one."""
     seconds: float = 6.0
     """How long to run; inf runs until Ctrl-C."""
+    dry_run: bool = False
+    """Everything but the motion: what would be sent is printed and drawn."""
+    yes: bool = False
+    """Move without asking first."""
+    out: Path = Path("runs/deployments")
+    """Folder that every run leaves its report in."""
 
     def run(self) -> None:
-        """Runs the loop until the time is over or Ctrl-C, and prints how it kept time."""
+        """Runs the loop until the time is over, Ctrl-C or a fault, and prints how it kept time."""
         from deploy.session import SessionOptions, deploy, describe
 
         check_objects(self.config.world)
-        options = SessionOptions(self.robot, self.camera, self.recording, self.object_name, self.seconds)
+        options = SessionOptions(
+            self.robot, self.camera, self.recording, self.object_name, self.seconds,
+            dry_run=self.dry_run, yes=self.yes, host=self.host, out=self.out,
+        )  # fmt: skip
         print(describe(deploy(self.config, self.policy, options)))
 
 

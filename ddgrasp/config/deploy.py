@@ -4,12 +4,16 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
 
 from ddgrasp.config.checks import Count, Range, Section, Text
+from ddgrasp.contract import ARMS, PANDA
 from ddgrasp.errors import UserError
 
 StartNoise = Literal["zero", "normal"]
 START_NOISES: tuple[StartNoise, ...] = get_args(StartNoise)
 Robot = Literal["sim", "franka"]
-Camera = Literal["stereo", "realsense", "replay"]
+Camera = Literal["stereo", "realsense", "replay", "rig"]
+ArmName = Literal["fr3", "panda"]
+Kernel = Literal["realtime", "any"]
+ClockName = Literal["machine", "robot"]
 ROBOTS: tuple[Robot, ...] = get_args(Robot)
 CAMERAS: tuple[Camera, ...] = get_args(Camera)
 _Coordinate = Annotated[float, Range(-2, 2)]
@@ -22,10 +26,31 @@ class FrankaConfig(Section, name="deploy.franka"):
 
     host: Text = "172.16.0.2"
     """Address of the robot's control unit."""
+    model: ArmName = "fr3"
+    """Which arm it is, fr3 or panda: its limits hold, and another one that answers is refused."""
+    kernel: Kernel = "realtime"
+    """What this machine must run: a realtime kernel, as an arm that keeps 1 kHz wants, or any."""
     dynamics: Annotated[float, Range(0, 1, above=True)] = 0.2
-    """Share of the arm's velocity, acceleration and jerk limits that it may use."""
+    """Share of the arm's velocity, acceleration and jerk limits that it may use; the safety filter lets no
+    step ask for more."""
+    start_dynamics: Annotated[float, Range(0, 0.3, above=True)] = 0.05
+    """The same for the move to the start pose."""
+    contact_torque_nm: Annotated[float, Range(1, 100)] = 20.0
+    """Torque on any joint at which the arm stops itself."""
+    contact_force_n: Annotated[float, Range(1, 100)] = 30.0
+    """Force at the hand, in newtons, and torque, in newton metres, at which the arm stops itself."""
+    load_kg: Annotated[float, Range(0, 3)] = 0.0
+    """Mass that the arm carries beside its hand, between the fingers. What is grasped need not be known: it
+    must weigh less than the contact force allows."""
     grip_force_n: Annotated[float, Range(0, 140, above=True)] = 20.0
     """Force of the gripper in newtons."""
+
+    @property
+    def speed_rad_s(self) -> tuple[float, ...]:
+        """(7,) the speed that the joints may have: `dynamics` of the slower of this arm and a Panda, within
+        whose limits franky plans whichever arm answers."""
+        slower = map(min, ARMS[self.model].joint_velocity_rad_s, PANDA.joint_velocity_rad_s)
+        return tuple(self.dynamics * limit for limit in slower)
 
 
 @dataclass(frozen=True)
@@ -53,19 +78,29 @@ class DeployConfig(Section, name="deploy"):
     """Where the point between the finger pads may go, robot base frame; 12 mm = fingertips on the table."""
     workspace_upper_m: _Corner = (0.80, 0.45, 0.80)
     """The box's other corner."""
+    arm_lower_m: _Corner = (-0.55, -0.80, 0.0)
+    """Where elbow, forearm, wrist and hand may be: table and walls, robot base frame."""
+    arm_upper_m: _Corner = (0.95, 0.80, 1.30)
+    """That box's other corner."""
     realtime_trials: Count = 3
     """Trials on the machine's own clock, for time keeping (success comes from evaluation.rig_trials)."""
     workers: Annotated[int, Range(1, 1024)] = 2
     """Processes that run simulated-clock trials."""
     film_every: Annotated[int, Range(1, 10000)] = 6
     """Steps between two columns of a trial's film strip."""
+    clock: ClockName = "machine"
+    """Whose time the loop keeps: this machine's, or the robot's own (an arm that may be slower than real)."""
     franka: FrankaConfig = field(default_factory=FrankaConfig)
     realsense: RealSenseConfig = field(default_factory=RealSenseConfig)
 
     def check(self) -> None:
         """See `Section.check`."""
-        if any(low >= high for low, high in zip(self.workspace_lower_m, self.workspace_upper_m, strict=True)):
-            raise UserError(
-                f"deploy.workspace is {self.workspace_lower_m} to {self.workspace_upper_m}; expected the "
-                "lower corner below the upper one in x, y and z."
-            )
+        for name, lower, upper in (
+            ("workspace", self.workspace_lower_m, self.workspace_upper_m),
+            ("arm", self.arm_lower_m, self.arm_upper_m),
+        ):
+            if any(low >= high for low, high in zip(lower, upper, strict=True)):
+                raise UserError(
+                    f"deploy.{name} is {lower} to {upper}; expected the lower corner below the upper one in "
+                    "x, y and z."
+                )

@@ -1,12 +1,13 @@
 """A Franka arm through franky (`pip install -e '.[franka]'`).
 
-Written against franky-control 2.0's documented API and tried against franky-sim, a simulator that
-speaks the arm's network protocol; it has not been run on an arm by us. Keep the emergency stop in
-your hand, and start with a small `dynamics`.
+Written against franky-control 2.0 and tested against franky-sim, which speaks the arm's network protocol
+(rig/fr3); it has not been run on an arm by us. docs/hardware.md says how to begin. Keep the
+stop in your hand.
 """
 
+import contextlib
 import importlib
-import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,25 +15,28 @@ import numpy as np
 from jaxtyping import Float
 
 from ddgrasp import contract
+from ddgrasp.config.deploy import FrankaConfig
 from ddgrasp.errors import UserError
+from deploy import kinematics
+from deploy.devices import franka_faults
+from deploy.devices.franka_hand import FrankaHand
+from deploy.devices.franka_probe import check_arm
 from deploy.devices.options import Setup
-from deploy.interfaces import Clock, RobotState
+from deploy.interfaces import Clock, RobotError, RobotState
+from mjx_envs.scene import HOME_RAD
 
-GRIPPER_SPEED_M_S = 0.1
-GRASP_ANY_WIDTH_M = contract.GRIPPER_MAX_WIDTH_M
-"""franky's outer tolerance: a grasp of any width counts, as in simulation."""
-WIDTH_PERIOD_S = 0.03
+AT_START_RAD = 0.01
+"""No joint further than this from the start pose: the arm is there."""
+START_S = 120.0
+RECOVERY_S = 0.5
+"""Until the arm's state says that an error is gone."""
+_POLL_S = 0.01
 
 
 def make(setup: Setup) -> "FrankaRobot":
     """The configured arm, not connected yet."""
-    config = setup.config.deploy.franka
-    return FrankaRobot(
-        config.host,
-        setup.clock,
-        dynamics=config.dynamics,
-        grip_force_n=config.grip_force_n,
-    )
+    confirm = None if setup.options.dry_run else setup.confirm
+    return FrankaRobot(setup.config.deploy.franka, setup.clock, confirm, setup.say)
 
 
 class FrankaRobot:
@@ -40,135 +44,194 @@ class FrankaRobot:
 
     def __init__(
         self,
-        host: str,
+        config: FrankaConfig,
         clock: Clock,
-        *,
-        dynamics: float = 0.2,
-        grip_force_n: float = 20.0,
-        realtime: bool = True,
+        confirm: Callable[[str], None] | None,
+        say: Callable[[str], None] = lambda text: None,
     ):
-        """`dynamics` in (0, 1] scales the arm's velocity, acceleration and jerk limits.
-
-        `realtime` insists on a real-time kernel, as a real arm needs; a simulated one does not.
-        """
-        if not 0.0 < dynamics <= 1.0:
-            raise UserError(f"deploy.franka.dynamics is {dynamics}; expected above 0 and at most 1.")
-        self._host, self._clock = host, clock
-        self._dynamics, self._grip_force_n, self._realtime = dynamics, grip_force_n, realtime
+        """`confirm` is called with a question before anything moves, and raises UserError if the answer is
+        no; without it `start` moves nothing. `say` is told what `start` does."""
+        self._config, self._clock = config, clock
+        self._confirm, self._say = confirm, say
+        self._limits = contract.ARMS[config.model]
         self._arm: Any = None
-        self._hand: _Hand | None = None
-        self._holding = False
+        self._hand: FrankaHand | None = None
+        self._errors: tuple[type[Exception], ...] = ()
+        self._lost_by: tuple[type[Exception], ...] = ()
+        self._holding = self._moved = self._faulted = False
 
     def start(self) -> None:
-        """Connect to arm and gripper. Raises UserError."""
-        franky = self._franky = _franky()
+        """Connect, check which arm answers, clear its errors, set its limits, then move it to the start pose.
+
+        Raises UserError.
+        """
+        franky = self._franky = load_franky()
+        check_arm(self._config.host, self._config.model)
+        # A socket that breaks comes through libfranka as a bare RuntimeError ("Net Exception").
+        self._errors = (franky.Exception, franky.GripperException, RuntimeError)
+        self._lost_by = (franky.NetworkException, RuntimeError)
+        self._holding = self._moved = self._faulted = False
+        config = self._config
+        realtime = franky.RealtimeConfig
+        kernel = realtime.Enforce if config.kernel == "realtime" else realtime.Ignore
         try:
-            kernel = franky.RealtimeConfig.Enforce if self._realtime else franky.RealtimeConfig.Ignore
-            arm = franky.Robot(self._host, relative_dynamics_factor=self._dynamics, realtime_config=kernel)
-            arm.recover_from_errors()
-            self._hand = _Hand(franky.Gripper(self._host), franky.Exception, self._grip_force_n)
-        except franky.Exception as error:
-            raise UserError(
-                f"no Franka at {self._host!r} ({error}): unlock the joints, activate FCI in Desk and check "
-                "deploy.franka.host."
-            ) from error
-        self._arm = arm
+            self._arm = franky.Robot(
+                config.host, relative_dynamics_factor=config.dynamics, realtime_config=kernel
+            )
+            self._prepare()
+            gripper = franky.Gripper(config.host)
+            if self._confirm is not None:
+                self._go_to_start(gripper)
+            self._hand = FrankaHand(gripper, self._errors, config.grip_force_n)
+        except self._errors as error:
+            if self._moved:
+                raise UserError(f"on the way to the start pose {self._fault(error)}.") from error
+            raise UserError(franka_faults.no_connection(franky, config.host, config.model, error)) from error
 
     def read_state(self) -> RobotState:
-        """Joints as of now; the width as the gripper last reported it. Raises what stopped the gripper."""
+        """Joints as of now; the width as the gripper last reported it. Raises RobotError."""
         assert self._hand is not None
-        q = np.asarray(self._arm.state.q, float)
-        return RobotState(q, self._hand.width_m(), self._clock.now())
+        with self._reporting():
+            self._arm.poll_motion()  # raises what stopped the last motion (a reflex, a limit)
+            return RobotState(np.asarray(self._arm.state.q, float), self._hand.width_m(), self._clock.now())
 
     def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
-        """Set the (7,) joint target, pre-empting the last, and the gripper. Raises what stopped the last."""
+        """Set the (7,) joint target, pre-empting the last, and the gripper. Raises RobotError."""
         assert self._hand is not None
-        joints = [float(q) for q in q_target_rad]
-        self._move(self._franky.JointMotion(joints, return_when_finished=False))
+        with self._reporting():
+            self._move(self._to(q_target_rad, return_when_finished=False))
+            self._hand.set(close)
         self._holding = False
-        self._hand.set(close)
 
     def hold(self) -> None:
-        """Brake as fast as the limits allow, then stay: once, since asking again would restart the stop."""
-        if not self._holding:
-            self._move(self._franky.JointStopMotion())
+        """Brake as fast as the limits allow, then stay: once, since asking again would restart the stop.
+
+        Raises RobotError.
+        """
+        if not self._holding and self._moved and not self._faulted:
+            with self._reporting():
+                self._move(self._franky.JointStopMotion())
         self._holding = True
 
     def stop(self) -> None:
-        """Brake along a planned stop, wait for it, let go of the connection. The gripper keeps its grip."""
+        """Brake along a planned stop, wait for it, let go of the connection. The gripper keeps its grip.
+
+        Raises RobotError if the arm did not stop by itself before and cannot be told to.
+        """
         hand, self._hand = self._hand, None
         if hand is not None:
             hand.stop()
-        arm, self._arm = self._arm, None
-        if arm is None:
-            return
         try:
-            arm.move(self._franky.JointStopMotion())
-        except self._franky.Exception:
-            arm.stop()
-            raise
+            if self._arm is not None and self._moved and not self._faulted:
+                with self._reporting():
+                    self._arm.move(self._franky.JointStopMotion())
+        finally:
+            self._arm = None
+
+    def time_s(self) -> float | None:
+        """See TimedRobot: the arm's own clock; None once the arm has failed."""
+        if self._arm is None or self._faulted:
+            return None
+        with self._reporting():
+            return float(self._arm.state.time.to_sec())
+
+    def _prepare(self) -> None:
+        """Errors cleared, contact thresholds, load, and no limit above the arm's own. UserError."""
+        arm, config = self._arm, self._config
+        if arm.state.robot_mode == self._franky.RobotMode.UserStopped:
+            raise UserError(
+                f"the arm at {config.host!r} is stopped by a person: release the stop, try again."
+            )
+        stood = franka_faults.names(RuntimeError(repr(arm.state.current_errors)))
+        if not self._recover():
+            raise UserError(
+                f"the arm at {config.host!r} does not recover from {', '.join(stood) or 'its error'}: "
+                "look at it, clear the error in Desk, try again."
+            )
+        if stood:
+            self._say(f"recovered from {', '.join(stood)}")
+        arm.set_collision_behavior(config.contact_torque_nm, config.contact_force_n)
+        arm.set_load(config.load_kg, [0.0, 0.0, kinematics.GRIP_D_M], [0.0] * 9)
+        for limit, own in (
+            (arm.joint_velocity_limit, self._limits.joint_velocity_rad_s),
+            (arm.joint_acceleration_limit, self._limits.joint_acceleration_rad_s2),
+        ):
+            limit.set(np.minimum(limit.get(), own))
+
+    def _go_to_start(self, gripper: Any) -> None:
+        """Gripper homed and open, the arm at the start pose; a person is asked before either moves."""
+        assert self._confirm is not None
+        away_rad = float(np.max(np.abs(np.asarray(self._arm.state.q) - HOME_RAD)))
+        self._confirm(
+            f"The {self._limits.name} at {self._config.host} will home its gripper and move to the start "
+            f"pose ({away_rad:.2f} rad away) at {self._config.start_dynamics:.0%} of its speed. "
+            "Is the way clear?"
+        )
+        self._moved = True
+        self._say("homing the gripper")
+        gripper.homing()
+        if away_rad > AT_START_RAD:
+            self._say("moving to the start pose")
+            slower = min(1.0, self._config.start_dynamics / self._config.dynamics)
+            self._arm.move(self._to(np.array(HOME_RAD), relative_dynamics_factor=slower), asynchronous=True)
+            self._wait_at_start()
+
+    def _wait_at_start(self) -> None:
+        """Until the joints are there. Raises UserError if they are not in `START_S` of the arm's time."""
+        begun_s = self._arm.state.time.to_sec()
+        while True:
+            self._arm.poll_motion()
+            state = self._arm.state
+            if np.max(np.abs(np.asarray(state.q) - HOME_RAD)) <= AT_START_RAD:
+                return
+            if state.time.to_sec() - begun_s > START_S:
+                raise UserError(f"the arm is not at its start pose after {START_S:g} s: see what holds it.")
+            time.sleep(_POLL_S)
+
+    def _to(self, q_target_rad: Float[np.ndarray, "7"], **options: Any) -> Any:
+        return self._franky.JointMotion([float(q) for q in q_target_rad], **options)
 
     def _move(self, motion: Any) -> None:
-        self._arm.poll_motion()  # raises what stopped the last motion (a reflex, a limit)
+        self._arm.poll_motion()
+        self._moved = True
         self._arm.move(motion, asynchronous=True)
 
-
-class _Hand:
-    """The gripper, asked and told in threads of its own.
-
-    It answers over the network, and a command waits for the end of the one before: both take too
-    long for a control period.
-    """
-
-    def __init__(self, gripper: Any, error_class: type[Exception], force_n: float):
-        self._gripper, self._error_class, self._force_n = gripper, error_class, force_n
-        self._width_m = float(gripper.width)
-        self._wish: bool | None = None
-        self._changed, self._stopping = threading.Event(), threading.Event()
-        self._error: Exception | None = None
-        for work in (self._watch, self._act):
-            threading.Thread(target=self._guard, args=(work,), daemon=True).start()
-
-    def width_m(self) -> float:
-        """As the gripper last reported it. Raises what stopped it."""
-        if self._error is not None:
-            raise self._error
-        return self._width_m
-
-    def set(self, close: bool) -> None:
-        """Close or open, once the motion under way has ended; the newest wish counts."""
-        if close != self._wish:
-            self._wish = close
-            self._changed.set()
-
-    def stop(self) -> None:
-        """End both threads, after what they are at; the gripper keeps its grip."""
-        self._stopping.set()
-        self._changed.set()
-
-    def _guard(self, work: Callable[[], None]) -> None:
+    @contextlib.contextmanager
+    def _reporting(self):
         try:
-            while not self._stopping.is_set():
-                work()
-        except self._error_class as error:
-            self._error = error
+            yield
+        except self._errors as error:
+            raise RobotError(self._fault(error)) from error
 
-    def _watch(self) -> None:
-        self._width_m = float(self._gripper.width)
-        self._stopping.wait(WIDTH_PERIOD_S)
+    def _fault(self, error: Exception) -> str:
+        """What happened and how the arm stands now, in one line; it is not told to move again."""
+        self._faulted = True
+        if isinstance(error, self._lost_by):
+            return self._lost(error)
+        if isinstance(error, self._franky.GripperException):
+            return f"the gripper failed: {franka_faults.one_line(error)}"
+        try:
+            recovered = self._recover()
+        except self._lost_by:
+            return self._lost(error)
+        except self._errors as trouble:
+            return f"{franka_faults.describe(error)}; no recovery: {franka_faults.one_line(trouble)}"
+        after = "recovered, the arm stands" if recovered else "not recovered: look at it and clear it in Desk"
+        return f"the arm stopped itself: {franka_faults.describe(error)}; {after}"
 
-    def _act(self) -> None:
-        self._changed.wait()
-        self._changed.clear()
-        if self._stopping.is_set():
-            return
-        if self._wish:
-            self._gripper.grasp(0.0, GRIPPER_SPEED_M_S, self._force_n, epsilon_outer=GRASP_ANY_WIDTH_M)
-        else:
-            self._gripper.open(GRIPPER_SPEED_M_S)
+    def _recover(self) -> bool:
+        """Whether the arm is free of errors after automatic error recovery."""
+        if not self._arm.recover_from_errors():
+            time.sleep(RECOVERY_S)  # the state it looked at may be older than the recovery
+        return not self._arm.has_errors
+
+    def _lost(self, error: Exception) -> str:
+        said = franka_faults.one_line(error)
+        return f"the connection to {self._config.host} is lost ({said}): the arm stands by itself"
 
 
-def _franky() -> Any:
+def load_franky() -> Any:
+    """The library. Raises UserError with the remedy where it is absent."""
     try:
         return importlib.import_module("franky")
     except ImportError as error:

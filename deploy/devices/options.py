@@ -1,5 +1,6 @@
 """What a session asks for, and what every device is made from."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +16,22 @@ class SessionOptions:
     robot: str = "sim"
     """sim (the pseudo-real rig) or franka."""
     camera: str = "stereo"
-    """stereo (the rig's own camera), realsense, or replay (a recording; the robot acts on old pictures)."""
+    """stereo (the rig's own camera), realsense, replay (a recording; the robot acts on old pictures), or rig
+    (what stands around the FR3 rig that runs at the robot's host)."""
     recording: Path | None = None
     """Recording for camera replay."""
     object_name: str = ""
     """Object on the rig's table; empty takes the first configured one."""
     seconds: float = 6.0
     """How long to run; inf runs until Ctrl-C."""
+    dry_run: bool = False
+    """Everything but the motion: what would be sent is said and drawn."""
+    yes: bool = False
+    """Move without asking first."""
+    host: str = ""
+    """Address of the robot's control unit; empty takes deploy.franka.host."""
+    out: Path = Path("runs/deployments")
+    """Folder that every run leaves its report in."""
 
 
 @dataclass(frozen=True)
@@ -33,3 +43,7 @@ class Setup:
     info: PolicyMetadata
     """The policy's: rate, picture size, depth type."""
     clock: Clock
+    confirm: Callable[[str], None] = lambda question: None
+    """Called with a question before a device moves by itself; raises UserError if a person says no."""
+    say: Callable[[str], None] = lambda text: None
+    """Told what a device does before the loop begins."""

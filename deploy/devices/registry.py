@@ -6,7 +6,7 @@ A new device is a file beside this one with its class and a `make`, and a line h
 from collections.abc import Callable, Mapping
 
 from ddgrasp.errors import UserError, unknown_name
-from deploy.devices import franka_robot, realsense_camera, replay_camera, rig_camera, rig_robot
+from deploy.devices import fr3_camera, franka_robot, realsense_camera, replay_camera, rig_camera, rig_robot
 from deploy.devices.options import SessionOptions, Setup
 from deploy.interfaces import Camera, Robot
 
@@ -15,12 +15,14 @@ CAMERAS: Mapping[str, Callable[[Setup, Robot], Camera]] = {
     "stereo": rig_camera.make,
     "realsense": realsense_camera.make,
     "replay": replay_camera.make,
+    "rig": fr3_camera.make,
 }
 REFUSED: Mapping[tuple[str, str], str] = {
     ("franka", "stereo"): "camera 'stereo' sees the simulated rig alone, not robot 'franka': "
     "use --camera realsense.",
     ("franka", "replay"): "camera 'replay' shows the past: robot 'franka' would move blindly; "
     "use --camera realsense.",
+    ("sim", "rig"): "camera 'rig' sees the FR3 rig, not robot 'sim': use --camera stereo, or --robot franka.",
 }
 """(robot, camera) that make no sense together, and why; all others do."""
 

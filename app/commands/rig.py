@@ -1,0 +1,32 @@
+"""ddgrasp rig: the test rig's simulated arm, to be driven as one drives a real arm."""
+
+import time
+from dataclasses import dataclass
+from typing import Annotated
+
+from ddgrasp.config.checks import Range, Seed
+
+
+@dataclass(frozen=True)
+class RigFr3:
+    """Serve an FR3 with table, wall, clutter and one object on this machine, until Ctrl-C."""
+
+    object_name: str = "cube"
+    """What lies on the table."""
+    host: str = "127.0.0.1"
+    """Address of this machine to listen on: ports 1337 to 1339."""
+    seed: Seed = 0
+    """Where object and clutter stand."""
+    speed: Annotated[float, Range(0, 1, above=True)] = 1.0
+    """Largest share of real time."""
+
+    def run(self) -> None:
+        """Serves, and says how to drive it."""
+        from rig.fr3.process import Fr3Rig
+        from rig.fr3.scene import primitive
+
+        with Fr3Rig(self.host, primitive(self.object_name), self.seed, self.speed) as rig:
+            drive = f"ddgrasp deploy --policy FILE.onnx --robot franka --host {self.host} --camera rig"
+            print(f"FR3 at {self.host} before {self.object_name!r}. Drive it: {drive}", flush=True)
+            while rig.running():
+                time.sleep(0.2)

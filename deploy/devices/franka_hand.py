@@ -1,0 +1,83 @@
+"""The Franka Hand, asked and told in threads of its own."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from ddgrasp import contract
+
+SPEED_M_S = 0.1
+GRASP_ANY_WIDTH_M = contract.GRIPPER_MAX_WIDTH_M
+"""franky's outer tolerance: a grasp of any width counts, as in simulation."""
+WIDTH_PERIOD_S = 0.03
+
+
+class FrankaHand:
+    """Opens and closes while the arm moves.
+
+    The gripper answers over the network, and a command waits for the end of the one before: both take too
+    long for a control period.
+    """
+
+    def __init__(self, gripper: Any, errors: tuple[type[Exception], ...], force_n: float):
+        """`errors` are what the gripper may raise."""
+        self._gripper, self._errors, self._force_n = gripper, errors, force_n
+        self._width_m = float(gripper.width)
+        self._wish: bool | None = None
+        self._busy = False
+        self._changed, self._stopping = threading.Event(), threading.Event()
+        self._error: Exception | None = None
+        for work in (self._watch, self._act):
+            threading.Thread(target=self._guard, args=(work,), daemon=True).start()
+
+    def width_m(self) -> float:
+        """As the gripper last reported it. Raises what stopped it."""
+        if self._error is not None:
+            raise self._error
+        return self._width_m
+
+    def set(self, close: bool) -> None:
+        """Close or open. A motion that is not wished any more is stopped; the newest wish counts."""
+        if close == self._wish:
+            return
+        self._wish = close
+        self._changed.set()
+        if self._busy:
+            threading.Thread(target=self._guard_once, args=(self._gripper.stop,), daemon=True).start()
+
+    def stop(self) -> None:
+        """End both threads, after what they are at; the gripper keeps its grip."""
+        self._stopping.set()
+        self._changed.set()
+
+    def _guard(self, work: Callable[[], None]) -> None:
+        while not self._stopping.is_set() and self._error is None:
+            self._guard_once(work)
+
+    def _guard_once(self, work: Callable[[], Any]) -> None:
+        try:
+            work()
+        except self._errors as error:
+            if self._error is None and not self._stopping.is_set():
+                self._error = error
+
+    def _watch(self) -> None:
+        self._width_m = float(self._gripper.width)
+        self._stopping.wait(WIDTH_PERIOD_S)
+
+    def _act(self) -> None:
+        self._changed.wait()
+        self._changed.clear()
+        if self._stopping.is_set():
+            return
+        self._busy = True
+        try:
+            if self._wish:
+                self._gripper.grasp(0.0, SPEED_M_S, self._force_n, epsilon_outer=GRASP_ANY_WIDTH_M)
+            else:
+                self._gripper.open(SPEED_M_S)
+        except self._errors:
+            if not self._changed.is_set():  # not stopped by `set`: the gripper's own trouble
+                raise
+        finally:
+            self._busy = False

@@ -1,0 +1,50 @@
+"""The rig's side channel: the scene, its true state, and what a person beside an arm can do to it.
+
+One line of JSON asks, one answers. The loop, the driver and the safety filter never see it: it is for the
+rig's camera, for judging success and for the tests.
+"""
+
+import json
+import socket
+from typing import Any
+
+from ddgrasp.errors import UserError
+
+PORT = 1339
+"""Beside the protocol's own: 1337 is the robot's, 1338 the gripper's."""
+CONNECT_S, ANSWER_S = 2.0, 20.0
+
+
+class ChannelLost(Exception):
+    """The rig does not answer any more."""
+
+
+class Channel:
+    """A connection to a running rig. Raises UserError if there is none at `host`."""
+
+    def __init__(self, host: str):
+        try:
+            self._socket = socket.create_connection((host, PORT), CONNECT_S)
+        except OSError as error:
+            raise UserError(
+                f"no FR3 rig at {host!r} ({error.strerror or error}): start one, "
+                f"`ddgrasp rig fr3 --host {host}`."
+            ) from error
+        self._socket.settimeout(ANSWER_S)
+        self._file = self._socket.makefile("rw")
+
+    def ask(self, what: str, **values: Any) -> dict[str, Any]:
+        """The answer to one request; see `rig.fr3.serve.Rig.answer`. Raises ChannelLost."""
+        try:
+            self._file.write(json.dumps({"ask": what, **values}) + "\n")
+            self._file.flush()
+            line = self._file.readline()
+        except OSError as error:
+            raise ChannelLost(f"the FR3 rig does not answer ({error})") from error
+        if not line:
+            raise ChannelLost("the FR3 rig has gone")
+        return json.loads(line)
+
+    def close(self) -> None:
+        """Ends the connection."""
+        self._socket.close()
