@@ -26,13 +26,6 @@ CONFIG = Config(
 )
 
 
-@pytest.fixture(autouse=True)
-def compiles_quickly():
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def _checkpoints(directory) -> Checkpoints:
     return Checkpoints(directory / ppo_train.CHECKPOINTS)
 

@@ -96,9 +96,14 @@ class ReflexServer(FrankaRobotServer):
         self._post_process_commands()
 
     @property
+    def contact_torque_nm(self) -> tuple[float, ...]:
+        """(7,) N m that contacts exert on the joints, filtered; what the thresholds are compared with."""
+        return tuple(self._torque_nm.tolist())
+
+    @property
     def robot_state(self) -> FrankaRobotState:
         """See franky-sim; with the contact torque and the error that stands."""
-        state = super().robot_state.replace(tau_ext_hat_filtered=tuple(self._torque_nm))
+        state = super().robot_state.replace(tau_ext_hat_filtered=self.contact_torque_nm)
         if self.error is None:
             return state
         flags = tuple(index == self.error for index in range(_ERRORS))

@@ -56,6 +56,7 @@ class Rig:
     def run(self, stop: threading.Event) -> None:
         """Serves until `stop` is set. Raises OSError if a port is taken."""
         with self._sim, self._server:
+            self._tick()  # whoever asks finds an arm that has a state
             with _listen(self._options.host, self.request):
                 print(json.dumps({"ready": self._options.host}), flush=True)
                 while not stop.is_set():
@@ -108,7 +109,7 @@ class Rig:
             "object_quat": body.xquat.tolist(),
             "error": server.error,
             "in_motion": bool(server.current_motion_id),
-            "contact_torque_nm": server.robot_state.tau_ext_hat_filtered,
+            "contact_torque_nm": server.contact_torque_nm,
         }
 
     def _place(self, x_m: float, y_m: float, yaw_rad: float) -> dict[str, Any]:
