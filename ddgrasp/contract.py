@@ -127,6 +127,11 @@ class CameraProfile:
         )
 
     @property
+    def nearest_m(self) -> float:
+        """Nearest surface that a D4xx whose stream is this profile reports: where the search ends."""
+        return self.fx_px * self.baseline_m / D4XX_SEARCH_PX
+
+    @property
     def crop_origin_px(self) -> tuple[int, int]:
         """(row, column) of the centred crop window's first pixel."""
         return (
@@ -148,6 +153,13 @@ D455 = CameraProfile(
     crop_width_px=580,
 )
 """RealSense D455 depth stream: 87 degrees horizontal field of view, 95 mm baseline (datasheet)."""
+
+D455_STREAM = replace(D455.scaled(2 / 3), width_px=848, cx_px=424.0)
+"""The mode in which a D455 is run, 848 x 480 (its 853 columns less five): it sees from 0.34 m on. At
+1280 x 720 that is 0.51 m, and the object is lifted to 0.41 m; at 640 x 360 it is 0.25 m, with a third more
+noise, since a pixel of disparity is worth more."""
+D4XX_SEARCH_PX = 126
+"""Disparities that a D4xx's matcher searches, at every resolution (RealSense's tuning guide)."""
 
 CAMERA_POSITION_M = (0.94, 0.0, 0.56)
 CAMERA_LOOK_AT_M = (0.48, 0.0, 0.05)

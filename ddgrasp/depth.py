@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Real, Shaped, UInt16
 
 from ddgrasp.arrays import AnyArray
-from ddgrasp.contract import DEPTH_UNIT_M
+from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
 
 MAX_MM = 65535
 """The farthest depth that fits: 65.535 m."""
@@ -85,6 +85,26 @@ def crop_nearest(
     (height, width), (rows, columns) = maps.shape[-2:], size
     had, n = (height, rows) if height * columns <= width * rows else (width, columns)
     return maps[..., _under_centres(height, rows, had, n)[:, None], _under_centres(width, columns, had, n)]
+
+
+def at_profile(
+    maps: Shaped[np.ndarray, "*b H W"], had: CameraProfile, wanted: CameraProfile
+) -> Shaped[np.ndarray, "*b {wanted.height_px} {wanted.width_px}"]:
+    """(..., H, W) of the camera `had` to what `wanted` would have seen from the same place, in NumPy.
+
+    Each pixel is the one of `had` that its ray goes through; 0 where there is none. Nothing is interpolated.
+    """
+    rows = _under_rays(wanted.height_px, wanted.fy_px, wanted.cy_px, had.fy_px, had.cy_px)
+    columns = _under_rays(wanted.width_px, wanted.fx_px, wanted.cx_px, had.fx_px, had.cx_px)
+    seen = ((rows >= 0) & (rows < had.height_px))[:, None] & ((columns >= 0) & (columns < had.width_px))
+    taken = maps[..., rows.clip(0, had.height_px - 1)[:, None], columns.clip(0, had.width_px - 1)]
+    return np.where(seen, taken, maps.dtype.type(0))
+
+
+def _under_rays(out: int, focal_px: float, middle_px: float, had_focal_px: float, had_middle_px: float):
+    """(out,) pixels of an axis, floor(f' (i + 1/2 - c) / f + c'), possibly outside the picture."""
+    at = (np.arange(out) + 0.5 - middle_px) * (had_focal_px / focal_px) + had_middle_px
+    return np.floor(at).astype(int)
 
 
 def _under_centres(length: int, out: int, had: int, n: int) -> np.ndarray:

@@ -118,7 +118,9 @@ class SafetyFilter:
         limited = np.clip(step, self._last_step_rad - change, self._last_step_rad + change)
         step = self._noted(limited, step, "joint_acceleration", causes)
         largest = np.array(limits.velocity_rad_s) * dt
-        step = self._noted(np.clip(step, -largest, largest), step, "joint_velocity", causes)
+        # All joints alike: the hand goes where it was told to, more slowly.
+        slower = min(1.0, float((largest / np.maximum(np.abs(step), 1e-9)).min()))
+        step = self._noted(step if slower == 1.0 else slower * step, step, "joint_velocity", causes)
         # A joint measured outside its range may only come back, and no faster than the limit above.
         room_down = np.minimum(np.array(limits.lower_rad) - q_rad, largest)
         room_up = np.maximum(np.array(limits.upper_rad) - q_rad, -largest)

@@ -85,7 +85,7 @@ def _for_devices(config: Config, options: SessionOptions) -> Config:
     section = config.deploy
     if options.host:
         section = replace(section, franka=replace(section.franka, host=options.host))
-    if options.camera == "rig":
+    if options.camera in ("rig", "rig-ideal"):
         section = replace(section, clock="robot", franka=replace(section.franka, kernel="any"))
     return replace(config, deploy=section)
 

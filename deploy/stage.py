@@ -1,10 +1,7 @@
 """Stage `deploy`: the exported student in the pseudo-real rig at 10 Hz."""
 
 import hashlib
-import json
-import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +9,12 @@ from ddgrasp import artifacts, contract, upgrades
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_bytes, atomic_write_text
+from ddgrasp.files import atomic_write_bytes
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
 from deploy.policy import POLICY_FILE
 from deploy.timing import Timings
+from deploy.trial_log import TrialLog
 from deploy.trials import TrialResult, plan, run_trials
 from rig.film import Film, contact_sheet
 
@@ -65,56 +63,6 @@ def metrics(results: Sequence[TrialResult]) -> dict[str, Any]:
         "realtime_trials": _success(real),
         **_timings(real or simulated).summary(contract.CONTROL_DT_S),
     }
-
-
-class TrialLog:
-    """Finished trials on disk, one JSON line each behind a header; a torn last line is dropped."""
-
-    def __init__(self, path: Path, header: dict[str, Any], earlier: Sequence[dict[str, Any]] = ()):
-        """Read what is there. Raises UserError if it belongs to another policy or configuration.
-
-        Args:
-            header: what the trials belong to: the policy and the configuration.
-            earlier: the same as earlier versions wrote it.
-        """
-        self._path = path
-        self.results: dict[tuple[int, bool], TrialResult] = {}
-        lines = _complete_lines(path)
-        if lines and lines[0] not in (header, *earlier):
-            raise UserError(
-                f"{path} holds trials of another policy or configuration: delete {path.parent} to start "
-                "them anew, or choose another --out."
-            )
-        for line in lines[1:]:
-            result = TrialResult(**line)
-            self.results[result.key] = result
-        # Written anew, so that the next line starts on a line of its own.
-        text = "".join(_line(value) for value in [header, *map(asdict, self.results.values())])
-        atomic_write_text(path, text)
-
-    def append(self, result: TrialResult) -> None:
-        """Add a finished trial; it is on the disk when this returns."""
-        self.results[result.key] = result
-        with open(self._path, "a") as file:
-            file.write(_line(asdict(result)))
-            file.flush()
-            os.fsync(file.fileno())
-
-
-def _line(value: dict[str, Any]) -> str:
-    return json.dumps(value, allow_nan=False) + "\n"
-
-
-def _complete_lines(path: Path) -> list[dict[str, Any]]:
-    if not path.exists():
-        return []
-    lines = []
-    for text in path.read_text(errors="replace").splitlines():
-        try:
-            lines.append(json.loads(text))
-        except json.JSONDecodeError:
-            break
-    return lines
 
 
 def _header(config: Config, policy_path: Path) -> dict[str, Any]:

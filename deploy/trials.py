@@ -1,14 +1,16 @@
 """Trials of an exported policy in the pseudo-real rig, through the very loop that would drive a robot."""
 
+import atexit
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import UInt8
@@ -70,13 +72,26 @@ def plan(config: Config) -> list[Trial]:
     return simulated + real
 
 
+class Bench(Protocol):
+    """Somewhere to try a policy."""
+
+    def run(self, trial: Trial) -> tuple[TrialResult, Film]:
+        """One trial."""
+        ...
+
+    def close(self) -> None:
+        """Lets go of everything."""
+        ...
+
+
 class Rig:
     """World, camera and policy, built once and used for one trial after the other."""
 
-    def __init__(self, config: Config, policy_path: Path):
+    def __init__(self, config: Config, policy_path: Path, ideal: bool = False):
+        """`ideal` looks through a camera without errors instead of the stereo camera."""
         import cv2
 
-        from rig.camera import make_camera
+        from rig.camera import IdealCamera, make_camera
         from rig.world import make_world
 
         cv2.setNumThreads(1)
@@ -85,7 +100,11 @@ class Rig:
             policy_path, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None
         )
         self._world = make_world(config.world)
-        self._camera = make_camera(config, self._world)
+        self._camera = (
+            IdealCamera(self._world.model, config.record.stereo, config.world.profile)
+            if ideal
+            else make_camera(config, self._world)
+        )
 
     def run(self, trial: Trial) -> tuple[TrialResult, Film]:
         """Run one trial. The same trial gives the same result on the simulated clock."""
@@ -103,31 +122,44 @@ class Rig:
         )
         safety = safety_filter(config.deploy, self._policy.info)
         loop = ControlLoop(camera, robot, self._policy, safety, clock, settings)
-        filming = _Filming(camera, config.deploy.film_every)
+        filming = Filming(camera, config.deploy.film_every)
         # Drawing for people takes the time of a period: not while time is measured.
         report = loop.run(config.world.episode_steps, None if trial.realtime else filming.look)
         if report.interrupted:
             raise KeyboardInterrupt
         robot.catch_up()
-        return _result(trial, bool(self._world.success()), report), filming.film()
+        return result(trial, bool(self._world.success()), report), filming.film()
+
+    def close(self) -> None:
+        """Nothing to let go of."""
 
 
 def run_trials(
-    config: Config, policy_path: Path, trials: Sequence[Trial], workers: int
+    config: Config,
+    policy_path: Path,
+    trials: Sequence[Trial],
+    workers: int,
+    make: Callable[[Config, Path], Bench] = Rig,
 ) -> Iterator[tuple[TrialResult, Film]]:
-    """Results of `trials` as they come, from `workers` fresh processes (0: all in this one)."""
+    """Results of `trials` as they come, from `workers` fresh processes (0: all in this one).
+
+    `make` makes what every process tries them on.
+    """
     if not trials:
         return
     if workers == 0:
-        rig = Rig(config, policy_path)
-        for trial in trials:
-            yield rig.run(trial)
+        bench = make(config, policy_path)
+        try:
+            for trial in trials:
+                yield bench.run(trial)
+        finally:
+            bench.close()
         return
     executor = ProcessPoolExecutor(
         min(workers, len(trials)),
         mp_context=get_context("spawn"),
         initializer=_start_worker,
-        initargs=(config, policy_path, os.getpid()),
+        initargs=(config, policy_path, make, os.getpid()),
     )
     try:
         for future in as_completed([executor.submit(_run_in_worker, trial) for trial in trials]):
@@ -136,10 +168,18 @@ def run_trials(
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-class _Filming:
+class Filmed(Protocol):
+    """A camera that also takes pictures for people."""
+
+    def picture(self) -> UInt8[np.ndarray, "H W 3"]:
+        """(H, W, 3) uint8 colour."""
+        ...
+
+
+class Filming:
     """Collects a picture every few steps."""
 
-    def __init__(self, camera: StereoCamera, every: int):
+    def __init__(self, camera: Filmed, every: int):
         self._camera, self._every = camera, every
         self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
 
@@ -156,7 +196,8 @@ class _Filming:
         return Film(steps, np.stack(rgb), np.stack(depth))
 
 
-def _result(trial: Trial, success: bool, report: LoopReport) -> TrialResult:
+def result(trial: Trial, success: bool, report: LoopReport) -> TrialResult:
+    """What came of `trial`, from the loop's report and the rig's verdict."""
     timings = report.timings
     seconds: dict[str, Any] = {
         name: [round(value, 6) for value in getattr(timings, name)]
@@ -176,18 +217,20 @@ def _result(trial: Trial, success: bool, report: LoopReport) -> TrialResult:
 
 # --- worker processes --------------------------------------------------------------------------
 
-_rig: Rig | None = None
-_rig_of: tuple[Config, Path]
+_bench: Bench | None = None
+_make_bench: Callable[[], Bench]
 
 
-def _start_worker(config: Config, policy_path: Path, parent: int) -> None:
+def _start_worker(
+    config: Config, policy_path: Path, make: Callable[[Config, Path], Bench], parent: int
+) -> None:
     """Leave Ctrl-C to the parent, and go when the parent has gone."""
     import signal
 
-    global _rig_of
+    global _make_bench
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
-    _rig_of = config, policy_path
+    _make_bench = partial(make, config, policy_path)
 
 
 def _leave_with(parent: int) -> None:
@@ -197,7 +240,9 @@ def _leave_with(parent: int) -> None:
 
 
 def _run_in_worker(trial: Trial) -> tuple[TrialResult, Film]:
-    # The rig is built here, not in the initialiser, so that its errors reach the parent as they are.
-    global _rig
-    _rig = _rig or Rig(*_rig_of)
-    return _rig.run(trial)
+    # The bench is built here, not in the initialiser, so that its errors reach the parent as they are.
+    global _bench
+    if _bench is None:
+        _bench = _make_bench()
+        atexit.register(_bench.close)
+    return _bench.run(trial)

@@ -6,6 +6,7 @@ from jaxtyping import Float, Float64, UInt8, UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import Config, RecordConfig, StereoConfig
+from ddgrasp.depth import to_millimetres
 from mjx_envs import draws, kinematics
 from mjx_envs.camera import Buffers, Camera, look_at, nominal_camera
 from mjx_envs.render.raycast_numpy import render, render_depth
@@ -45,6 +46,20 @@ class RigCamera:
         """(H, W, 3) uint8 colour, aligned to depth."""
         buffers = render(self.model, data, self.stereo.camera(T_world_cam), far_m=FAR_M)
         return np.rint(np.clip(buffers.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+class IdealCamera(RigCamera):
+    """The same camera without errors."""
+
+    def depth_mm(
+        self,
+        data: mujoco.MjData,
+        T_world_cam: Float[np.ndarray, "4 4"],
+        rng: np.random.Generator,
+        object_name: str = "",
+    ) -> UInt16[np.ndarray, "H W"]:
+        """(H, W) uint16 millimetres as rendered."""
+        return to_millimetres(render_depth(self.model, data, self.stereo.camera(T_world_cam), far_m=FAR_M))
 
 
 def make_camera(config: Config, world: RigWorld) -> RigCamera:

@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -77,24 +78,50 @@ def test_loop_over_a_replay_holds_once_the_recording_ends(recording, tmp_path):
     assert report.events[0].reason.startswith("stale frame: the same one again")
 
 
-def test_realsense_takes_the_centre_pixel_of_every_block():
-    camera = RealSenseCamera(SimClock(), contract.D455.scaled(0.25))
-    counts = np.zeros((720, 1280), np.uint16)
-    counts[2::4, 2::4] = np.arange(180 * 320, dtype=np.uint16).reshape(180, 320)
-    depth = camera._convert(counts)
-    assert depth.dtype == np.uint16
-    np.testing.assert_array_equal(depth, counts[2::4, 2::4])
+PROFILE = contract.D455.scaled(0.25)
+
+
+def stream_intrinsics(**changes: float) -> SimpleNamespace:
+    """As librealsense reports the stream: pixel centres are whole numbers."""
+    stream = contract.D455_STREAM
+    nominal = dict(fx=stream.fx_px, fy=stream.fy_px, ppx=stream.cx_px - 0.5, ppy=stream.cy_px - 0.5)
+    return SimpleNamespace(**{**nominal, **changes})
+
+
+def test_realsense_takes_the_pixel_on_every_ray():
+    camera = RealSenseCamera(SimClock(), PROFILE)
+    columns = np.tile(np.arange(848, dtype=np.uint16), (480, 1))
+    depth = camera.convert(columns)
+    assert depth.dtype == np.uint16 and depth.shape == (180, 320)
+    # 320 pixels look as wide as 853: 2 and 2/3 each, 2.5 columns of the widest view are missing on each side
+    np.testing.assert_array_equal(depth[90, [0, 1, 160, 318, 319]], [0, 1, 425, 846, 0])
+    rows = camera.convert(np.tile(np.arange(480, dtype=np.uint16)[:, None], (1, 848)))
+    np.testing.assert_array_equal(rows[[0, 90, 179], 160], [1, 241, 478])
+    camera._stream = camera._checked(stream_intrinsics(ppx=433.5, fy=contract.D455_STREAM.fy_px * 1.05))
+    assert camera.convert(columns)[90, 160] == 435  # another principal point, the same ray
     camera._unit_m = 0.0001  # a device set to a tenth of a millimetre
-    np.testing.assert_array_equal(camera._convert(np.full((720, 1280), 7004, np.uint16)), 700)
+    np.testing.assert_array_equal(camera.convert(np.full((480, 848), 7004, np.uint16))[20:-20, 20:-20], 700)
+
+
+def test_a_d455_sees_where_the_object_is_lifted_to():
+    position, aim = np.array(contract.CAMERA_POSITION_M), np.array(contract.CAMERA_LOOK_AT_M)
+    forward = (aim - position) / np.linalg.norm(aim - position)
+    lifted_m = forward @ (np.array(contract.LIFT_TARGET_M) - position)
+    assert contract.D455_STREAM.nearest_m == pytest.approx(0.339, abs=5e-4)
+    assert contract.D455_STREAM.nearest_m < lifted_m - contract.LIFT_TOLERANCE_M < contract.D455.nearest_m
+    assert get_preset("demo").record.stereo.min_range_m == pytest.approx(
+        contract.D455_STREAM.nearest_m, abs=1e-3
+    )
 
 
 def test_realsense_refuses_what_it_cannot_deliver():
-    with pytest.raises(UserError, match=r"300x169 depth, no whole fraction of 1280x720"):
-        RealSenseCamera(SimClock(), contract.D455.scaled(300 / 1280))
-    camera = RealSenseCamera(SimClock(), contract.D455)
-    camera._check_focal(contract.D455.fx_px * 1.05)
-    with pytest.raises(UserError, match="focal length is 380.0 px"):
-        camera._check_focal(380.0)
+    with pytest.raises(UserError, match=r"1280x720 depth, more than the stream's 848x480"):
+        RealSenseCamera(SimClock(), contract.D455)
+    camera = RealSenseCamera(SimClock(), PROFILE)
+    with pytest.raises(UserError, match=r"camera's fx is 380.0 px, a D455's at 848x480 is 449.6 px"):
+        camera._checked(stream_intrinsics(fx=380.0))
+    with pytest.raises(UserError, match=r"camera's cy is 300.0 px, a D455's at 848x480 is 240.0 px"):
+        camera._checked(stream_intrinsics(ppy=299.5))
 
 
 def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
@@ -111,7 +138,7 @@ def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
 
     clock = SimClock()
     clock.sleep_until(5.0)
-    camera = RealSenseCamera(clock, contract.D455)
+    camera = RealSenseCamera(clock, PROFILE)
     camera._rs = Library
     monkeypatch.setattr("deploy.devices.realsense_camera.time.time", lambda: 1000.0)
     assert camera._exposed_s(DepthFrame()) == pytest.approx(4.96)
@@ -120,7 +147,11 @@ def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
 @pytest.mark.parametrize(
     ("module", "start", "extra"),
     [
-        ("pyrealsense2", lambda: RealSenseCamera(SimClock(), contract.D455).start(), "realsense"),
+        (
+            "pyrealsense2",
+            lambda: RealSenseCamera(SimClock(), PROFILE).start(),
+            "realsense",
+        ),
         ("franky", lambda: FrankaRobot(FrankaConfig(host="127.0.0.1"), SimClock(), None).start(), "franka"),
     ],
 )
@@ -132,7 +163,7 @@ def test_missing_driver_names_the_extra(monkeypatch, module, start, extra):
 
 
 def test_drivers_that_never_started_can_be_stopped():
-    RealSenseCamera(SimClock(), contract.D455).stop()
+    RealSenseCamera(SimClock(), PROFILE).stop()
     FrankaRobot(FrankaConfig(host="127.0.0.1"), SimClock(), None).stop()
     with pytest.raises(UserError, match="franka.dynamics is 1.5"):
         FrankaConfig(dynamics=1.5)
@@ -171,7 +202,8 @@ def test_every_pair_is_refused_or_can_be_made(recording):
                 continue
             made[robot, camera] = registry.make_devices(Setup(preset, options, info, SimClock()))
     assert set(registry.ROBOTS) == set(ROBOTS) and set(registry.CAMERAS) == set(CAMERAS)
-    assert refused == set(registry.REFUSED) == {("franka", "stereo"), ("franka", "replay"), ("sim", "rig")}
+    assert refused == set(registry.REFUSED)
+    assert refused == {("franka", "stereo"), ("franka", "replay"), ("sim", "rig"), ("sim", "rig-ideal")}
     names = {pair: tuple(type(device).__name__ for device in devices) for pair, devices in made.items()}
     assert names == {
         ("sim", "stereo"): ("SimRobot", "StereoCamera"),
@@ -179,6 +211,7 @@ def test_every_pair_is_refused_or_can_be_made(recording):
         ("sim", "replay"): ("SimRobot", "ReplayCamera"),
         ("franka", "realsense"): ("FrankaRobot", "RealSenseCamera"),
         ("franka", "rig"): ("FrankaRobot", "Fr3Camera"),
+        ("franka", "rig-ideal"): ("FrankaRobot", "Fr3Camera"),
     }
     robot, camera = made["sim", "stereo"]
     camera.start()

@@ -254,11 +254,12 @@ def test_limits_are_the_fr3_s_and_the_filter_keeps_them_before_the_arm_would(tmp
         robot.start()
         beyond = robot.read_state().q_rad.copy()
         beyond[3] = contract.PANDA.joint_lower_rad[3]
-        robot.command(beyond, close=False)
         with pytest.raises(RobotError, match="position_limits_violation .*range.*recovered, the arm stands"):
             for _ in range(100):
+                robot.command(beyond, close=False)
                 clock.sleep_until(clock.now() + 0.02)
                 robot.read_state()
+        assert rig.channel.ask("state")["q_rad"][3] > contract.FR3.joint_lower_rad[3]
         robot.stop()
 
 

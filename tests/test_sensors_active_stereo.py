@@ -12,7 +12,8 @@ import pytest
 from ddgrasp.config import RecordConfig, StereoConfig, WorldConfig
 from mjx_envs.camera import Buffers, Camera, nominal_camera
 from rig.camera import RigCamera, jittered_pose
-from sensors.models.active_stereo import ActiveStereo, flatten
+from sensors.models.active_stereo import ActiveStereo
+from sensors.models.matching import flatten
 from sensors.models.materials import Material
 from sensors.statistics import curves, figures, stats
 

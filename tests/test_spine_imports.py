@@ -19,7 +19,7 @@ JAX_FREE = (
     "ddgrasp", "deploy", "evaluation", "ddgrasp.policy_metadata", "mjx_envs.scene", "mjx_envs.objects",
     "mjx_envs.object_spec", "mjx_envs.draws",
     "mjx_envs.render.ray_geometry", "mjx_envs.render.raycast_numpy", "mjx_envs.camera", "rig.world",
-    "sensors.models.active_stereo", "sensors.recordings.recording",
+    "sensors.models.active_stereo", "sensors.models.matching", "sensors.recordings.recording",
     "evaluation.camera_comparison", "sensors.recordings.importers",
     "sensors.recordings.realsense", "sensors.recordings.realsense_live",
 )  # fmt: skip

@@ -23,6 +23,7 @@ from app.commands.rig import RigFr3
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
+from app.commands.trials import DeployTrials
 from ddgrasp.config import Config
 from ddgrasp.presets import get_preset
 from ddgrasp.scaling import scaled
@@ -67,6 +68,7 @@ COMMANDS: dict[str, type] = {
     "student eval": StudentEval,
     "export": Export,
     "deploy": Deploy,
+    "deploy trials": DeployTrials,
     "rig fr3": RigFr3,
     "weights convert": WeightsConvert,
     "weights list": WeightsList,

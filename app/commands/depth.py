@@ -72,9 +72,9 @@ class RecordRealsense:
     """Frames to record; 0 takes --seconds."""
     hz: int = 10
     """Frames kept per second: 1, 2, 3, 5, 6, 10, 15 or 30; the camera itself always runs at 30."""
-    width: int = 1280
+    width: int = contract.D455_STREAM.width_px
     """Columns of depth and colour, in pixels."""
-    height: int = 720
+    height: int = contract.D455_STREAM.height_px
     """Rows of depth and colour, in pixels."""
     serial: str = ""
     """Serial number of the camera; empty takes the first."""

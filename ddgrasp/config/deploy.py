@@ -10,7 +10,7 @@ from ddgrasp.errors import UserError
 StartNoise = Literal["zero", "normal"]
 START_NOISES: tuple[StartNoise, ...] = get_args(StartNoise)
 Robot = Literal["sim", "franka"]
-Camera = Literal["stereo", "realsense", "replay", "rig"]
+Camera = Literal["stereo", "realsense", "replay", "rig", "rig-ideal"]
 ArmName = Literal["fr3", "panda"]
 Kernel = Literal["realtime", "any"]
 ClockName = Literal["machine", "robot"]
@@ -31,8 +31,8 @@ class FrankaConfig(Section, name="deploy.franka"):
     kernel: Kernel = "realtime"
     """What this machine must run: a realtime kernel, as an arm that keeps 1 kHz wants, or any."""
     dynamics: Annotated[float, Range(0, 1, above=True)] = 0.2
-    """Share of the arm's velocity, acceleration and jerk limits that it may use; the safety filter lets no
-    step ask for more."""
+    """Share of the arm's speed limits that it may use; the safety filter lets no step ask for more. Its
+    acceleration is all its own, since an arm that follows late does not stop where the policy thinks."""
     start_dynamics: Annotated[float, Range(0, 0.3, above=True)] = 0.05
     """The same for the move to the start pose."""
     contact_torque_nm: Annotated[float, Range(1, 100)] = 20.0

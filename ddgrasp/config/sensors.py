@@ -1,14 +1,20 @@
 """Models of depth cameras: the rig's own stereo camera and the simpler ones it is compared with."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal, get_args
 
+from ddgrasp import contract
 from ddgrasp.config.checks import Range, Section, Seed, Share, Text
 
 Sensor = Literal["ideal", "dextrah", "kinect", "stereo", "learned"]
 SENSORS: tuple[Sensor, ...] = get_args(Sensor)
 _Window = Annotated[int, Range(1, 255)]
 """Side of a window in pixels."""
+
+
+def odd(side_px: float) -> int:
+    """The odd number nearest to `side_px`: a window that has a middle pixel."""
+    return 2 * round((side_px - 1) / 2) + 1
 
 
 @dataclass(frozen=True)
@@ -39,8 +45,8 @@ class StereoConfig(Section, name="record.stereo"):
     lens_blur_px: Annotated[float, Range(0, 20)] = 0.45
     """Gaussian blur of the lens, pixels."""
     # --- matcher ---
-    min_range_m: Annotated[float, Range(0.05, 100)] = 0.35
-    """Nearer surfaces exceed the disparity search and are invalid."""
+    min_range_m: Annotated[float, Range(0.05, 100)] = round(contract.D455_STREAM.nearest_m, 3)
+    """Nearer surfaces exceed the disparity search and are invalid; of a D455 as it is run."""
     max_range_m: Annotated[float, Range(0.05, 100)] = 6.0
     """Farther depth is reported as invalid."""
     block_px: _Window = 3
@@ -71,6 +77,12 @@ class StereoConfig(Section, name="record.stereo"):
     """Disparity noise that filter takes away, standard deviation: larger relief stays. 0 switches it off."""
     subpixel_steps: Annotated[int, Range(1, 4096)] = 32
     """Disparity is reported in 1/32 of a pixel, as D4xx cameras do."""
+
+    def finer(self, factor: float) -> "StereoConfig":
+        """For pictures of the same camera with `factor` times the pixels per side: larger windows."""
+        sides = ("block_px", "residual_window_px", "refine_window_px", "flat_window_px")
+        windows = {name: odd(getattr(self, name) * factor) for name in sides}
+        return replace(self, **windows, speckle_px=round(self.speckle_px * factor**2))
 
     def check(self) -> None:
         """See `Section.check`."""

@@ -1,36 +1,90 @@
-"""The FR3 rig's camera as a camera driver: an ideal depth camera before the simulated scene."""
+"""The FR3 rig's cameras as camera drivers: a D455 as it is run, and one that makes no errors."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from ddgrasp import contract
+from ddgrasp.config import StereoConfig
+from ddgrasp.depth import to_millimetres
 from deploy.devices.options import Setup
-from deploy.interfaces import CameraError, Clock, Frame, Robot
+from deploy.devices.realsense_camera import RealSenseCamera
+from deploy.interfaces import CameraError, Clock, Depth, Frame, Robot
+from mjx_envs.camera import Camera as Pinhole
 
 if TYPE_CHECKING:
     from rig.fr3.channel import Channel
     from rig.fr3.picture import ScenePicture
 
+Pose = Float[np.ndarray, "4 4"]
+RIG_SCALE = 0.25
+"""`world.camera_scale` at which the configuration's windows were chosen, by the development rig."""
+Sense = Callable[["ScenePicture", Pose, str], Depth]
+"""From the scene as it stands, where the camera is, and the object's name: (H, W) uint16 millimetres."""
+
 
 def make(setup: Setup, robot: Robot) -> "Fr3Camera":
-    """Looks at the rig that runs at the robot's host, from its nominal place within the calibration error."""
-    from rig.camera import camera_pose
+    """A D455 before the rig that runs at the robot's host, at its nominal place within its error."""
+    profile, rng = _profile(setup), np.random.default_rng(setup.config.seed)
+    return _at_place(setup, profile, stereo(setup.config.record.stereo, profile, setup.clock, rng))
 
-    config = setup.config
-    pose = camera_pose(config, np.random.default_rng(config.seed))
-    return Fr3Camera(config.deploy.franka.host, setup.clock, config.world.profile, pose)
+
+def make_ideal(setup: Setup, robot: Robot) -> "Fr3Camera":
+    """A camera without errors at the same place."""
+    profile = _profile(setup)
+    return _at_place(setup, profile, ideal(profile))
+
+
+def stereo(
+    config: StereoConfig,
+    profile: contract.CameraProfile,
+    clock: Clock,
+    rng: np.random.Generator,
+    stream: contract.CameraProfile = contract.D455_STREAM,
+) -> Sense:
+    """Matching at the size of `stream`, then what the RealSense driver does to a frame.
+
+    `profile` is the policy's picture.
+    """
+    from sensors.models.active_stereo import ActiveStereo
+    from sensors.models.materials import rig_materials
+
+    windows = stream.fx_px / contract.D455.scaled(RIG_SCALE).fx_px
+    camera, driver = ActiveStereo(config, stream, windows), RealSenseCamera(clock, profile, stream=stream)
+
+    def sense(picture: "ScenePicture", T_world_cam: Pose, name: str) -> Depth:
+        materials = rig_materials(picture.model, name)
+        return driver.convert(camera.sense(picture.buffers, T_world_cam, rng, materials, picture.depth_m))
+
+    return sense
+
+
+def ideal(profile: contract.CameraProfile) -> Sense:
+    """Rendered depth of the policy's picture."""
+
+    def sense(picture: "ScenePicture", T_world_cam: Pose, name: str) -> Depth:
+        return to_millimetres(picture.depth_m(pinhole(profile, T_world_cam)))
+
+    return sense
 
 
 class Fr3Camera:
-    """Asks the rig where everything is and draws it: uint16 millimetres, 0 = nothing there."""
+    """Asks the rig where everything is and pictures it: uint16 millimetres, 0 = invalid.
 
-    def __init__(self, host: str, clock: Clock, profile: contract.CameraProfile, T_world_cam: np.ndarray):
-        """`T_world_cam` (4, 4) is where the camera stands."""
-        self._host, self._clock = host, clock
+    Time nearly stands still in the rig while a picture is made, which may take longer than a control step.
+    """
+
+    def __init__(
+        self, host: str, clock: Clock, sense: Sense, profile: contract.CameraProfile, T_world_cam: Pose
+    ):
+        """`T_world_cam` (4, 4) is where the camera stands, `profile` the picture for people."""
+        self._host, self._clock, self._sense = host, clock, sense
         self._profile, self._T_world_cam = profile, T_world_cam
         self._channel: Channel | None = None
         self._picture: ScenePicture | None = None
+        self._object = ""
 
     def start(self) -> None:
         """Connect and build the scene. Raises UserError if no rig runs at the host."""
@@ -38,20 +92,23 @@ class Fr3Camera:
         from rig.fr3.picture import ScenePicture
 
         self._channel = Channel(self._host)
-        scene_xml = self._channel.ask("scene")["xml"]
-        self._picture = ScenePicture(scene_xml, self._profile, self._T_world_cam)
+        scene = self._channel.ask("scene")
+        self._picture, self._object = ScenePicture(scene["xml"]), scene["object"]
 
     def read(self) -> Frame:
         """The scene as it is now. Raises CameraError if the rig does not answer."""
         from rig.fr3.channel import ChannelLost
 
         assert self._channel is not None and self._picture is not None
-        asked_s = self._clock.now()
         try:
-            state = self._channel.ask("state")
+            self._channel.ask("slow", on=True)
+            asked_s = self._clock.now()
+            self._picture.pose(np.array(self._channel.ask("state")["qpos"]))
+            frame = Frame(self._sense(self._picture, self._T_world_cam, self._object), asked_s)
+            self._channel.ask("slow", on=False)
         except ChannelLost as error:
             raise CameraError(str(error)) from error
-        return Frame(self._picture.depth_mm(np.array(state["qpos"])), asked_s)
+        return frame
 
     def stop(self) -> None:
         """Disconnect."""
@@ -60,3 +117,26 @@ class Fr3Camera:
         if self._channel is not None:
             self._channel.close()
         self._picture = self._channel = None
+
+    def picture(self) -> UInt8[np.ndarray, "H W 3"]:
+        """(H, W, 3) uint8 colour of the scene as it was last read, from the same place (for people)."""
+        assert self._picture is not None
+        return self._picture.rgb(pinhole(self._profile, self._T_world_cam))
+
+
+def pinhole(profile: contract.CameraProfile, T_world_cam: Pose) -> Pinhole:
+    """The camera of that picture at (4, 4) `T_world_cam`."""
+    p = profile
+    return Pinhole(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.height_px, p.width_px, T_world_cam)
+
+
+def _profile(setup: Setup) -> contract.CameraProfile:
+    return contract.D455.scaled(setup.info.depth_width / contract.D455.width_px)
+
+
+def _at_place(setup: Setup, profile: contract.CameraProfile, sense: Sense) -> Fr3Camera:
+    from rig.camera import camera_pose
+
+    config = setup.config
+    pose = camera_pose(config, np.random.default_rng(config.seed))
+    return Fr3Camera(config.deploy.franka.host, setup.clock, sense, profile, pose)

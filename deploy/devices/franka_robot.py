@@ -28,6 +28,8 @@ from mjx_envs.scene import HOME_RAD
 AT_START_RAD = 0.01
 """No joint further than this from the start pose: the arm is there."""
 START_S = 120.0
+LATE = 1.5
+"""Control periods for which a joint keeps its speed if no command follows; then it brakes."""
 RECOVERY_S = 0.5
 """Until the arm's state says that an error is gone."""
 _POLL_S = 0.01
@@ -54,6 +56,7 @@ class FrankaRobot:
         self._config, self._clock = config, clock
         self._confirm, self._say = confirm, say
         self._limits = contract.ARMS[config.model]
+        self._speed_rad_s = np.array(config.speed_rad_s)
         self._arm: Any = None
         self._hand: FrankaHand | None = None
         self._errors: tuple[type[Exception], ...] = ()
@@ -75,9 +78,9 @@ class FrankaRobot:
         realtime = franky.RealtimeConfig
         kernel = realtime.Enforce if config.kernel == "realtime" else realtime.Ignore
         try:
-            self._arm = franky.Robot(
-                config.host, relative_dynamics_factor=config.dynamics, realtime_config=kernel
-            )
+            # All of its acceleration: an arm that follows late does not stop where the policy thinks.
+            dynamics = franky.RelativeDynamicsFactor(config.dynamics, 1.0, 1.0)
+            self._arm = franky.Robot(config.host, relative_dynamics_factor=dynamics, realtime_config=kernel)
             self._prepare()
             gripper = franky.Gripper(config.host)
             if self._confirm is not None:
@@ -99,7 +102,10 @@ class FrankaRobot:
         """Set the (7,) joint target, pre-empting the last, and the gripper. Raises RobotError."""
         assert self._hand is not None
         with self._reporting():
-            self._move(self._to(q_target_rad, return_when_finished=False))
+            away_rad = q_target_rad - np.asarray(self._arm.state.q)
+            speed = np.clip(away_rad / contract.CONTROL_DT_S, -1.0 * self._speed_rad_s, self._speed_rad_s)
+            duration = self._franky.Duration(round(1000 * LATE * contract.CONTROL_DT_S))
+            self._move(self._franky.JointVelocityMotion(speed, duration))
             self._hand.set(close)
         self._holding = False
 
@@ -110,7 +116,7 @@ class FrankaRobot:
         """
         if not self._holding and self._moved and not self._faulted:
             with self._reporting():
-                self._move(self._franky.JointStopMotion())
+                self._move(self._franky.JointVelocityStopMotion())
         self._holding = True
 
     def stop(self) -> None:
@@ -124,7 +130,7 @@ class FrankaRobot:
         try:
             if self._arm is not None and self._moved and not self._faulted:
                 with self._reporting():
-                    self._arm.move(self._franky.JointStopMotion())
+                    self._arm.move(self._franky.JointVelocityStopMotion())
         finally:
             self._arm = None
 
@@ -172,7 +178,9 @@ class FrankaRobot:
         gripper.homing()
         if away_rad > AT_START_RAD:
             self._say("moving to the start pose")
-            slower = min(1.0, self._config.start_dynamics / self._config.dynamics)
+            share = self._config.start_dynamics
+            speed = min(1.0, share / self._config.dynamics)
+            slower = self._franky.RelativeDynamicsFactor(speed, share, share)
             self._arm.move(self._to(np.array(HOME_RAD), relative_dynamics_factor=slower), asynchronous=True)
             self._wait_at_start()
 
@@ -183,6 +191,7 @@ class FrankaRobot:
             self._arm.poll_motion()
             state = self._arm.state
             if np.max(np.abs(np.asarray(state.q) - HOME_RAD)) <= AT_START_RAD:
+                self._arm.join_motion()  # what follows is of another kind, and must not cut it short
                 return
             if state.time.to_sec() - begun_s > START_S:
                 raise UserError(f"the arm is not at its start pose after {START_S:g} s: see what holds it.")

@@ -16,8 +16,8 @@ class SessionOptions:
     robot: str = "sim"
     """sim (the pseudo-real rig) or franka."""
     camera: str = "stereo"
-    """stereo (the rig's own camera), realsense, replay (a recording; the robot acts on old pictures), or rig
-    (what stands around the FR3 rig that runs at the robot's host)."""
+    """stereo (the rig's own camera), realsense, replay (a recording; the robot acts on old pictures), rig (a
+    D455 before the FR3 rig that runs at the robot's host), or rig-ideal (the same without errors)."""
     recording: Path | None = None
     """Recording for camera replay."""
     object_name: str = ""

@@ -5,6 +5,7 @@ a synthetic stream; it has not been run on a camera by us.
 """
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,9 @@ from deploy.devices.options import Setup
 from deploy.interfaces import CameraError, Clock, Frame, Robot
 from sensors.recordings.realsense import load_pyrealsense2
 
-STREAM_WIDTH_PX, STREAM_HEIGHT_PX = 1280, 720
-FOCAL_TOLERANCE = 0.1
-"""A focal length further than this (relative) from the policy's is another camera."""
+INTRINSICS_TOLERANCE = 0.1
+"""A focal length or a principal point further than this share of the focal length from the stream's nominal
+one is another camera, or another mode."""
 
 
 def make(setup: Setup, robot: Robot) -> "RealSenseCamera":
@@ -33,10 +34,10 @@ def make(setup: Setup, robot: Robot) -> "RealSenseCamera":
 
 
 class RealSenseCamera:
-    """Raw depth of the newest frame at a fraction of 1280 x 720, uint16 millimetres, no post-processing.
+    """Raw depth of the newest frame at the policy's intrinsics, uint16 millimetres, no post-processing.
 
-    The smaller picture takes one pixel of every block (its centre): a mean or median would already
-    be a refinement that the policy was not trained on.
+    Each pixel of the smaller picture takes the stream's pixel on its ray, by the intrinsics that the camera
+    itself reports: a mean or median would already be a refinement that the policy was not trained on.
     """
 
     def __init__(
@@ -45,44 +46,42 @@ class RealSenseCamera:
         profile: contract.CameraProfile,
         *,
         serial: str = "",
+        stream: contract.CameraProfile = contract.D455_STREAM,
         stream_hz: int = 30,
         timeout_ms: int = 200,
     ):
-        """`profile` is the policy's camera; its size must divide 1280 x 720 evenly."""
-        self._stride = STREAM_WIDTH_PX // profile.width_px
-        fits = (profile.width_px * self._stride, profile.height_px * self._stride)
-        if fits != (STREAM_WIDTH_PX, STREAM_HEIGHT_PX):
+        """`profile` is the policy's camera, no larger than `stream`, the mode that the camera is run in."""
+        if profile.width_px > stream.width_px or profile.height_px > stream.height_px:
             raise UserError(
-                f"the policy takes {profile.width_px}x{profile.height_px} depth, no whole fraction of "
-                f"{STREAM_WIDTH_PX}x{STREAM_HEIGHT_PX}: export it with world.camera_scale 1, 0.5 or 0.25."
+                f"the policy takes {profile.width_px}x{profile.height_px} depth, more than the stream's "
+                f"{stream.width_px}x{stream.height_px}: export it with world.camera_scale 0.5 or less."
             )
         self._clock, self._profile, self._serial = clock, profile, serial
         self._stream_hz, self._timeout_ms = stream_hz, timeout_ms
         self._pipeline: Any = None
-        self._unit_m = contract.DEPTH_UNIT_M
+        self._unit_m, self._mode, self._stream = contract.DEPTH_UNIT_M, stream, stream
         self._number: int | None = None
         self._frame: Frame | None = None
 
     def start(self) -> None:
-        """Open the stream and check its focal length. Raises UserError."""
+        """Open the stream and check its intrinsics. Raises UserError."""
         rs = load_pyrealsense2()
         self._rs, pipeline, config = rs, rs.pipeline(), rs.config()
         if self._serial:
             config.enable_device(self._serial)
-        config.enable_stream(
-            rs.stream.depth, STREAM_WIDTH_PX, STREAM_HEIGHT_PX, rs.format.z16, self._stream_hz
-        )
+        size = self._mode.width_px, self._mode.height_px
+        config.enable_stream(rs.stream.depth, *size, rs.format.z16, self._stream_hz)
         try:
             active = pipeline.start(config)
         except RuntimeError as error:
             raise UserError(
-                f"no RealSense depth stream {STREAM_WIDTH_PX}x{STREAM_HEIGHT_PX} at {self._stream_hz} Hz "
+                f"no RealSense depth stream {size[0]}x{size[1]} at {self._stream_hz} Hz "
                 f"({error}); check the USB 3 cable and camera.serial {self._serial!r}."
             ) from error
         self._pipeline = pipeline
         self._unit_m = active.get_device().first_depth_sensor().get_depth_scale()
         intrinsics = active.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
-        self._check_focal(intrinsics.fx / self._stride)
+        self._stream = self._checked(intrinsics)
 
     def read(self) -> Frame:
         """The newest frame; waits for one only at the very start, or when the stream has paused."""
@@ -95,24 +94,23 @@ class RealSenseCamera:
         taken = frames.get_depth_frame() if frames else None
         if taken and taken.get_frame_number() != self._number:
             self._number = taken.get_frame_number()
-            self._frame = Frame(self._convert(np.asanyarray(taken.get_data())), self._exposed_s(taken))
+            self._frame = Frame(self.convert(np.asanyarray(taken.get_data())), self._exposed_s(taken))
         if self._frame is None:
             raise CameraError("the stream has started, but no frame has come yet")
         return self._frame
+
+    def convert(self, counts: np.ndarray) -> np.ndarray:
+        """(H, W) uint16 millimetres at the policy's size from the stream's picture, in the device's own unit.
+
+        A new array: librealsense reuses its buffer.
+        """
+        return depth.from_counts(depth.at_profile(counts, self._stream, self._profile), self._unit_m)
 
     def stop(self) -> None:
         """Close the stream, if it is open."""
         if self._pipeline is not None:
             self._pipeline.stop()
             self._pipeline = None
-
-    def _convert(self, counts: np.ndarray) -> np.ndarray:
-        """(H, W) uint16 millimetres from the full picture in the device's own unit.
-
-        A new array: librealsense reuses its buffer.
-        """
-        size = (self._profile.height_px, self._profile.width_px)
-        return depth.from_counts(depth.resize_nearest(counts, size), self._unit_m)
 
     def _exposed_s(self, taken: Any) -> float:
         """When the frame was exposed, on the loop's clock: the host's time of day tells its age."""
@@ -122,11 +120,24 @@ class RealSenseCamera:
         age_s = time.time() - taken.get_timestamp() * 1e-3
         return now_s - max(age_s, 0.0)
 
-    def _check_focal(self, fx_px: float) -> None:
-        wanted = self._profile.fx_px
-        if abs(fx_px - wanted) > FOCAL_TOLERANCE * wanted:
-            self.stop()
-            raise UserError(
-                f"the camera's focal length is {fx_px:.1f} px at this scale, the policy was trained for "
-                f"{wanted:.1f} px: use a D455, or train with your camera's profile."
-            )
+    def _checked(self, intrinsics: Any) -> contract.CameraProfile:
+        """The stream as the camera reports it. Raises UserError if it is not the mode that was asked for.
+
+        Its pixel centres are whole numbers, the contract's lie half a pixel further.
+        """
+        had = self._mode
+        reported = {
+            "fx": (intrinsics.fx, had.fx_px, had.fx_px),
+            "fy": (intrinsics.fy, had.fy_px, had.fy_px),
+            "cx": (intrinsics.ppx + 0.5, had.cx_px, had.fx_px),
+            "cy": (intrinsics.ppy + 0.5, had.cy_px, had.fy_px),
+        }
+        for name, (value, nominal, focal) in reported.items():
+            if abs(value - nominal) > INTRINSICS_TOLERANCE * focal:
+                self.stop()
+                raise UserError(
+                    f"the camera's {name} is {value:.1f} px, a D455's at {had.width_px}x"
+                    f"{had.height_px} is {nominal:.1f} px: use a D455, or train with yours."
+                )
+        fx, fy, cx, cy = (value for value, _, _ in reported.values())
+        return replace(had, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)

@@ -16,6 +16,7 @@ CAMERAS: Mapping[str, Callable[[Setup, Robot], Camera]] = {
     "realsense": realsense_camera.make,
     "replay": replay_camera.make,
     "rig": fr3_camera.make,
+    "rig-ideal": fr3_camera.make_ideal,
 }
 REFUSED: Mapping[tuple[str, str], str] = {
     ("franka", "stereo"): "camera 'stereo' sees the simulated rig alone, not robot 'franka': "
@@ -23,6 +24,7 @@ REFUSED: Mapping[tuple[str, str], str] = {
     ("franka", "replay"): "camera 'replay' shows the past: robot 'franka' would move blindly; "
     "use --camera realsense.",
     ("sim", "rig"): "camera 'rig' sees the FR3 rig, not robot 'sim': use --camera stereo, or --robot franka.",
+    ("sim", "rig-ideal"): "camera 'rig-ideal' sees the FR3 rig, not robot 'sim': use --camera stereo.",
 }
 """(robot, camera) that make no sense together, and why; all others do."""
 

@@ -7,58 +7,113 @@ import xml.etree.ElementTree as ET
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, Float64, UInt8, UInt16
+from jaxtyping import Float, Float32, Float64, Int32, UInt8
 
-from ddgrasp import contract, depth
 from ddgrasp.errors import UserError
+from mjx_envs.camera import Buffers, Camera
+from sensors.models.materials import geom_rgb
 
 CAMERA = "depth_camera"
+FAR_M = 10.0
+"""What is further away counts as nothing."""
 _T_OPENCV_OPENGL = np.diag([1.0, -1.0, -1.0])
 """MuJoCo's cameras look along -z with y up, OpenCV's along z with y down."""
+_LARGEST_PX = 2048
+_GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
+"""As a number: an array compared with the enumeration itself is compared object by object."""
 
 
 class ScenePicture:
-    """The scene seen by a pinhole camera that has no errors.
+    """The scene seen by pinhole cameras that have no errors and look straight ahead.
 
     Args:
       scene_xml: what the rig's side channel answers to `scene`, visual meshes included.
-      profile: size and intrinsics; the principal point must be the middle.
-      T_world_cam: (4, 4) OpenCV axes.
     """
 
-    def __init__(
-        self, scene_xml: str, profile: contract.CameraProfile, T_world_cam: Float[np.ndarray, "4 4"]
-    ):
+    def __init__(self, scene_xml: str):
         root = ET.fromstring(scene_xml)
         world = root.find("worldbody")
         assert world is not None
-        world.append(_camera(profile, T_world_cam))
-        self._model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
-        self._data = mujoco.MjData(self._model)
+        world.append(ET.Element("camera", {"name": CAMERA}))
+        visual = ET.SubElement(root, "visual")
+        ET.SubElement(visual, "global", {"offwidth": str(_LARGEST_PX), "offheight": str(_LARGEST_PX)})
+        ET.SubElement(visual, "quality", {"offsamples": "0"})  # a pixel is one surface, not a mixture
+        self.model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+        self._data = mujoco.MjData(self.model)
+        self._rgb = np.concatenate(
+            [geom_rgb(self.model), np.zeros((1, 3), np.float32)]
+        )  # black where none is
+        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         _without_display()
-        self._renderer = mujoco.Renderer(self._model, profile.height_px, profile.width_px)
 
-    def depth_mm(self, qpos: Float64[np.ndarray, " nq"]) -> UInt16[np.ndarray, "H W"]:
-        """(H, W) uint16 planar depth in millimetres with the scene in `qpos`."""
-        self._renderer.enable_depth_rendering()
-        metres = self._render(qpos)
-        self._renderer.disable_depth_rendering()
-        return depth.to_millimetres(metres)
+    def pose(self, qpos: Float64[np.ndarray, " nq"]) -> None:
+        """The scene from now on."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self._data)
 
-    def rgb(self, qpos: Float64[np.ndarray, " nq"]) -> UInt8[np.ndarray, "H W 3"]:
-        """(H, W, 3) uint8 colour with the scene in `qpos`."""
-        return self._render(qpos)
+    def depth_m(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
+        """(H, W) planar depth, metres; 0 = nothing there."""
+        renderer = self._look(camera)
+        renderer.enable_depth_rendering()
+        depth_m = renderer.render()
+        renderer.disable_depth_rendering()
+        return np.where(depth_m < FAR_M, depth_m, np.float32(0))
+
+    def rgb(self, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
+        """(H, W, 3) uint8 colour."""
+        return self._look(camera).render().copy()
+
+    def buffers(self, camera: Camera) -> Buffers:
+        """Depth, geoms, their colours without light, and normals; what `ActiveStereo` draws with."""
+        depth_m = self.depth_m(camera)
+        renderer = self._look(camera)
+        renderer.enable_segmentation_rendering()
+        ids, kinds = np.moveaxis(renderer.render(), -1, 0)
+        renderer.disable_segmentation_rendering()
+        geoms = np.where((kinds == _GEOM) & (depth_m > 0), ids, -1).astype(np.int32)
+        return Buffers(depth_m, self._rgb[geoms], geoms, _normals(depth_m, geoms, camera))
 
     def close(self) -> None:
-        """Lets go of the OpenGL context."""
-        self._renderer.close()
+        """Lets go of the OpenGL contexts."""
+        for renderer in self._renderers.values():
+            renderer.close()
 
-    def _render(self, qpos: np.ndarray) -> np.ndarray:
-        self._data.qpos[:] = qpos
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
-        self._renderer.update_scene(self._data, CAMERA)
-        return self._renderer.render().copy()
+    def _look(self, camera: Camera) -> mujoco.Renderer:
+        assert camera.cx_px == camera.width_px / 2 and camera.cy_px == camera.height_px / 2
+        own, T = self.model.camera(CAMERA), np.asarray(camera.T_world_cam)
+        own.pos, own.fovy = T[:3, 3], math.degrees(2 * math.atan(camera.height_px / 2 / camera.fy_px))
+        mujoco.mju_mat2Quat(own.quat, (T[:3, :3] @ _T_OPENCV_OPENGL).ravel())
+        mujoco.mj_camlight(self.model, self._data)
+        size = (camera.height_px, camera.width_px)
+        if size not in self._renderers:
+            self._renderers[size] = mujoco.Renderer(self.model, *size)
+        self._renderers[size].update_scene(self._data, CAMERA)
+        return self._renderers[size]
+
+
+def _normals(
+    depth_m: Float32[np.ndarray, "H W"], geoms: Int32[np.ndarray, "H W"], camera: Camera
+) -> Float32[np.ndarray, "H W 3"]:
+    """(H, W, 3) unit normals, world frame, towards the camera: differences of neighbours on one geom."""
+    x = ((np.arange(camera.width_px) + 0.5 - camera.cx_px) / camera.fx_px).astype(np.float32)[None, :]
+    y = ((np.arange(camera.height_px) + 0.5 - camera.cy_px) / camera.fy_px).astype(np.float32)[:, None]
+    points = np.stack([x * depth_m, y * depth_m, depth_m], axis=-1)
+    normal = np.cross(_slope(points, geoms, 0), _slope(points, geoms, 1))
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    facing = np.where((normal * points).sum(-1, keepdims=True) > 0, np.float32(-1), np.float32(1))
+    unit = normal * facing / np.maximum(length, np.float32(1e-12))
+    unit[(geoms < 0) | (length[..., 0] == 0)] = 0.0
+    return (unit @ np.asarray(camera.T_world_cam)[:3, :3].T.astype(np.float32)).astype(np.float32)
+
+
+def _slope(
+    points: Float[np.ndarray, "H W 3"], geoms: Int32[np.ndarray, "H W"], axis: int
+) -> Float[np.ndarray, "H W 3"]:
+    """Along an axis of the picture: the sum of the differences to both neighbours, but to other geoms."""
+    step = np.diff(points, axis=axis)
+    step *= (np.diff(geoms, axis=axis) == 0)[..., None]
+    nothing = np.zeros_like(points.take([0], axis))
+    return np.concatenate([nothing, step], axis) + np.concatenate([step, nothing], axis)
 
 
 def _without_display() -> None:
@@ -72,12 +127,3 @@ def _without_display() -> None:
     except Exception as error:  # its loaders raise what they like
         raise UserError(f"camera 'rig' draws with OpenGL, and EGL is absent ({error}): add it.") from error
     gl_context.GLContext = GLContext
-
-
-def _camera(profile: contract.CameraProfile, T_world_cam: np.ndarray) -> ET.Element:
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, (T_world_cam[:3, :3] @ _T_OPENCV_OPENGL).ravel())
-    fovy = math.degrees(2 * math.atan(profile.height_px / 2 / profile.fy_px))
-    numbers = {"pos": T_world_cam[:3, 3], "quat": quat, "fovy": [fovy]}
-    attributes = {name: " ".join(f"{value:.9g}" for value in values) for name, values in numbers.items()}
-    return ET.Element("camera", {"name": CAMERA, **attributes})

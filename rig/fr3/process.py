@@ -56,11 +56,14 @@ class Fr3Rig:
 
     def __enter__(self) -> "Fr3Rig":
         """Starts it and waits until it listens. Raises UserError if it does not."""
-        command = [sys.executable, "-m", "rig.fr3.serve", json.dumps(self._options)]
+        command = [sys.executable, "-m", "rig.fr3.serve"]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
+        assert self._process.stdin is not None
         try:
+            self._process.stdin.write(json.dumps(self._options) + "\n")
+            self._process.stdin.flush()
             self._wait_until_ready()
             self._channel = Channel(self.host)
         except BaseException:

@@ -7,6 +7,7 @@ Error numbers: `research_interface::robot::Error` of Franka's published protocol
 
 import select
 import socket
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -121,9 +122,8 @@ class ReflexServer(FrankaRobotServer):
 
     def _exceeded(self, model: mujoco.MjModel, data: mujoco.MjData) -> int | None:
         command = self._FrankaRobotServer__current_control_command  # type: ignore[attr-defined]
-        target = np.array(command.q_c)
-        beyond = (target < contract.FR3.joint_lower_rad) | (target > contract.FR3.joint_upper_rad)
-        if target.any() and beyond.any():
+        target, state = np.array(command.q_c), self._arm.inner_state
+        if (target.any() and _beyond(target)) or _beyond(_standstill(state.q, state.dq)):
             return GENERATOR_POSITION_LIMITS
         if np.any(np.abs(self._torque_nm) > self.thresholds.torque_nm):
             return JOINT_REFLEX
@@ -173,6 +173,16 @@ class _Recover(protocol.AutomaticErrorRecoveryCommand):
     def handle(self, server: ReflexServer) -> None:
         server.recover()
         self.reply(protocol.AutomaticErrorRecoveryStatus.kSuccess)
+
+
+def _standstill(q_rad: Sequence[float], speed_rad_s: Sequence[float]) -> Float[np.ndarray, "7"]:
+    """(7,) where the joints stand after braking as hard as they may: q + v |v| / 2a."""
+    speed = np.array(speed_rad_s)
+    return np.array(q_rad) + speed * np.abs(speed) / (2.0 * np.array(contract.FR3.joint_acceleration_rad_s2))
+
+
+def _beyond(q_rad: Float[np.ndarray, "7"]) -> bool:
+    return bool(np.any((q_rad < contract.FR3.joint_lower_rad) | (q_rad > contract.FR3.joint_upper_rad)))
 
 
 def contact_torque(model: mujoco.MjModel, data: mujoco.MjData) -> Float[np.ndarray, "7"]:

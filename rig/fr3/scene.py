@@ -47,6 +47,29 @@ def primitive(name: str) -> SceneObject:
     return SceneObject(name, inertial + _slot_geoms(spec, layout), spec.rest_height_m)
 
 
+def meshed(name: str) -> SceneObject:
+    """One of the mesh objects. Raises UserError for an unknown name, or without the extra [fr3]."""
+    from rig.meshes.bodies import CONTACT_SOLREF, make_body
+
+    body = make_body(name)
+    xx, yy, zz, xy, xz, yz = body.inertia_kg_m2[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    inertia = _numbers((xx, yy, zz, xy, xz, yz))
+    geoms = [f'<inertial mass="{body.mass_kg}" pos="0 0 0" fullinertia="{inertia}"/>']
+    assets = []
+    for surface in body.surfaces:
+        mesh = f"{OBJECT_BODY}_{surface.name}"
+        vertices, faces = _numbers(surface.vertices_m.ravel()), " ".join(map(str, surface.faces.ravel()))
+        assets.append(f'<mesh name="{mesh}" vertex="{vertices}" face="{faces}" inertia="shell"/>')
+        look = f'rgba="{_numbers(surface.rgb)} 1" contype="0" conaffinity="0" group="1"'
+        geoms.append(f'<geom name="{mesh}" type="mesh" mesh="{mesh}" {look} mass="0"/>')
+    touching = _touching(body.friction, _numbers(CONTACT_SOLREF))
+    for i, vertices_m in enumerate(body.convex_m):
+        mesh = f"{OBJECT_BODY}_contact{i}"
+        assets.append(f'<mesh name="{mesh}" vertex="{_numbers(vertices_m.ravel())}"/>')
+        geoms.append(f'<geom name="{mesh}" type="mesh" mesh="{mesh}" group="3" mass="0" {touching}/>')
+    return SceneObject(name, "".join(geoms), body.rest_height_m, "".join(assets))
+
+
 def furnish(scene: ET.Element, thing: SceneObject, seed: int) -> None:
     """Adds table, wall, clutter and the object to franky-sim's scene; its ground becomes the floor.
 
@@ -88,7 +111,7 @@ def _object(thing: SceneObject, xy_m: tuple[float, float], yaw_rad: float) -> ET
 
 def _slot_geoms(spec: ObjectSpec, layout: SlotLayout) -> str:
     """Geoms of a primitive; those that only show (cylinders, plates) do not collide."""
-    touching = f'condim="4" priority="1" friction="{spec.friction} 0.005 0.0001" solref="0.004 1"'
+    touching = _touching(spec.friction, "0.004 1")
     geoms = ""
     columns = zip(layout.names, layout.kinds, *spec.slot_arrays(layout), spec.slot_rgb(layout), strict=True)
     for name, kind, size, pos, quat, rgb in columns:
@@ -98,6 +121,10 @@ def _slot_geoms(spec: ObjectSpec, layout: SlotLayout) -> str:
         shape = f'type="{kind}" size="{_numbers(size)}" pos="{_numbers(pos)}" quat="{_numbers(quat)}"'
         geoms += f'<geom name="{name}" {shape} mass="0" rgba="{_numbers(rgb)} 1" {contact}/>'
     return geoms
+
+
+def _touching(friction: float, solref: str) -> str:
+    return f'condim="4" priority="1" friction="{friction} 0.005 0.0001" solref="{solref}"'
 
 
 def _clutter(world: ET.Element, index: int, rng: np.random.Generator) -> None:

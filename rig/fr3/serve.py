@@ -1,6 +1,7 @@
-"""The rig's own process: `python -m rig.fr3.serve OPTIONS`, started by `rig.fr3.process`.
+"""The rig's own process: `python -m rig.fr3.serve`, started by `rig.fr3.process`.
 
-Lives as long as its standard input is open, so it goes with whoever started it, however that ended.
+Its options are the first line of its standard input. It lives as long as that is open, so it goes with
+whoever started it, however that ended.
 """
 
 import json
@@ -22,6 +23,9 @@ from rig.fr3.reflex import ReflexServer
 
 TICK_S = 0.001
 COMMAND_WAIT_S = 0.05
+SLOW_TICK_S = 0.2
+"""Wall-clock time of a tick while somebody takes a picture: time nearly stands still, and the client, which
+gives up after a second without a state, goes on hearing of the arm."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,7 @@ class Rig:
         self._server = _Server(self._sim, options.host)
         self._requests: queue.Queue[tuple[dict[str, Any], queue.Queue[dict[str, Any]]]] = queue.Queue()
         self._away_until_s = 0.0
+        self._slow = False
 
     def run(self, stop: threading.Event) -> None:
         """Serves until `stop` is set. Raises OSError if a port is taken."""
@@ -69,7 +74,7 @@ class Rig:
         return answer.get()
 
     def answer(self, asked: dict[str, Any]) -> dict[str, Any]:
-        """The side channel's requests: scene, state, place (x_m, y_m, yaw_rad), disconnect (seconds)."""
+        """Requests: scene, state, place (x_m, y_m, yaw_rad), slow (on), disconnect (seconds)."""
         match asked["ask"]:
             case "scene":
                 return {"xml": self._xml, "object": self.thing.name}
@@ -77,6 +82,9 @@ class Rig:
                 return self._state()
             case "place":
                 return self._place(asked["x_m"], asked["y_m"], asked["yaw_rad"])
+            case "slow":
+                self._slow = asked["on"]
+                return {}
             case "disconnect":
                 self._server.disconnect()
                 self._away_until_s = time.monotonic() + asked["seconds"]
@@ -95,6 +103,14 @@ class Rig:
         assert self._sim.model is not None and self._sim.data is not None
         self._server.robot_server.watch(self._sim.model, self._sim.data)
         self._server.robot_server.wait_for_command(COMMAND_WAIT_S)
+        if self._slow:
+            self._wait_for_request(SLOW_TICK_S)
+
+    def _wait_for_request(self, seconds: float) -> None:
+        """Somebody who is drawing may be done."""
+        end = time.monotonic() + seconds
+        while self._requests.empty() and time.monotonic() < end:
+            time.sleep(TICK_S)
 
     def _state(self) -> dict[str, Any]:
         data, server = self._sim.data, self._server.robot_server
@@ -188,7 +204,7 @@ def _listen(host: str, request: Any) -> socketserver.ThreadingTCPServer:
 
 def main() -> int:
     """Serves until standard input ends; 2 with one line of JSON if it cannot."""
-    options = Options(**json.loads(sys.argv[1]))
+    options = Options(**json.loads(sys.stdin.readline()))
     stop = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
     try:

@@ -15,13 +15,14 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+from jaxtyping import Float, Float32, UInt8, UInt16
 
 from ddgrasp.config import StereoConfig
+from ddgrasp.config.sensors import odd
 from ddgrasp.contract import CameraProfile
 from ddgrasp.depth import to_millimetres
 from mjx_envs.camera import Buffers, Camera
-from sensors.models import planes
+from sensors.models import matching
 from sensors.models.materials import NEAR_INFRARED_RGB, Material
 
 Render = Callable[[Camera], Buffers]
@@ -58,8 +59,6 @@ CONTRAST_WINDOW_PX = 9
 """The pictures are compared less their mean over this window."""
 TEXTURE_WINDOW_PX = 7
 """Contrast is measured over this window: small enough for a dark object on a bright table."""
-OTHER_SURFACE_PX = 0.5
-"""Neighbouring disparities further apart than this belong to two surfaces."""
 
 
 class ActiveStereo:
@@ -68,8 +67,13 @@ class ActiveStereo:
     The pattern and the matcher are made once; frames differ by the generator given to `sense`.
     """
 
-    def __init__(self, config: StereoConfig, profile: CameraProfile):
-        self.config = config
+    def __init__(self, config: StereoConfig, profile: CameraProfile, windows: float = 1.0):
+        """`windows` is how many times wider all windows are than `config` says: they cover the same part of a
+        larger picture then."""
+        self.config = config = config.finer(windows) if windows != 1.0 else config
+        self._dark_px, self._contrast_px, self._texture_px, self._spread_px = (
+            odd(side * windows) for side in (DARK_WINDOW_PX, CONTRAST_WINDOW_PX, TEXTURE_WINDOW_PX, SPREAD_PX)
+        )
         self.profile = profile
         p = profile
         self._x = ((np.arange(p.width_px) + 0.5 - p.cx_px) / p.fx_px).astype(np.float32)[None, :]
@@ -81,7 +85,7 @@ class ActiveStereo:
         self._texture = albedo_texture(config.pattern_seed, TEXTURE_PX, TEXTURE_PX)
         self._fb_px_m = p.fx_px * p.baseline_m
         self._disparities = 16 * math.ceil(self._fb_px_m / config.min_range_m / 16)
-        self._matcher = _matcher(config, self._disparities)
+        self._matcher = matching.matcher(config, self._disparities)
 
     def sense(
         self,
@@ -142,12 +146,12 @@ class ActiveStereo:
         columns = np.arange(self.profile.width_px, dtype=np.float32)[None, :]
         # The left band has no counterpart in the right picture.
         valid = (coarse > 0) & (columns - coarse >= 0)
-        contrast = _contrast(left)
-        valid &= cv2.medianBlur(left, DARK_WINDOW_PX) >= self.config.dark_limit
-        left, right = _without_mean(left), _without_mean(right)
-        fine, residual = _refine(left, right, coarse, self.config)
+        contrast = matching.contrast(left, self._texture_px)
+        valid &= cv2.medianBlur(left, self._dark_px) >= self.config.dark_limit
+        left, right = (matching.without_mean(picture, self._contrast_px) for picture in (left, right))
+        fine, residual = matching.refine(left, right, coarse, self.config)
         valid &= (residual < self.config.residual_limit) & (contrast > self.config.contrast_limit)
-        fine = flatten(fine, valid, self.config)
+        fine = matching.flatten(fine, valid, self.config)
         steps = self.config.subpixel_steps
         return np.where(valid, np.rint(fine * steps) / steps, 0).astype(np.float32)
 
@@ -190,7 +194,7 @@ class ActiveStereo:
         diffuse, highlight = _reflect(normal, to_projector, view)
         radiance = dots * speckle * ((1.0 - translucency) * albedo * diffuse + specular * highlight)
         if translucency.any():
-            radiance += cv2.blur(dots, (SPREAD_PX, SPREAD_PX)) * translucency * albedo * diffuse
+            radiance += cv2.blur(dots, (self._spread_px, self._spread_px)) * translucency * albedo * diffuse
 
         to_lamp, _ = _unit(lamp[0] - x_z, lamp[1] - y_z, lamp[2] - z)
         diffuse, highlight = _reflect(normal, to_lamp, view)
@@ -298,23 +302,6 @@ def albedo_texture(seed: int, height_px: int, width_px: int) -> Float32[np.ndarr
     return (noise / noise.std()).astype(np.float32)
 
 
-def _matcher(config: StereoConfig, disparities: int) -> cv2.StereoSGBM:
-    area = config.block_px**2
-    return cv2.StereoSGBM.create(
-        minDisparity=0,
-        numDisparities=disparities,
-        blockSize=config.block_px,
-        P1=round(8 * area * config.smoothness),
-        P2=round(32 * area * config.smoothness),
-        disp12MaxDiff=config.left_right_px,
-        preFilterCap=31,
-        uniquenessRatio=config.uniqueness_percent,
-        speckleWindowSize=config.speckle_px,
-        speckleRange=1,
-        mode=cv2.STEREO_SGBM_MODE_SGBM,
-    )
-
-
 def _unit(x, y, z) -> tuple[np.ndarray, np.ndarray]:
     """((3, H, W) unit vectors, (H, W) lengths)."""
     vector = np.stack([x, y, z])
@@ -334,67 +321,3 @@ def _reflect(normal, to_light, to_view) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(SHININESS_DOUBLINGS - 1):
         squared = squared * squared
     return diffuse, squared * (diffuse > 0)
-
-
-def _contrast(picture: np.ndarray) -> np.ndarray:
-    """(H, W) float32: standard deviation of the grey levels around each pixel."""
-    window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)
-    mean, square = cv2.blur(picture.astype(np.float32), window), cv2.sqrBoxFilter(picture, cv2.CV_32F, window)
-    return np.sqrt(np.maximum(square - mean * mean, 0.0))
-
-
-def _without_mean(picture: np.ndarray) -> np.ndarray:
-    """(H, W) float32: the picture less its local mean."""
-    picture = picture.astype(np.float32)
-    return picture - cv2.blur(picture, (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX))
-
-
-def _refine(
-    left: np.ndarray, right: np.ndarray, coarse_px: np.ndarray, config: StereoConfig
-) -> tuple[np.ndarray, np.ndarray]:
-    """One Gauss-Newton step on the windowed squared difference (Lucas and Kanade 1981).
-
-    The semi-global matcher interpolates its cost by a parabola in 1/16 px, which pulls towards whole
-    pixels and differs from pixel to pixel. With i the pixels of a window, c_i their coarse disparity, e_i
-    the difference of the pictures there and s_i the slope, the disparity d that all of them share minimises
-    sum (e_i + s_i (d - c_i))^2. Pixels whose c_i is more than OTHER_SURFACE_PX from their neighbourhood's
-    median do not take part.
-
-    Returns:
-        (H, W) disparity in pixels, moved by at most half a pixel; (H, W) residual relative to the
-        local contrast: near 0 for a perfect match, 1.4 for unrelated pictures.
-    """
-    gradient = cv2.Sobel(right, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-    grid = np.indices(left.shape, dtype=np.float32)
-    rows, at = grid[0], grid[1] - coarse_px
-    matched = cv2.remap(right, at, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    slope = cv2.remap(gradient, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    window = (config.refine_window_px, config.refine_window_px)
-    difference = left - matched
-    middle = cv2.medianBlur(coarse_px, 5)
-    smooth = cv2.blur(middle, window)
-    smooth = np.where(np.abs(smooth - middle) < OTHER_SURFACE_PX, smooth, middle)
-    weight = slope * slope * (np.abs(coarse_px - middle) < OTHER_SURFACE_PX)
-    towards = weight * (coarse_px - smooth) - np.where(weight > 0, slope * difference, 0)
-    total = cv2.blur(weight, window)
-    fine = smooth + cv2.blur(towards, window) / np.maximum(total, 1e-3)
-    window = (config.residual_window_px, config.residual_window_px)
-    energy = 0.5 * cv2.blur(left * left + matched * matched, window) + 1e-3
-    residual = np.sqrt(cv2.blur(difference * difference, window) / energy)
-    return np.clip(fine, coarse_px - 0.5, coarse_px + 0.5), residual
-
-
-def flatten(fine_px: Map, valid: Bool[np.ndarray, "H W"], config: StereoConfig) -> Map:
-    """(H, W) disparity, noise on flat surfaces averaged away over a window, edges and relief kept.
-
-    Lee's filter (1980) about the window's plane instead of its mean: with v the variance of the window from
-    its plane and n that of the noise, a pixel keeps max(0, 1 - n / v) of its distance from the plane. For the
-    fit, small holes are filled with the mean around them; large ones leave v, and so the pixel, as it is.
-    """
-    window = (config.flat_window_px, config.flat_window_px)
-    share = cv2.blur(valid.astype(np.float32), window)
-    around = cv2.blur(np.where(valid, fine_px, 0), window) / np.maximum(share, 1e-3)
-    whole = np.where(valid, fine_px, around)
-    variance, plane = planes.residual_variance(whole, config.flat_window_px)
-    keep = np.maximum(1.0 - config.flat_noise_px**2 / np.maximum(variance, 1e-9), 0.0)
-    return (plane + keep * (whole - plane)).astype(np.float32)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 Colour = Sequence[float | int] | Float[np.ndarray, " channels"]
 """Red, green and blue in [0, 1]; what follows them is ignored."""
@@ -48,7 +48,7 @@ class ObjectMaterial:
     surface: Material
     source: str
     parts: Mapping[str, Material] = field(default_factory=dict)
-    """Materials of single slots, by geom name (`SlotLayout.names`), where they differ."""
+    """Materials of slots (`SlotLayout.names`) or surfaces of a mesh (`rig.meshes`), where they differ."""
 
 
 _ESTIMATE = "our estimate"
@@ -56,15 +56,20 @@ _FRUIT = (
     "half of the light above 800 nm, whatever the colour (Merzlyak et al. 2003, apples); gloss: " + _ESTIMATE
 )
 _STALK = Material(0.45, 0.02)
+_STEEL = Material(0.02, 4.0)
+"""Mirrors and hardly scatters."""
+_STALKS: dict[str, Material] = dict.fromkeys(
+    ("slot_box", "stem", "stalk", "tip", "leaf0", "leaf1", "leaf2", "leaf3"), _STALK
+)
 
 OBJECT_MATERIALS: dict[str, ObjectMaterial] = {
     "cube": ObjectMaterial(Material(0.65, 0.03), "raw softwood; " + _ESTIMATE),
     "apple": ObjectMaterial(Material(0.50, 0.60), "waxed; " + _FRUIT),
     "banana": ObjectMaterial(Material(0.55, 0.15), "satin; " + _FRUIT),
-    "pear": ObjectMaterial(Material(0.50, 0.20), "satin; " + _FRUIT, {"slot_box": _STALK}),
-    "peach": ObjectMaterial(Material(0.55, 0.01), "downy, no gloss; " + _FRUIT, {"slot_box": _STALK}),
+    "pear": ObjectMaterial(Material(0.50, 0.20), "satin; " + _FRUIT, _STALKS),
+    "peach": ObjectMaterial(Material(0.55, 0.01), "downy, no gloss; " + _FRUIT, _STALKS),
     "block": ObjectMaterial(Material(0.45, 0.01), "matt foam; " + _ESTIMATE),
-    "persimmon": ObjectMaterial(Material(0.50, 0.80), "smooth, waxy; " + _FRUIT, {"slot_box": _STALK}),
+    "persimmon": ObjectMaterial(Material(0.50, 0.80), "smooth, waxy; " + _FRUIT, _STALKS),
     "starfruit": ObjectMaterial(
         Material(0.06, 0.40, translucency=0.95),
         "waxy; watery flesh and thin ribs let light through, little returns and not where it entered; "
@@ -74,14 +79,30 @@ OBJECT_MATERIALS: dict[str, ObjectMaterial] = {
     "can": ObjectMaterial(
         Material(0.45, 0.80),
         "varnished paper label, bare steel lid that mirrors and hardly scatters; " + _ESTIMATE,
-        {"slot_cylinder1": Material(0.02, 4.0)},
+        {"slot_cylinder1": _STEEL, "tin": _STEEL, "tab": _STEEL},
     ),
     "wheel": ObjectMaterial(
         Material(0.03, 0.05),
         "tyre of rubber filled with carbon black, which absorbs the near infrared as well; " + _ESTIMATE,
-        {"slot_cylinder0": Material(0.60, 0.30)},
+        {"slot_cylinder0": Material(0.60, 0.30), "rim": Material(0.60, 0.30)},
     ),
     "bread": ObjectMaterial(Material(0.55, 0.01), "dry crust; " + _ESTIMATE),
+    "mug": ObjectMaterial(Material(0.45, 0.60), "glazed stoneware; " + _ESTIMATE),
+    "bottle": ObjectMaterial(
+        Material(0.25, 1.00, translucency=0.60),
+        "glass before juice; " + _ESTIMATE,
+        {"cap": Material(0.70, 0.20)},
+    ),
+    "screwdriver": ObjectMaterial(
+        Material(0.45, 0.60, translucency=0.30), "clear acetate handle; " + _ESTIMATE, {"shaft": _STEEL}
+    ),
+    "milk": ObjectMaterial(Material(0.75, 0.10), "printed cardboard; " + _ESTIMATE),
+    "hammer": ObjectMaterial(
+        Material(0.10, 2.00), "forged steel; " + _ESTIMATE, {"handle": Material(0.60, 0.10)}
+    ),
+    "bulb": ObjectMaterial(
+        Material(0.40, 0.80, translucency=0.50), "frosted glass; " + _ESTIMATE, {"cap": _STEEL}
+    ),
 }
 """By object name. One that is not listed is guessed from its colour (`Material.from_rgb`)."""
 
@@ -96,15 +117,22 @@ def rig_materials(model: mujoco.MjModel, object_name: str = "") -> dict[int, Mat
     """Near-infrared materials of every geom of the rig's model, by geom id."""
     object_body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "object")
     materials = {}
-    for geom in range(model.ngeom):
-        rgb = model.geom_rgba[geom]
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+    for geom, rgb in enumerate(geom_rgb(model)):
+        name = model.geom(geom).name
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE or name == "table":
             materials[geom] = Material.from_rgb(rgb, texture=TABLE_TEXTURE)
         elif model.geom_bodyid[geom] == object_body:
-            materials[geom] = object_material(object_name, model.geom(geom).name, rgb)
+            materials[geom] = object_material(object_name, name.removeprefix("object_"), rgb)
         else:
             materials[geom] = Material.from_rgb(rgb, specular=ROBOT_SPECULAR)
     return materials
+
+
+def geom_rgb(model: mujoco.MjModel) -> Float32[np.ndarray, "geoms 3"]:
+    """(ngeom, 3) colour of every geom, its MuJoCo material's where it has one."""
+    material = model.geom_matid
+    named = model.mat_rgba[np.maximum(material, 0)] if model.nmat else model.geom_rgba
+    return np.where((material >= 0)[:, None], named, model.geom_rgba)[:, :3].astype(np.float32)
 
 
 def object_material(object_name: str, slot: str, rgb: Colour) -> Material:

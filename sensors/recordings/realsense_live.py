@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ddgrasp import contract
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.progress import Progress, Task
 from sensors.recordings.importers import Imported, RawFrame, Source, import_recording
@@ -32,9 +33,9 @@ class LiveOptions:
     frames: int
     hz: int = 10
     """Frames kept per second, a divisor of STREAM_HZ."""
-    width_px: int = 1280
-    height_px: int = 720
-    """Size of the depth and of the colour stream."""
+    width_px: int = contract.D455_STREAM.width_px
+    height_px: int = contract.D455_STREAM.height_px
+    """Size of the depth and of the colour stream; deploy runs the camera at the same."""
     serial: str = ""
     """Serial number of the camera; empty takes the first."""
 
@@ -200,7 +201,7 @@ def _not_started(rs: Any, options: LiveOptions, error: RuntimeError) -> UserErro
         return unknown_name("--serial", options.serial, serials)
     return UserError(
         f"the camera gives no depth and colour of {options.width_px}x{options.height_px} at {STREAM_HZ} Hz "
-        f"({error}): choose 1280x720, 848x480 or 640x480 (--width, --height), a USB 3 port, and close other "
+        f"({error}): choose 848x480, 640x480 or 1280x720 (--width, --height), a USB 3 port, and close other "
         "programs that use it."
     )
 

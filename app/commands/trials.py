@@ -1,0 +1,62 @@
+"""ddgrasp deploy trials: a policy on a rig, as many times as a figure needs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from ddgrasp.config.checks import Count, Range
+
+
+@dataclass(frozen=True)
+class DeployTrials:
+    """Try an exported policy on a rig: as many trials of every object, success with intervals, films."""
+
+    policy: Path
+    """ONNX file that `ddgrasp export` wrote."""
+    rig: Literal["fr3", "development"] = "fr3"
+    """fr3 (the test rig: another arm behind Franka's protocol, mesh objects, a D455 as it is run) or
+    development (the rig that everything was tuned on)."""
+    objects: tuple[str, ...] = ("all",)
+    """Names, or all."""
+    trials: Count = 10
+    """How many with every object."""
+    split: Literal["development", "test"] = "development"
+    """development seeds, or test seeds, which are to be looked at once."""
+    number: Annotated[int, Range(0, 999)] = 0
+    """Which seed of the split."""
+    shapes: Literal["mesh", "primitive"] = "mesh"
+    """On rig fr3: mesh objects, or the development rig's primitives."""
+    camera: Literal["stereo", "coarse", "ideal"] = "stereo"
+    """stereo (the rig's own), ideal (without errors), coarse (on rig fr3: matched at the policy's size)."""
+    seconds: Annotated[float, Range(0.5, 60)] = 6.0
+    """Length of a trial."""
+    contact: Annotated[float, Range(1, 100)] = 100.0
+    """On rig fr3: newtons at the hand, and newton metres, at which the arm stops itself."""
+    preset: str | None = None
+    """Configuration of camera and loop; without it that of the run that the policy lies in."""
+    workers: Annotated[int, Range(1, 64)] = 2
+    """Rigs that run side by side."""
+    out: Path = Path("runs/trials")
+    """Folder for trials.jsonl, table.json and films; trials that it has are not run again."""
+
+    def run(self) -> None:
+        """Runs what is missing and prints the table."""
+        from app.commands.student import config_of
+        from ddgrasp.progress import Progress
+        from evaluation import rig_trials
+
+        series = rig_trials.Series(
+            self.rig,
+            self.objects,
+            self.trials,
+            self.split,
+            self.number,
+            self.shapes,
+            self.camera,
+            self.seconds,
+            self.contact,
+        )
+        config = config_of(self.policy, self.preset)
+        progress = Progress(name="deploy trials")
+        table = rig_trials.run(config, self.policy, series, self.out, self.workers, progress)
+        print(rig_trials.describe(table))

@@ -1,0 +1,168 @@
+"""Trials of one exported policy on a rig, as many of every object: where a student's figure comes from."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from ddgrasp import artifacts, contract
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.files import atomic_write_bytes, atomic_write_text
+from ddgrasp.progress import Progress
+from deploy.fr3_trials import Fr3Bench
+from deploy.stage import STAGE
+from deploy.trial_log import TrialLog
+from deploy.trials import Bench, Rig, Trial, TrialResult, run_trials
+from evaluation import wilson
+from rig import seeds
+from rig.film import Film, contact_sheet
+
+RigName = Literal["development", "fr3"]
+Shapes = Literal["mesh", "primitive"]
+Sight = Literal["stereo", "coarse", "ideal"]
+TRIALS_FILE, TABLE_FILE = "trials.jsonl", "table.json"
+EVERYTHING = "all"
+
+
+@dataclass(frozen=True)
+class Series:
+    """Which trials."""
+
+    rig: RigName = "fr3"
+    """fr3 (the test rig: another arm, mesh objects, a D455 as it is run) or development."""
+    objects: tuple[str, ...] = (EVERYTHING,)
+    """Names, or all: the twelve of training and, in other shapes, the six that no list of training has."""
+    trials: int = 10
+    """How many with every object."""
+    split: seeds.Split = "development"
+    """Seeds that may be looked at again and again, or test seeds, which are looked at once."""
+    number: int = 0
+    """Which seed of the split."""
+    shapes: Shapes = "mesh"
+    """On rig fr3: mesh objects, or the development rig's primitives."""
+    camera: Sight = "stereo"
+    """stereo (the rig's own), ideal (no errors), or coarse (rig fr3: matched at the policy's size)."""
+
+    seconds: float = 6.0
+    """Length of a trial."""
+    contact: float = 100.0
+    """On rig fr3: newtons at the hand, and newton metres, at which the arm stops itself."""
+
+    def names(self) -> tuple[str, ...]:
+        """The objects. UserError for an unknown one, or a choice that the rig does not have."""
+        if self.rig == "development" and (self.camera == "coarse" or self.shapes != "mesh"):
+            raise UserError("--camera coarse and --shapes are rig fr3's: drop them, or choose --rig fr3.")
+        known = self._known()
+        names = known if self.objects == (EVERYTHING,) else self.objects
+        for name in names:
+            if name not in known:
+                raise unknown_name("object", name, (*known, EVERYTHING))
+        return tuple(dict.fromkeys(names))
+
+    def plan(self) -> list[Trial]:
+        """Object after object; trial i of an object is the same whichever others are asked for."""
+        known = self._known()
+        return [
+            Trial(known.index(name) * len(seeds.SEEDS[self.split]) + i, name)
+            for name in self.names()
+            for i in range(self.trials)
+        ]
+
+    def make(self) -> Callable[[Config, Path], Bench]:
+        """What makes a bench in every worker."""
+        if self.rig == "fr3":
+            return Fr3Bench(self.shapes, self.camera, self.contact)
+        return partial(Rig, ideal=self.camera == "ideal")
+
+    def _known(self) -> tuple[str, ...]:
+        if self.rig == "development" or self.shapes == "primitive":
+            return _trained()
+        from rig.meshes.objects import MESH_OBJECTS
+
+        return (*_trained(), *(name for name in MESH_OBJECTS if name not in _trained()))
+
+
+def run(
+    config: Config, policy: Path, series: Series, out: Path, workers: int, progress: Progress
+) -> dict[str, Any]:
+    """The table of `series`; trials that `out` has already are not run again.
+
+    Leaves trials.jsonl, table.json and a film of every failure and of each object's first success in `out`.
+    """
+    if not policy.is_file():
+        raise UserError(f"{policy}: no such file; make one with `ddgrasp export`.")
+    steps = round(series.seconds * contract.CONTROL_HZ)
+    world = replace(config.world, objects=_trained(), episode_steps=steps)
+    config = replace(config, seed=seeds.seed(series.split, series.number), world=world)
+    trials = series.plan()
+    out.mkdir(parents=True, exist_ok=True)
+    log = TrialLog(out / TRIALS_FILE, _header(config, policy, series))
+    todo = [trial for trial in trials if (trial.index, False) not in log.results]
+    with progress.task("trials", len(trials)) as task:
+        task.start_at(len(trials) - len(todo))
+        for result, film in run_trials(config, policy, todo, workers, series.make()):
+            shown = {r.object_name for r in log.results.values() if r.success}
+            log.append(result)
+            if film.steps and not (result.success and result.object_name in shown):
+                _keep(out, result, film)
+            task.advance(success=sum(r.success for r in log.results.values()) / len(log.results))
+    table = tabulate([log.results[trial.index, False] for trial in trials])
+    atomic_write_text(out / TABLE_FILE, json.dumps({"series": asdict(series), **table}, indent=1) + "\n")
+    return table
+
+
+def _keep(out: Path, result: TrialResult, film: Film) -> None:
+    outcome = "success" if result.success else "failure"
+    title = f"{result.object_name}, trial {result.index}: {outcome} {' '.join(result.events[-1:])}"
+    sheet = contact_sheet(film, title)
+    atomic_write_bytes(out / f"{result.object_name}-{result.index}-{outcome}.png", sheet)
+
+
+def tabulate(results: Sequence[TrialResult]) -> dict[str, Any]:
+    """Success with Wilson intervals by object and in total: of all, seen, unseen and other objects."""
+    names = tuple(dict.fromkeys(result.object_name for result in results))
+    groups = {
+        "seen": contract.SEEN_OBJECTS,
+        "unseen": contract.UNSEEN_OBJECTS,
+        "other": tuple(name for name in names if name not in _trained()),
+        "all": names,
+    }
+    rows = {
+        group: _success(r for r in results if r.object_name in members) for group, members in groups.items()
+    }
+    return {
+        "objects": {name: _success(r for r in results if r.object_name == name) for name in names},
+        **{group: row for group, row in rows.items() if row["n"]},
+        "faults": sum(any(" fault: " in event for event in result.events) for result in results),
+    }
+
+
+def describe(table: dict[str, Any]) -> str:
+    """The table as text."""
+    rows = {**table["objects"], **{k: table[k] for k in ("seen", "unseen", "other", "all") if k in table}}
+    lines = [f"{name:<12} {wilson.describe(row)}" for name, row in rows.items()]
+    return "\n".join([*lines, f"ended by a fault of the robot: {table['faults']}"])
+
+
+def _trained() -> tuple[str, ...]:
+    """The twelve objects of training's lists."""
+    return (*contract.SEEN_OBJECTS, *contract.UNSEEN_OBJECTS)
+
+
+def _success(results: Iterable[TrialResult]) -> dict[str, Any]:
+    outcomes = [result.success for result in results]
+    return wilson.success(sum(outcomes), len(outcomes))
+
+
+def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
+    """What the trials belong to; how many of which objects may grow."""
+    bench = {key: value for key, value in asdict(series).items() if key not in ("objects", "trials")}
+    return {
+        "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
+        "config_hash": artifacts.config_hash(config, STAGE),
+        **bench,
+    }

@@ -1,0 +1,156 @@
+"""Trials on the FR3 rig: mesh scene, its D455, what counts as success, and the table of a series."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("franky_sim", reason="needs pip install -e '.[fr3]'")
+pytest.importorskip("franky", reason="needs pip install -e '.[fr3]'")
+
+import xml.etree.ElementTree as ET
+
+from franky_sim.mujoco_simulator import MujocoSimulator
+
+from ddgrasp import contract
+from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
+from ddgrasp.progress import Progress
+from deploy.clock import SimClock
+from deploy.devices import fr3_camera
+from deploy.fr3_trials import free_host
+from deploy.trials import TrialResult
+from deploy_support import constant_bias, describe, write_policy
+from evaluation import rig_trials
+from evaluation.rig_trials import Series
+from mjx_envs.camera import nominal_camera
+from mjx_envs.scene import HOME_RAD
+from rig import seeds
+from rig.fr3 import scene
+from rig.fr3.picture import ScenePicture
+from rig.fr3.process import Fr3Rig
+
+PROFILE = contract.D455.scaled(0.25)
+T_WORLD_CAM = nominal_camera(PROFILE).T_world_cam
+STEREO = get_preset("demo").record.stereo
+
+
+@pytest.fixture(scope="module")
+def picture():
+    """The furnished scene with the wheel, as it is first seen; skips without OpenGL."""
+    sim = MujocoSimulator()
+    sim.add_robot(initial_q=list(HOME_RAD), initial_hand_width=0.08)
+    scene.furnish(sim.scene, scene.meshed("wheel"), 3)
+    try:
+        made = ScenePicture(ET.tostring(sim.scene, encoding="unicode"))
+    except UserError as error:
+        pytest.skip(str(error))
+    made.pose(made.model.qpos0)
+    yield made
+    made.close()
+
+
+def test_a_mesh_object_weighs_and_rests_as_described():
+    with Fr3Rig(free_host(), scene.meshed("mug")) as rig:
+        start_s, height_m = rig.channel.ask("state")["time_s"], scene.meshed("mug").rest_height_m
+        rig.channel.ask("place", x_m=0.5, y_m=0.1, yaw_rad=0.3)
+        while rig.channel.ask("state")["time_s"] < start_s + 0.5:
+            pass
+        at_m = rig.channel.ask("state")["object_position_m"]
+    np.testing.assert_allclose(at_m, [0.5, 0.1, height_m], atol=2e-3)
+
+
+def test_normals_and_geoms_are_those_of_the_scene(picture):
+    camera = fr3_camera.pinhole(PROFILE, T_WORLD_CAM)
+    buffers = picture.buffers(camera)
+    table = buffers.segmentation == picture.model.geom(scene.TABLE).id
+    assert table.mean() > 0.3
+    np.testing.assert_allclose(np.median(buffers.normal_w[table], axis=0), [0, 0, 1], atol=1e-3)
+    seen = buffers.depth_m > 0
+    np.testing.assert_allclose(np.linalg.norm(buffers.normal_w, axis=-1)[seen].mean(), 1.0, atol=0.01)
+    T, v, u = T_WORLD_CAM, *np.argwhere(table)[1000]
+    ray = np.array([(u + 0.5 - camera.cx_px) / camera.fx_px, (v + 0.5 - camera.cy_px) / camera.fy_px, 1.0])
+    height_m = (T[:3, 3] + T[:3, :3] @ ray * buffers.depth_m[v, u])[2]
+    assert height_m == pytest.approx(0.0, abs=5e-4)
+
+
+def test_the_d455_sees_the_table_to_a_millimetre_and_loses_black_rubber(picture):
+    rng = np.random.default_rng(0)
+    stereo = fr3_camera.stereo(STEREO, PROFILE, SimClock(), rng)(picture, T_WORLD_CAM, "wheel")
+    ideal = fr3_camera.ideal(PROFILE)(picture, T_WORLD_CAM, "wheel")
+    assert stereo.shape == ideal.shape == (180, 320) and stereo.dtype == np.uint16
+    geoms = picture.buffers(fr3_camera.pinhole(PROFILE, T_WORLD_CAM)).segmentation
+    table = geoms == picture.model.geom(scene.TABLE).id
+    error_mm = np.abs(stereo.astype(int) - ideal)[table & (stereo > 0)]
+    assert np.median(error_mm) <= 1.0
+    tyre = geoms == picture.model.geom("object_tyre").id
+    lost = [np.mean(stereo[part] == 0) for part in (tyre, table)]
+    assert lost[0] > 2 * lost[1] and lost[1] < 0.15
+
+
+def test_seeds_of_development_and_test_are_disjoint():
+    assert not set(seeds.SEEDS["development"]) & set(seeds.SEEDS["test"])
+    assert seeds.seed("test", 3) == seeds.SEEDS["test"][3]
+    with pytest.raises(ValueError, match="development has seeds 0 to 999, not 1000"):
+        seeds.seed("development", 1000)
+
+
+def test_a_trial_is_the_same_whichever_others_are_asked_for():
+    everything, some = Series(trials=3).plan(), Series(objects=("bread", "mug"), trials=2).plan()
+    assert len(everything) == 18 * 3 and set(some) < set(everything)
+    assert len({trial.index for trial in everything}) == len(everything)
+    assert [trial.object_name for trial in some] == ["bread"] * 2 + ["mug"] * 2
+
+
+@pytest.mark.parametrize(
+    ("series", "message"),
+    [
+        (Series(objects=("aple",)), "Unknown object 'aple'. Did you mean 'apple'"),
+        (Series(rig="development", objects=("mug",)), "Unknown object 'mug'"),
+        (Series(rig="development", camera="coarse"), "are rig fr3's"),
+    ],
+)
+def test_wrong_series_get_one_line(series, message):
+    with pytest.raises(UserError, match=message):
+        series.plan()
+
+
+def trial_result(name: str, index: int, success: bool, event: str = "") -> TrialResult:
+    return TrialResult(
+        index, name, False, success, 60, 0, 0, {}, [event] * bool(event), *([] for _ in range(5))
+    )
+
+
+def test_the_table_counts_groups_and_faults():
+    results = [trial_result("apple", i, i > 0) for i in range(4)]
+    results += [trial_result("wheel", 9, False, "step 3 (0.30 s) fault: it met something")]
+    results += [trial_result("mug", 12, True)]
+    table = rig_trials.tabulate(results)
+    counts = {
+        group: (table[group]["successes"], table[group]["n"]) for group in ("seen", "unseen", "other", "all")
+    }
+    assert counts == {"seen": (3, 4), "unseen": (0, 1), "other": (1, 1), "all": (4, 6)}
+    assert table["faults"] == 1 and table["objects"]["apple"]["rate"] == 0.75
+    assert "apple        75.0 % of 4" in rig_trials.describe(table)
+
+
+def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path):
+    policy = write_policy(
+        tmp_path / "policy.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.0, -1.0)
+    )
+    series = Series(objects=("cube",), trials=2, shapes="primitive", camera="ideal", seconds=0.5)
+    config = replace(get_preset("debug"))
+    out = tmp_path / "out"
+    table = rig_trials.run(config, policy, series, out, 0, Progress(quiet=True))
+    assert (table["all"]["successes"], table["all"]["n"], table["faults"]) == (0, 2, 0)
+    lines = (out / rig_trials.TRIALS_FILE).read_text().splitlines()
+    assert len(lines) == 3 and all(json.loads(line)["steps"] == 5 for line in lines[1:])
+    assert sorted(path.name for path in out.glob("*.png")) == [
+        "cube-4000-failure.png",
+        "cube-4001-failure.png",
+    ]
+    again = rig_trials.run(config, policy, series, out, 0, Progress(quiet=True))
+    assert again == table and (out / rig_trials.TRIALS_FILE).read_text().splitlines() == lines
+    with pytest.raises(UserError, match="trials of another policy or configuration"):
+        rig_trials.run(config, policy, replace(series, number=1), out, 0, Progress(quiet=True))
