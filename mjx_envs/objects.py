@@ -91,6 +91,7 @@ OBJECTS: dict[str, ObjectSpec] = {
         ObjectSpec(
             "banana", 3, mass_kg=0.12, friction=0.8, rgb=(0.90, 0.80, 0.15), rest_height_m=0.018,
             grasp_symmetry=2, capsules=_banana_arc(length_m=0.145, bend_rad=1.0, radius_m=0.018),
+            grasp_offset_m=(0.0, -0.006, 0.0),  # the arc's middle: its centroid lies on the inner side
             source="a medium banana, 18 cm; USDA FoodData Central 173944: medium 118 g",
         ),
         ObjectSpec(

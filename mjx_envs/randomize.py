@@ -118,13 +118,13 @@ def maybe_held(
     """qpos (16,) with, in `share` of the episodes, the object between the fingers, raised by up to the way to
     the lift target.
 
-    `half_width_m` () is the object's, along the fingers: they start 1 mm from it, and close if so commanded.
+    `half_width_m` () is the object's, along the fingers: they start on it, and press if so commanded.
     """
     k_choice, k_height = jax.random.split(key)
     way = contract.LIFT_TARGET_M[2] - qpos[QPOS.object_pos][2]
     up = jnp.array([0.0, 0.0, 1.0]) * way * jax.random.uniform(k_height)
     joints = inverse_kinematics.solve(qpos[QPOS.arm], grasp_pos + up, grasp_quat)
-    opening = jnp.minimum(half_width_m + 0.001, contract.GRIPPER_MAX_WIDTH_M / 2)
+    opening = jnp.minimum(half_width_m, contract.GRIPPER_MAX_WIDTH_M / 2)
     held = qpos.at[QPOS.arm].set(joints).at[QPOS.fingers].set(opening).at[QPOS.object_pos].add(up)
     return jnp.where(jax.random.uniform(k_choice) < share, held, qpos)
 

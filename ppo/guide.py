@@ -15,6 +15,9 @@ from mjx_envs import inverse_kinematics, kinematics
 
 REACH_STEP_M, LIFT_STEP_M = 0.04, 0.045
 """Length of a waypoint step, per control step."""
+TOUCH_STEP_M, SLOWING = 0.010, 0.3
+"""Length of the last step before the grasp, and what a step may be longer for each metre that is left: an arm
+that comes down on something at full speed stops itself, as Franka's do."""
 GAIN = 1.4
 """Over one: the arm lags behind its targets."""
 MAX_ACTION = 0.85
@@ -42,7 +45,8 @@ def guide(observation: Float[jax.Array, "40"]) -> Float[jax.Array, "8"]:
     reach = grasp.at[2].add(above)
     lift = grip + jnp.asarray(contract.LIFT_TARGET_M) - object_pos
     way = jnp.where(held, lift, reach) - grip
-    stride = jnp.where(held, LIFT_STEP_M, REACH_STEP_M)
+    reach_step = jnp.minimum(REACH_STEP_M, TOUCH_STEP_M + SLOWING * jnp.linalg.norm(way))
+    stride = jnp.where(held, LIFT_STEP_M, reach_step)
     waypoint = grip + way * jnp.minimum(1.0, stride / jnp.maximum(jnp.linalg.norm(way), 1e-6))
     target = inverse_kinematics.solve(q, waypoint, jnp.where(held, grip_quat, grasp_quat))
 

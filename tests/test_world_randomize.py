@@ -240,6 +240,6 @@ def test_latency_delays_commands_by_one_step_in_its_share_of_the_episodes():
         path.append(np.asarray(state.data.qpos[:, :9]) - np.append(scene.HOME_RAD, (0.04, 0.04)))
     path = np.stack(path)  # all start alike, far from the cube: only latency tells them apart
     prompt, delayed = path[:, ~late], path[:, late]
-    assert np.abs(prompt[0, :, 3]).min() > 0.01 and prompt[0, :, 7].max() < -0.01
+    assert np.abs(prompt[0, :, 3]).min() > 0.01 and prompt[0, :, 7].max() < -0.004
     assert np.abs(delayed[0]).max() < 1e-3  # holds still
     np.testing.assert_allclose(delayed[1], np.broadcast_to(prompt[0, :1], delayed[1].shape), atol=1e-3)
