@@ -95,6 +95,7 @@ _ADDED_AFTER_2 = {
     "deploy.franka.contact_torque_nm": 20.0,
     "deploy.franka.contact_force_n": 30.0,
     "deploy.franka.load_kg": 0.0,
+    "deploy.franka.stiffness_nm_rad": 400.0,
     "world.random.pregrasp_turn_rad": 0.0,
     "world.random.held_share": 0.0,
     "world.reward.distance": "funnel",

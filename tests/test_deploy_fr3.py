@@ -83,13 +83,16 @@ def joint_bias(gripper: float = -1.0, **joints: float) -> np.ndarray:
     return bias
 
 
-def stands(rig: Fr3Rig) -> bool:
-    """Whether the arm stops moving, by the rig's own account, within two seconds of its time."""
+def stands(rig: Fr3Rig, in_motion: bool = False) -> bool:
+    """Whether the arm stops moving, by the rig's own account, within two seconds of its time; without a
+    controller of the client's, unless `in_motion`."""
     start_s = rig.channel.ask("state")["time_s"]
     while (before := rig.channel.ask("state"))["time_s"] < start_s + 2.0:
         while (after := rig.channel.ask("state"))["time_s"] < before["time_s"] + 0.05:
             time.sleep(0.002)
-        if np.abs(np.subtract(after["q_rad"], before["q_rad"])).max() < 5e-4 and not after["in_motion"]:
+        if np.abs(np.subtract(after["q_rad"], before["q_rad"])).max() < 5e-4 and (
+            in_motion or not after["in_motion"]
+        ):
             return True
     return False
 
@@ -261,6 +264,22 @@ def test_limits_are_the_fr3_s_and_the_filter_keeps_them_before_the_arm_would(tmp
                 robot.read_state()
         assert rig.channel.ask("state")["q_rad"][3] > contract.FR3.joint_lower_rad[3]
         robot.stop()
+
+
+def test_an_arm_that_gets_no_further_command_brakes_by_itself(rig):
+    robot, clock = connect(config_for(HOST), lambda question: None)
+    robot.start()
+    before = np.array(rig.channel.ask("state")["q_rad"])
+    step = np.array([0.08, 0, 0, 0, 0, 0, 0])
+    robot.command(before + step, close=False)
+    clock.sleep_until(clock.now() + 0.1)
+    made = np.array(rig.channel.ask("state")["q_rad"]) - before
+    assert 0.5 * step[0] < made[0] < 1.1 * step[0]  # from rest; training's arm makes 0.92 of it
+    clock.sleep_until(clock.now() + 0.5)
+    after = np.array(rig.channel.ask("state")["q_rad"])
+    assert stands(rig, in_motion=True) and (after - before)[0] < 2.5 * step[0]
+    robot.stop()
+    assert stands(rig)
 
 
 def test_start_asks_first_then_homes_and_moves_slowly_to_the_start_pose():

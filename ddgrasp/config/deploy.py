@@ -31,14 +31,15 @@ class FrankaConfig(Section, name="deploy.franka"):
     kernel: Kernel = "realtime"
     """What this machine must run: a realtime kernel, as an arm that keeps 1 kHz wants, or any."""
     dynamics: Annotated[float, Range(0, 1, above=True)] = 0.2
-    """Share of the arm's speed limits that it may use; the safety filter lets no step ask for more. Its
-    acceleration is all its own, since an arm that follows late does not stop where the policy thinks."""
+    """Share of the arm's speed limits that it may use: the safety filter lets no step ask for more."""
     start_dynamics: Annotated[float, Range(0, 0.3, above=True)] = 0.05
     """The same for the move to the start pose."""
     contact_torque_nm: Annotated[float, Range(1, 100)] = 20.0
     """Torque on any joint at which the arm stops itself."""
     contact_force_n: Annotated[float, Range(1, 100)] = 30.0
     """Force at the hand, in newtons, and torque, in newton metres, at which the arm stops itself."""
+    stiffness_nm_rad: Annotated[float, Range(50, 3000)] = 400.0
+    """Stiffness of joints 1 to 4, 0.4 of it at the wrist: a stiffer arm presses harder on what it touches."""
     load_kg: Annotated[float, Range(0, 3)] = 0.0
     """Mass that the arm carries beside its hand, between the fingers. What is grasped need not be known: it
     must weigh less than the contact force allows."""

@@ -21,6 +21,7 @@ from deploy import kinematics
 from deploy.devices import franka_faults
 from deploy.devices.franka_hand import FrankaHand
 from deploy.devices.franka_probe import check_arm
+from deploy.devices.franka_spring import FrankaSpring
 from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotError, RobotState
 from mjx_envs.scene import HOME_RAD
@@ -28,8 +29,6 @@ from mjx_envs.scene import HOME_RAD
 AT_START_RAD = 0.01
 """No joint further than this from the start pose: the arm is there."""
 START_S = 120.0
-LATE = 1.5
-"""Control periods for which a joint keeps its speed if no command follows; then it brakes."""
 RECOVERY_S = 0.5
 """Until the arm's state says that an error is gone."""
 _POLL_S = 0.01
@@ -42,7 +41,7 @@ def make(setup: Setup) -> "FrankaRobot":
 
 
 class FrankaRobot:
-    """Joint position targets that pre-empt each other: franky replans smoothly from the moving state."""
+    """Joint targets that a compliant arm follows (`deploy.devices.franka_spring`)."""
 
     def __init__(
         self,
@@ -56,9 +55,9 @@ class FrankaRobot:
         self._config, self._clock = config, clock
         self._confirm, self._say = confirm, say
         self._limits = contract.ARMS[config.model]
-        self._speed_rad_s = np.array(config.speed_rad_s)
         self._arm: Any = None
         self._hand: FrankaHand | None = None
+        self._following: FrankaSpring | None = None
         self._errors: tuple[type[Exception], ...] = ()
         self._lost_by: tuple[type[Exception], ...] = ()
         self._holding = self._moved = self._faulted = False
@@ -78,9 +77,9 @@ class FrankaRobot:
         realtime = franky.RealtimeConfig
         kernel = realtime.Enforce if config.kernel == "realtime" else realtime.Ignore
         try:
-            # All of its acceleration: an arm that follows late does not stop where the policy thinks.
-            dynamics = franky.RelativeDynamicsFactor(config.dynamics, 1.0, 1.0)
-            self._arm = franky.Robot(config.host, relative_dynamics_factor=dynamics, realtime_config=kernel)
+            self._arm = franky.Robot(
+                config.host, relative_dynamics_factor=config.dynamics, realtime_config=kernel
+            )
             self._prepare()
             gripper = franky.Gripper(config.host)
             if self._confirm is not None:
@@ -99,28 +98,27 @@ class FrankaRobot:
             return RobotState(np.asarray(self._arm.state.q, float), self._hand.width_m(), self._clock.now())
 
     def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
-        """Set the (7,) joint target, pre-empting the last, and the gripper. Raises RobotError."""
+        """Set the (7,) joint target, in place of the last, and the gripper. Raises RobotError."""
         assert self._hand is not None
         with self._reporting():
-            away_rad = q_target_rad - np.asarray(self._arm.state.q)
-            speed = np.clip(away_rad / contract.CONTROL_DT_S, -1.0 * self._speed_rad_s, self._speed_rad_s)
-            duration = self._franky.Duration(round(1000 * LATE * contract.CONTROL_DT_S))
-            self._move(self._franky.JointVelocityMotion(speed, duration))
+            self._arm.poll_motion()
+            self._spring().follow(q_target_rad)
             self._hand.set(close)
         self._holding = False
 
     def hold(self) -> None:
-        """Brake as fast as the limits allow, then stay: once, since asking again would restart the stop.
+        """Brake and stay where the arm is now: asked again it stays there.
 
         Raises RobotError.
         """
         if not self._holding and self._moved and not self._faulted:
             with self._reporting():
-                self._move(self._franky.JointVelocityStopMotion())
+                self._arm.poll_motion()
+                self._spring().stay()
         self._holding = True
 
     def stop(self) -> None:
-        """Brake along a planned stop, wait for it, let go of the connection. The gripper keeps its grip.
+        """Brake, wait until the arm stands, let go of the connection. The gripper keeps its grip.
 
         Raises RobotError if the arm did not stop by itself before and cannot be told to.
         """
@@ -130,9 +128,12 @@ class FrankaRobot:
         try:
             if self._arm is not None and self._moved and not self._faulted:
                 with self._reporting():
-                    self._arm.move(self._franky.JointVelocityStopMotion())
+                    if self._following is not None:
+                        self._following.stop()
         finally:
-            self._arm = None
+            if self._following is not None:
+                self._following.release()
+            self._arm = self._following = None
 
     def time_s(self) -> float | None:
         """See TimedRobot: the arm's own clock; None once the arm has failed."""
@@ -178,9 +179,7 @@ class FrankaRobot:
         gripper.homing()
         if away_rad > AT_START_RAD:
             self._say("moving to the start pose")
-            share = self._config.start_dynamics
-            speed = min(1.0, share / self._config.dynamics)
-            slower = self._franky.RelativeDynamicsFactor(speed, share, share)
+            slower = min(1.0, self._config.start_dynamics / self._config.dynamics)
             self._arm.move(self._to(np.array(HOME_RAD), relative_dynamics_factor=slower), asynchronous=True)
             self._wait_at_start()
 
@@ -200,10 +199,11 @@ class FrankaRobot:
     def _to(self, q_target_rad: Float[np.ndarray, "7"], **options: Any) -> Any:
         return self._franky.JointMotion([float(q) for q in q_target_rad], **options)
 
-    def _move(self, motion: Any) -> None:
-        self._arm.poll_motion()
-        self._moved = True
-        self._arm.move(motion, asynchronous=True)
+    def _spring(self) -> FrankaSpring:
+        if self._following is None:
+            self._following = FrankaSpring(self._franky, self._arm, self._config.stiffness_nm_rad)
+            self._moved = True
+        return self._following
 
     @contextlib.contextmanager
     def _reporting(self):
