@@ -14,7 +14,7 @@ from ddgrasp.errors import UserError
 from deploy.clock import RobotClock
 from deploy.devices import fr3_camera
 from deploy.devices.franka_robot import FrankaRobot
-from deploy.loop import ControlLoop, Step
+from deploy.loop import ControlLoop
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
 from deploy.trials import Filming, Trial, TrialResult, result
@@ -85,17 +85,11 @@ class Fr3Runner:
         camera = fr3_camera.Fr3Camera(rig.host, clock, self._sense(profile, clock, rng), profile, pose)
         safety = safety_filter(settings, info, "franka")
         loop = ControlLoop(camera, robot, self._policy, safety, clock, loop_settings(settings, info))
-        judge, filming = _Judge(rig.channel), Filming(camera, config.deploy.film_every)
-
-        def look(step: Step) -> None:
-            judge.look()
-            filming.look(step)
-
-        report = loop.run(config.world.episode_steps, look)
+        filming = Filming(camera, config.deploy.film_every)
+        report = loop.run(config.world.episode_steps, filming.look)
         if report.interrupted:
             raise KeyboardInterrupt
-        judge.look()
-        return result(trial, judge.success and not report.fault, report), filming.film()
+        return result(trial, camera.success() and not report.fault, report), filming.film()
 
     def close(self) -> None:
         """Ends the rig."""
@@ -133,23 +127,6 @@ class _PlacingRobot(FrankaRobot):
         super().start()
         self._channel.ask("place", **self._place)
         self._ticks.sleep_until(self._ticks.now() + SETTLE_S)
-
-
-class _Judge:
-    """Whether the object has been at the lift target for the last HOLD_STEPS control steps."""
-
-    def __init__(self, channel: Channel):
-        self._channel, self._steps = channel, 0
-
-    def look(self) -> None:
-        """Once per control step."""
-        at_m = np.array(self._channel.ask("state")["object_position_m"])
-        away_m = float(np.linalg.norm(at_m - contract.LIFT_TARGET_M))
-        self._steps = self._steps + 1 if away_m < contract.LIFT_TOLERANCE_M else 0
-
-    @property
-    def success(self) -> bool:
-        return self._steps >= contract.HOLD_STEPS
 
 
 def free_host() -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt16
+from jaxtyping import Float, Float32, UInt8, UInt16
 
 Depth = UInt16[np.ndarray, "H W"] | Float32[np.ndarray, "H W"]
 
@@ -20,6 +20,8 @@ class Frame:
     """(H, W) planar depth: uint16 millimetres or float32 metres; 0 = invalid."""
     timestamp_s: float
     """When it was exposed, on the loop's clock."""
+    rgb: UInt8[np.ndarray, "h w 3"] | None = None
+    """Colour of the same moment, where the camera gives it anyway."""
 
 
 @dataclass(frozen=True)
@@ -106,4 +108,22 @@ class Clock(Protocol):
 
     def sleep_until(self, deadline_s: float) -> None:
         """Return at `deadline_s` or, where that has passed, at once. Never early."""
+        ...
+
+
+@runtime_checkable
+class Filmed(Protocol):
+    """A camera that takes pictures for people when it is asked."""
+
+    def picture(self) -> UInt8[np.ndarray, "H W 3"]:
+        """(H, W, 3) uint8 colour, from where depth is taken."""
+        ...
+
+
+@runtime_checkable
+class Judge(Protocol):
+    """A camera before a rig, which knows where the object is."""
+
+    def success(self) -> bool:
+        """Whether the object has been at the lift target for the last HOLD_STEPS control steps."""
         ...

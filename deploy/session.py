@@ -1,6 +1,6 @@
 """`ddgrasp deploy`: an exported policy on a robot and a camera chosen by name."""
 
-import json
+import itertools
 import math
 import signal
 import sys
@@ -11,9 +11,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_bytes, atomic_write_text
+from ddgrasp.files import atomic_write_bytes
 from deploy import dry_run
 from deploy.clock import RealClock, RobotClock
 from deploy.devices.options import SessionOptions, Setup
@@ -22,13 +23,14 @@ from deploy.dry_run import DryRun
 from deploy.interfaces import Clock, Robot, TimedRobot
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
+from deploy.record import REPORT_FILE, DeploymentRecord, verdict
 from deploy.setup import loop_settings, safety_filter, speed_notice
 
 
 def deploy(
     config: Config, policy_path: Path, options: SessionOptions, say: Callable[[str], None] = print
 ) -> LoopReport:
-    """Run the loop; events go to `say` as they happen, the report into a file of `options.out`.
+    """Run the loop; events go to `say` as they happen, what it did into a folder of `options.out`.
 
     SIGTERM ends it as Ctrl-C does: the robot holds, both devices are stopped, the report comes back. So it
     does when the robot fails; its `fault` says with what.
@@ -59,13 +61,33 @@ def _run(
     driven = DryRun(robot, say) if options.dry_run else robot
     loop = ControlLoop(camera, driven, policy, safety, clock, loop_settings(config.deploy, policy.info), say)
     steps = round(options.seconds * policy.info.control_hz) if math.isfinite(options.seconds) else None
-    report = loop.run(steps)
-    _write(options.out, report, say)
+    folder = _new_folder(options.out)
+    profile = contract.D455.scaled(policy.info.depth_width / contract.D455.width_px)
+    kept = DeploymentRecord(camera, profile, f"{options.camera}, D455 profile", config.deploy.film_every)
+    with kept.into(folder):
+        report = loop.run(steps, kept.look)
+    asked = options.yes or options.dry_run or report.interrupted or bool(report.fault)
+    success = None if options.dry_run else verdict(camera, _unasked if asked else ask_success)
+    about = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
+    kept.finish(folder, report, success, {**about, "dry_run": options.dry_run, "created": _stamp()})
+    say(f"report: {folder / REPORT_FILE}")
     if isinstance(driven, DryRun):
-        path = options.out / f"{_stamp()}-dry-run.png"
+        path = folder / "dry-run.png"
         atomic_write_bytes(path, dry_run.draw(driven.sent, safety.limits, 1.0 / policy.info.control_hz))
         say(f"drawn: {path}")
     return report
+
+
+def ask_success(question: str) -> bool | None:
+    """A person's answer on the terminal; None without one."""
+    if not sys.stdin.isatty():
+        return None
+    answer = input(f"{question} [y/n, or Enter for no answer] ").strip().lower()
+    return {"y": True, "yes": True, "n": False, "no": False}.get(answer)
+
+
+def _unasked(question: str) -> bool | None:
+    """Where nobody is to be asked."""
 
 
 def ask_person(question: str) -> None:
@@ -98,10 +120,11 @@ def _keep_time_of(robot: Robot, clock: Clock, options: SessionOptions) -> None:
     clock.follow(robot.time_s)
 
 
-def _write(folder: Path, report: LoopReport, say: Callable[[str], None]) -> None:
-    path = folder / f"{_stamp()}.json"
-    atomic_write_text(path, json.dumps(report.as_dict(), indent=1, allow_nan=False) + "\n")
-    say(f"report: {path}")
+def _new_folder(out: Path) -> Path:
+    """One that does not exist, named after the time of day."""
+    stamp = _stamp()
+    names = (stamp if not again else f"{stamp}-{again}" for again in itertools.count())
+    return next(folder for name in names if not (folder := out / name).exists())
 
 
 def _stamp() -> str:

@@ -19,7 +19,7 @@ from ddgrasp.config import Config
 from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
 from deploy.devices.rig_robot import SimRobot
-from deploy.interfaces import Depth
+from deploy.interfaces import Depth, Filmed
 from deploy.loop import ControlLoop, LoopReport, Step
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
@@ -166,14 +166,6 @@ def run_trials(
             yield future.result()
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
-
-
-class Filmed(Protocol):
-    """A camera that also takes pictures for people."""
-
-    def picture(self) -> UInt8[np.ndarray, "H W 3"]:
-        """(H, W, 3) uint8 colour."""
-        ...
 
 
 class Filming:

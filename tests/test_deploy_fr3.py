@@ -325,7 +325,7 @@ def test_killed_server_ends_the_lab_s_own_command_with_a_report(tmp_path, open_g
         threading.Thread(target=lambda: (_wait_for_motion(rig.host), rig.kill()), daemon=True).start()
         report = deploy(preset, path, options, say)
     assert f"the connection to {rig.host} is lost" in report.fault and report.steps < 600
-    written = json.loads(next((tmp_path / "reports").glob("*.json")).read_text())
+    written = json.loads(next((tmp_path / "reports").glob("*/report.json")).read_text())
     assert written["fault"] == report.fault and any("fault" in event for event in written["events"])
     with Fr3Rig("127.0.0.16", primitive("cube")):  # the ports are free again
         again = deploy(preset, path, replace(options, seconds=0.3), say)

@@ -77,9 +77,17 @@ class Fr3Camera:
     """
 
     def __init__(
-        self, host: str, clock: Clock, sense: Sense, profile: contract.CameraProfile, T_world_cam: Pose
+        self,
+        host: str,
+        clock: Clock,
+        sense: Sense,
+        profile: contract.CameraProfile,
+        T_world_cam: Pose,
+        in_colour: bool = False,
     ):
-        """`T_world_cam` (4, 4) is where the camera stands, `profile` the picture for people."""
+        """`T_world_cam` (4, 4) is where the camera stands, `profile` the picture for people, which comes
+        with every frame if `in_colour`."""
+        self._in_colour, self._held_steps = in_colour, 0
         self._host, self._clock, self._sense = host, clock, sense
         self._profile, self._T_world_cam = profile, T_world_cam
         self._channel: Channel | None = None
@@ -103,8 +111,11 @@ class Fr3Camera:
         try:
             self._channel.ask("slow", on=True)
             asked_s = self._clock.now()
-            self._picture.pose(np.array(self._channel.ask("state")["qpos"]))
-            frame = Frame(self._sense(self._picture, self._T_world_cam, self._object), asked_s)
+            state = self._channel.ask("state")
+            self._judge(np.array(state["object_position_m"]))
+            self._picture.pose(np.array(state["qpos"]))
+            depth = self._sense(self._picture, self._T_world_cam, self._object)
+            frame = Frame(depth, asked_s, self.picture() if self._in_colour else None)
             self._channel.ask("slow", on=False)
         except ChannelLost as error:
             raise CameraError(str(error)) from error
@@ -117,6 +128,14 @@ class Fr3Camera:
         if self._channel is not None:
             self._channel.close()
         self._picture = self._channel = None
+
+    def success(self) -> bool:
+        """See Judge; as of the last `read`, one for every control step."""
+        return self._held_steps >= contract.HOLD_STEPS
+
+    def _judge(self, object_m: np.ndarray) -> None:
+        held = np.linalg.norm(object_m - contract.LIFT_TARGET_M) < contract.LIFT_TOLERANCE_M
+        self._held_steps = self._held_steps + 1 if held else 0
 
     def picture(self) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour of the scene as it was last read, from the same place (for people)."""
@@ -139,4 +158,4 @@ def _at_place(setup: Setup, profile: contract.CameraProfile, sense: Sense) -> Fr
 
     config = setup.config
     pose = camera_pose(config, np.random.default_rng(config.seed))
-    return Fr3Camera(config.deploy.franka.host, setup.clock, sense, profile, pose)
+    return Fr3Camera(config.deploy.franka.host, setup.clock, sense, profile, pose, in_colour=True)

@@ -71,11 +71,12 @@ class RealSenseCamera:
             config.enable_device(self._serial)
         size = self._mode.width_px, self._mode.height_px
         config.enable_stream(rs.stream.depth, *size, rs.format.z16, self._stream_hz)
+        config.enable_stream(rs.stream.color, *size, rs.format.rgb8, self._stream_hz)
         try:
             active = pipeline.start(config)
         except RuntimeError as error:
             raise UserError(
-                f"no RealSense depth stream {size[0]}x{size[1]} at {self._stream_hz} Hz "
+                f"no RealSense depth and colour streams {size[0]}x{size[1]} at {self._stream_hz} Hz "
                 f"({error}); check the USB 3 cable and camera.serial {self._serial!r}."
             ) from error
         self._pipeline = pipeline
@@ -94,7 +95,9 @@ class RealSenseCamera:
         taken = frames.get_depth_frame() if frames else None
         if taken and taken.get_frame_number() != self._number:
             self._number = taken.get_frame_number()
-            self._frame = Frame(self.convert(np.asanyarray(taken.get_data())), self._exposed_s(taken))
+            color = frames.get_color_frame()
+            rgb = np.asanyarray(color.get_data()).copy() if color else None
+            self._frame = Frame(self.convert(np.asanyarray(taken.get_data())), self._exposed_s(taken), rgb)
         if self._frame is None:
             raise CameraError("the stream has started, but no frame has come yet")
         return self._frame

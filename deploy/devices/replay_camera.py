@@ -57,7 +57,8 @@ class ReplayCamera:
         index = min(elapsed, len(self._recording) - 1)
         if self._frame is None or index != self._shown:
             self._shown = index
-            self._frame = Frame(self._recording.depth_mm(index), self._start_s + index * self._period_s)
+            due_s = self._start_s + index * self._period_s
+            self._frame = Frame(self._recording.depth_mm(index), due_s, self._recording.rgb(index))
         return self._frame
 
     def stop(self) -> None:

@@ -57,6 +57,11 @@ class StereoCamera:
     def stop(self) -> None:
         """Nothing to close."""
 
+    def success(self) -> bool:
+        """See Judge."""
+        self._catch_up()
+        return self._world.success()
+
     def picture(self) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour picture of the scene as it stands, from the same place (for people)."""
         return self._camera.rgb(self._world.data, self._T_world_cam)

@@ -1,0 +1,123 @@
+"""What a deployment leaves behind: its frames as a recording, its steps, its report, a film, how it ended.
+
+A folder of deployments is a folder of recordings: `ddgrasp ddg fit --data runs/deployments` fits the
+generator to what the robot just saw.
+"""
+
+import json
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from ddgrasp import contract
+from ddgrasp.depth import to_millimetres
+from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_bytes, atomic_write_text
+from deploy.interfaces import Camera, Filmed, Judge
+from deploy.loop import LoopReport, Step
+from rig.film import Film, contact_sheet
+from sensors.recordings.recording import RecordingWriter
+
+STEPS_FILE, REPORT_FILE, FILM_FILE = "steps.jsonl", "report.json", "film.png"
+FILM_COLUMNS = 12
+"""Most pictures of the film strip: what comes later is thinned out evenly."""
+
+
+class DeploymentRecord:
+    """Collects what the loop did; the disk is a thread's, so that a step does not wait for it."""
+
+    def __init__(self, camera: Camera, profile: contract.CameraProfile, sensor: str, film_every: int):
+        """`profile` is the policy's picture; `film_every` as in `DeployConfig`."""
+        self._camera, self._every = camera, film_every
+        self._meta = {
+            "sensor": sensor, "fx_px": profile.fx_px, "baseline_m": profile.baseline_m,
+            "hz": contract.CONTROL_HZ, "consecutive_frames": True,
+        }  # fmt: skip
+        self._rows: list[dict[str, Any]] = []
+        self._queue: queue.Queue[tuple[np.ndarray, np.ndarray] | None] = queue.Queue()
+        self._film: list[tuple[int, UInt8[np.ndarray, "h w 3"], np.ndarray]] = []
+        self.frames = 0
+        self._trouble = ""
+
+    @contextmanager
+    def into(self, folder: Path) -> Iterator[None]:
+        """Frames become the recording `folder` when this ends, if there were any."""
+        thread = threading.Thread(target=self._write_frames, args=(folder,), daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            self._queue.put(None)
+            thread.join()
+
+    def look(self, step: Step) -> None:
+        """What the loop's `on_step` is called with."""
+        row = {"step": step.index, "q_rad": step.state.q_rad.tolist(), "width_m": float(step.state.width_m)}
+        row |= {"time_s": step.state.timestamp_s, "held": step.action is None}
+        row["action"] = None if step.action is None else np.asarray(step.action, float).tolist()
+        row["q_target_rad"] = None if step.q_target_rad is None else step.q_target_rad.tolist()
+        self._rows.append(row)
+        if step.frame is None:
+            return
+        rgb = step.frame.rgb
+        if rgb is None and step.index % self._every == 0 and isinstance(self._camera, Filmed):
+            rgb = self._camera.picture()
+        if rgb is None:
+            return
+        depth = step.frame.depth
+        depth_mm = depth if depth.dtype == np.uint16 else to_millimetres(depth)
+        row["frame"] = self.frames
+        self.frames += 1
+        self._queue.put((rgb, depth_mm))
+        self._keep(step.index, rgb, depth_mm)
+
+    def finish(self, folder: Path, report: LoopReport, success: bool | None, about: dict[str, Any]) -> None:
+        """Writes everything but the frames into `folder`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(folder / STEPS_FILE, "".join(json.dumps(row) + "\n" for row in self._rows))
+        values = {**about, "success": success, "frames": self.frames, **report.as_dict()}
+        if self._trouble:
+            values["frames_lost"] = self._trouble
+        atomic_write_text(folder / REPORT_FILE, json.dumps(values, indent=1, allow_nan=False) + "\n")
+        if self._film:
+            steps, rgb, depth_mm = zip(*self._film, strict=True)
+            film = Film(steps, np.stack(rgb), np.stack(depth_mm))
+            outcome = {True: "success", False: "failure", None: "not judged"}[success]
+            atomic_write_bytes(folder / FILM_FILE, contact_sheet(film, f"{outcome} {report.fault}"))
+
+    def _keep(self, index: int, rgb: np.ndarray, depth_mm: np.ndarray) -> None:
+        """One of at most twice `FILM_COLUMNS` pictures, every second one dropped when there are more."""
+        if index % self._every:
+            return
+        import cv2
+
+        size = depth_mm.shape[::-1]
+        self._film.append((index, cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), depth_mm))
+        if len(self._film) >= 2 * FILM_COLUMNS:
+            self._film, self._every = self._film[::2], 2 * self._every
+
+    def _write_frames(self, folder: Path) -> None:
+        first = self._queue.get()
+        if first is None:
+            return
+        try:
+            with RecordingWriter(folder, self._meta) as writer:
+                taken: tuple[np.ndarray, np.ndarray] | None = first
+                while taken is not None:
+                    writer.add(*taken)
+                    taken = self._queue.get()
+        except (UserError, OSError) as error:
+            self._trouble = str(error)  # the arm goes on; the report says what is missing
+
+
+def verdict(camera: Camera, ask: Callable[[str], bool | None]) -> bool | None:
+    """Whether the object was lifted and held: what the rig knows, else what a person answers, else None."""
+    if isinstance(camera, Judge):
+        return camera.success()
+    return ask("Is the object in the hand, lifted to where it belongs?")

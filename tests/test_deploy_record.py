@@ -1,0 +1,109 @@
+"""What a deployment leaves: a recording that the generator can be fitted to, steps, report, film, verdict."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ddgrasp.presets import get_preset
+from deploy import session
+from deploy.devices.options import SessionOptions
+from deploy.interfaces import Frame
+from deploy_support import KinematicRobot, constant_bias, describe, write_policy
+from sensors.recordings.recording import Recording, find_recordings
+
+DEPTH_MM = np.full((180, 320), 700, np.uint16)
+DEPTH_MM[:20] = 0
+
+
+class ColourCamera:
+    """Depth and colour of an unchanging scene, as a RealSense gives both."""
+
+    def __init__(self, clock, fails_at=None):
+        self._clock, self._fails_at, self._reads = clock, fails_at, 0
+
+    def start(self):
+        pass
+
+    def read(self):
+        self._reads += 1
+        if self._reads == self._fails_at:
+            raise KeyboardInterrupt
+        rgb = np.full((480, 848, 3), self._reads, np.uint8)
+        return Frame(DEPTH_MM + np.uint16(self._reads), self._clock.now(), rgb)
+
+    def stop(self):
+        pass
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Deploys a policy that bends joint 1, before a camera; (report, the folder it left)."""
+    policy = write_policy(
+        tmp_path / "p.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.2)
+    )
+
+    def deployed(camera=ColourCamera, **changes):
+        monkeypatch.setattr(
+            session, "make_devices", lambda setup: (KinematicRobot(setup.clock), camera(setup.clock))
+        )
+        options = replace(SessionOptions(seconds=0.5, out=tmp_path / "kept"), **changes)
+        before = set(options.out.glob("*"))
+        report = session.deploy(get_preset("debug"), policy, options, lambda text: None)
+        (folder,) = set(options.out.glob("*")) - before
+        return report, folder
+
+    return deployed
+
+
+def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
+    report, folder = run()
+    recording = Recording.open(folder)
+    assert len(recording) == report.steps == 5 and recording.consecutive and not recording.skipped
+    np.testing.assert_array_equal(recording.depth_mm(2)[:, 0], (DEPTH_MM + np.uint16(3))[:, 0])
+    assert recording.optics() == pytest.approx((168.6, 0.095), abs=0.1)
+    rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
+    assert [row["frame"] for row in rows] == list(range(5)) and len(rows[0]["q_rad"]) == 7
+    assert rows[1]["action"][0] == pytest.approx(0.2) and rows[1]["q_target_rad"][0] > rows[1]["q_rad"][0]
+    kept = json.loads((folder / "report.json").read_text())
+    assert (kept["steps"], kept["frames"], kept["success"], kept["robot"]) == (5, 5, None, "sim")
+    assert (folder / "film.png").stat().st_size > 1000
+
+
+def test_two_in_a_second_are_two_recordings_of_one_folder(run, tmp_path):
+    folders = {run()[1] for _ in range(2)}
+    assert {recording.path for recording in find_recordings(tmp_path / "kept")} == folders
+
+
+def test_an_interrupted_one_is_kept_as_far_as_it_went(run):
+    report, folder = run(lambda clock: ColourCamera(clock, fails_at=4), seconds=60.0)
+    assert report.interrupted and len(Recording.open(folder)) == 3
+    assert json.loads((folder / "report.json").read_text())["interrupted"]
+
+
+@pytest.mark.parametrize(("answer", "success"), [("y", True), ("No", False), ("", None), ("perhaps", None)])
+def test_a_person_says_how_it_ended(run, monkeypatch, answer, success):
+    monkeypatch.setattr(session.sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: answer)
+    _, folder = run()
+    assert json.loads((folder / "report.json").read_text())["success"] is success
+
+
+def test_the_rig_judges_by_itself(run):
+    class Judging(ColourCamera):
+        def success(self):
+            return True
+
+    _, folder = run(Judging, yes=True)
+    assert json.loads((folder / "report.json").read_text())["success"] is True
+
+
+def test_a_disk_that_takes_no_frames_stops_nothing(run, monkeypatch):
+    def full(self, rgb, depth_mm):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("deploy.record.RecordingWriter.add", full)
+    report, folder = run()
+    kept = json.loads((folder / "report.json").read_text())
+    assert report.steps == 5 and "No space left" in kept["frames_lost"] and not (folder / "depth").exists()
