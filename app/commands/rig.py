@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from ddgrasp.config.checks import Range, Seed
 
@@ -12,7 +12,9 @@ class RigFr3:
     """Serve an FR3 with table, wall, clutter and one object on this machine, until Ctrl-C."""
 
     object_name: str = "cube"
-    """What lies on the table."""
+    """What lies on the table; `ddgrasp objects list --meshes` names them."""
+    shapes: Literal["mesh", "primitive"] = "mesh"
+    """mesh, or the development rig's primitives."""
     host: str = "127.0.0.1"
     """Address of this machine to listen on: ports 1337 to 1339."""
     seed: Seed = 0
@@ -22,10 +24,11 @@ class RigFr3:
 
     def run(self) -> None:
         """Serves, and says how to drive it."""
+        from rig.fr3 import scene
         from rig.fr3.process import Fr3Rig
-        from rig.fr3.scene import primitive
 
-        with Fr3Rig(self.host, primitive(self.object_name), self.seed, self.speed) as rig:
+        thing = (scene.meshed if self.shapes == "mesh" else scene.primitive)(self.object_name)
+        with Fr3Rig(self.host, thing, self.seed, self.speed) as rig:
             drive = f"ddgrasp deploy --policy FILE.onnx --robot franka --host {self.host} --camera rig"
             print(f"FR3 at {self.host} before {self.object_name!r}. Drive it: {drive}", flush=True)
             while rig.running():
