@@ -10,16 +10,19 @@ from sensors.models.materials import OBJECT_MATERIALS, Material, object_material
 
 
 def test_every_object_has_a_material_with_a_source():
-    assert set(OBJECT_MATERIALS) == set(OBJECTS)
+    meshes = pytest.importorskip("rig.meshes.objects", reason="needs pip install -e '.[fr3]'").MESH_OBJECTS
+    assert set(OBJECT_MATERIALS) == set(OBJECTS) | set(meshes)
     assert all(listed.source for listed in OBJECT_MATERIALS.values())
     for listed in OBJECT_MATERIALS.values():
         for material in (listed.surface, *listed.parts.values()):
             assert 0 < material.albedo < 1 and 0 <= material.specular <= 5
 
 
-def test_parts_are_named_after_slots_that_exist():
+def test_parts_are_named_after_slots_or_surfaces_that_exist():
+    meshes = pytest.importorskip("rig.meshes.objects", reason="needs pip install -e '.[fr3]'").MESH_OBJECTS
     model = RigWorld(objects=tuple(OBJECTS)).model
     names = {model.geom(i).name for i in range(model.ngeom)}
+    names |= {part.name for described in meshes.values() for part in described.shape()}
     assert {part for listed in OBJECT_MATERIALS.values() for part in listed.parts} <= names
 
 
