@@ -13,8 +13,8 @@ from ddgrasp.config.deploy import FrankaConfig
 from ddgrasp.errors import UserError
 from deploy.clock import RobotClock
 from deploy.devices import fr3_camera
-from deploy.devices.franka_robot import FrankaRobot
-from deploy.loop import ControlLoop
+from deploy.devices.franka_robot import LOST, FrankaRobot
+from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
 from deploy.trials import Filming, Trial, TrialResult, result
@@ -32,6 +32,7 @@ AWAY_M = (1.05, 0.0)
 """Where the object waits, on the table beyond the camera, while the arm goes to its start."""
 SETTLE_S = 0.3
 """From when the object is put down to the first step."""
+ATTEMPTS = 3
 _STREAM = 0x467233
 """Keeps these trials' random numbers apart from every other stage's ("Fr3")."""
 
@@ -55,6 +56,9 @@ class Fr3Runner:
     """One trial after the other; a rig runs as long as the object stays the same."""
 
     def __init__(self, config: Config, policy_path: Path, bench: Fr3Bench):
+        import cv2
+
+        cv2.setNumThreads(1)  # a rig for every core is the faster way to use them
         self._bench = bench
         self._policy = OnnxPolicy(
             policy_path, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None
@@ -64,7 +68,21 @@ class Fr3Runner:
         self._name = ""
 
     def run(self, trial: Trial) -> tuple[TrialResult, Film]:
-        """Puts the object down where the trial says, runs the policy, and judges by where the object is."""
+        """Puts the object down where the trial says, runs the policy, and judges by where the object is.
+
+        A connection that is lost says that this machine was too busy to keep it, and nothing of the policy:
+        the trial is run again on a fresh rig. Raises UserError if it is lost `ATTEMPTS` times.
+        """
+        for _ in range(ATTEMPTS):
+            report, success, film = self._attempt(trial)
+            if not report.fault.startswith(LOST):
+                return result(trial, success, report), film
+            self.close()
+        raise UserError(
+            f"{report.fault} ({ATTEMPTS} times): use fewer --workers, or end what else runs here."
+        )
+
+    def _attempt(self, trial: Trial) -> tuple[LoopReport, bool, Film]:
         config = self._config
         rig = self._rig_with(trial.object_name)
         rng = np.random.default_rng([config.seed, _STREAM, trial.index])
@@ -89,7 +107,7 @@ class Fr3Runner:
         report = loop.run(config.world.episode_steps, filming.look)
         if report.interrupted:
             raise KeyboardInterrupt
-        return result(trial, camera.success() and not report.fault, report), filming.film()
+        return report, camera.success() and not report.fault, filming.film()
 
     def close(self) -> None:
         """Ends the rig."""

@@ -29,6 +29,8 @@ from mjx_envs.scene import HOME_RAD
 AT_START_RAD = 0.01
 """No joint further than this from the start pose: the arm is there."""
 START_S = 120.0
+LOST = "the connection to"
+"""How a fault begins that is the network's."""
 RECOVERY_S = 0.5
 """Until the arm's state says that an error is gone."""
 _POLL_S = 0.01
@@ -236,7 +238,7 @@ class FrankaRobot:
 
     def _lost(self, error: Exception) -> str:
         said = franka_faults.one_line(error)
-        return f"the connection to {self._config.host} is lost ({said}): the arm stands by itself"
+        return f"{LOST} {self._config.host} is lost ({said}): the arm stands by itself"
 
 
 def load_franky() -> Any:

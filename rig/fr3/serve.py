@@ -23,7 +23,7 @@ from rig.fr3.reflex import ReflexServer
 
 TICK_S = 0.001
 COMMAND_WAIT_S = 0.05
-SLOW_TICK_S = 0.2
+SLOW_TICK_S = 0.05
 """Wall-clock time of a tick while somebody takes a picture: time nearly stands still, and the client, which
 gives up after a second without a state, goes on hearing of the arm."""
 
