@@ -34,7 +34,7 @@ class DeploymentRecord:
 
     def __init__(self, camera: Camera, profile: contract.CameraProfile, sensor: str, film_every: int):
         """`profile` is the policy's picture; `film_every` as in `DeployConfig`."""
-        self._camera, self._every = camera, film_every
+        self._camera, self._picture_every, self._film_every = camera, film_every, film_every
         self._meta = {
             "sensor": sensor, "fx_px": profile.fx_px, "baseline_m": profile.baseline_m,
             "hz": contract.CONTROL_HZ, "consecutive_frames": True,
@@ -66,7 +66,7 @@ class DeploymentRecord:
         if step.frame is None:
             return
         rgb = step.frame.rgb
-        if rgb is None and step.index % self._every == 0 and isinstance(self._camera, Filmed):
+        if rgb is None and step.index % self._picture_every == 0 and isinstance(self._camera, Filmed):
             rgb = self._camera.picture()
         if rgb is None:
             return
@@ -93,14 +93,14 @@ class DeploymentRecord:
 
     def _keep(self, index: int, rgb: np.ndarray, depth_mm: np.ndarray) -> None:
         """One of at most twice `FILM_COLUMNS` pictures, every second one dropped when there are more."""
-        if index % self._every:
+        if index % self._film_every:
             return
         import cv2
 
         size = depth_mm.shape[::-1]
         self._film.append((index, cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), depth_mm))
         if len(self._film) >= 2 * FILM_COLUMNS:
-            self._film, self._every = self._film[::2], 2 * self._every
+            self._film, self._film_every = self._film[::2], 2 * self._film_every
 
     def _write_frames(self, folder: Path) -> None:
         first = self._queue.get()

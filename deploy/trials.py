@@ -91,7 +91,7 @@ class Rig:
         """`ideal` looks through a camera without errors instead of the stereo camera."""
         import cv2
 
-        from rig.camera import IdealCamera, make_camera
+        from rig.camera import make_camera
         from rig.world import make_world
 
         cv2.setNumThreads(1)
@@ -100,11 +100,7 @@ class Rig:
             policy_path, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None
         )
         self._world = make_world(config.world)
-        self._camera = (
-            IdealCamera(self._world.model, config.record.stereo, config.world.profile)
-            if ideal
-            else make_camera(config, self._world)
-        )
+        self._camera = make_camera(config, self._world, ideal)
 
     def run(self, trial: Trial) -> tuple[TrialResult, Film]:
         """Run one trial. The same trial gives the same result on the simulated clock."""

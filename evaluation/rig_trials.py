@@ -13,7 +13,7 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from ddgrasp.progress import Progress
-from deploy.fr3_trials import Fr3Bench
+from deploy.fr3_trials import Fr3Bench, Shapes, Sight
 from deploy.stage import STAGE
 from deploy.trial_log import TrialLog
 from deploy.trials import Bench, Rig, Trial, TrialResult, run_trials
@@ -22,8 +22,6 @@ from rig import seeds
 from rig.film import Film, contact_sheet
 
 RigName = Literal["development", "fr3"]
-Shapes = Literal["mesh", "primitive"]
-Sight = Literal["stereo", "coarse", "ideal"]
 TRIALS_FILE, TABLE_FILE = "trials.jsonl", "table.json"
 EVERYTHING = "all"
 

@@ -21,8 +21,15 @@ FAR_M = 10.0
 class RigCamera:
     """Looks at `data` of `model`; reads both anew for every frame, so they may change in place."""
 
-    def __init__(self, model: mujoco.MjModel, config: StereoConfig, profile: contract.CameraProfile):
-        self.model = model
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        config: StereoConfig,
+        profile: contract.CameraProfile,
+        ideal: bool = False,
+    ):
+        """`ideal` depth is as rendered."""
+        self.model, self._ideal = model, ideal
         self.stereo = ActiveStereo(config, profile)
 
     def depth_mm(
@@ -40,6 +47,8 @@ class RigCamera:
         def draw_depth(camera: Camera) -> Float[np.ndarray, "H W"]:
             return render_depth(self.model, data, camera, far_m=FAR_M)
 
+        if self._ideal:
+            return to_millimetres(draw_depth(self.stereo.camera(T_world_cam)))
         return self.stereo.sense(draw, T_world_cam, rng, rig_materials(self.model, object_name), draw_depth)
 
     def rgb(self, data: mujoco.MjData, T_world_cam: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "H W 3"]:
@@ -48,23 +57,9 @@ class RigCamera:
         return np.rint(np.clip(buffers.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-class IdealCamera(RigCamera):
-    """The same camera without errors."""
-
-    def depth_mm(
-        self,
-        data: mujoco.MjData,
-        T_world_cam: Float[np.ndarray, "4 4"],
-        rng: np.random.Generator,
-        object_name: str = "",
-    ) -> UInt16[np.ndarray, "H W"]:
-        """(H, W) uint16 millimetres as rendered."""
-        return to_millimetres(render_depth(self.model, data, self.stereo.camera(T_world_cam), far_m=FAR_M))
-
-
-def make_camera(config: Config, world: RigWorld) -> RigCamera:
-    """The configured camera, before `world`."""
-    return RigCamera(world.model, config.record.stereo, config.world.profile)
+def make_camera(config: Config, world: RigWorld, ideal: bool = False) -> RigCamera:
+    """The configured camera, before `world`; `ideal` makes no errors."""
+    return RigCamera(world.model, config.record.stereo, config.world.profile, ideal)
 
 
 def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:
