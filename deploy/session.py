@@ -66,8 +66,8 @@ def _run(
     kept = DeploymentRecord(camera, profile, f"{options.camera}, D455 profile", config.deploy.film_every)
     with kept.into(folder):
         report = loop.run(steps, kept.look)
-    asked = options.yes or options.dry_run or report.interrupted or bool(report.fault)
-    success = None if options.dry_run else verdict(camera, _unasked if asked else ask_success)
+    unattended = options.yes or report.interrupted or bool(report.fault)
+    success = None if options.dry_run else verdict(camera, _unasked if unattended else ask_success)
     about = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
     kept.finish(folder, report, success, {**about, "dry_run": options.dry_run, "created": _stamp()})
     say(f"report: {folder / REPORT_FILE}")
@@ -82,7 +82,10 @@ def ask_success(question: str) -> bool | None:
     """A person's answer on the terminal; None without one."""
     if not sys.stdin.isatty():
         return None
-    answer = input(f"{question} [y/n, or Enter for no answer] ").strip().lower()
+    try:
+        answer = input(f"{question} [y/n, or Enter for no answer] ").strip().lower()
+    except (EOFError, KeyboardInterrupt):  # whoever leaves here still wants the report
+        return None
     return {"y": True, "yes": True, "n": False, "no": False}.get(answer)
 
 
