@@ -35,6 +35,7 @@ _DEBUG_DDG = DDGConfig(
     depth=DDGDepthConfig(height_px=90, width_px=160),
     unet=UNetConfig(widths=(16, 24), blocks=(0, 1), attention_heads=2),
     training=DDGTrainingConfig(steps=20, batch_size=4, checkpoint_every=10),
+    sampling=SamplingConfig(steps=2, batch_size=4),
 )
 _PAPER_DDG = DDGConfig(
     unet=UNetConfig(space_to_depth=2, widths=(96, 192, 384), blocks=(2, 2, 2), attention_heads=8),
@@ -44,6 +45,7 @@ _PAPER_DDG = DDGConfig(
 
 DEBUG = Config(
     preset="debug",
+    world=WorldConfig(episode_steps=45),
     teacher=TeacherConfig(
         start="pretrained/teacher",
         total_steps=160,
@@ -69,7 +71,7 @@ DEBUG = Config(
     ),
     export=ExportConfig(parity_batches=4, latency_runs=20),
     deploy=DeployConfig(realtime_trials=1),
-    evaluation=EvalConfig(teacher_trials=16, student_trials=4, rig_trials=4),
+    evaluation=EvalConfig(teacher_trials=16, student_trials=2, rig_trials=2),
     score=ScoreConfig(
         trajectories=3,
         frames=4,
