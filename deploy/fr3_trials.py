@@ -17,7 +17,7 @@ from deploy.devices.franka_robot import LOST, FrankaRobot
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
-from deploy.trials import Filming, Trial, TrialResult, result
+from deploy.trials import Filming, Trial, TrialResult, Watch, result
 from rig.camera import camera_pose
 from rig.film import Film
 from rig.fr3 import scene
@@ -67,14 +67,14 @@ class Fr3Runner:
         self._rig: Fr3Rig | None = None
         self._name = ""
 
-    def run(self, trial: Trial) -> tuple[TrialResult, Film]:
+    def run(self, trial: Trial, watch: Watch | None = None) -> tuple[TrialResult, Film]:
         """Puts the object down where the trial says, runs the policy, and judges by where the object is.
 
         A connection that is lost says that this machine was too busy to keep it, and nothing of the policy:
         the trial is run again on a fresh rig. Raises UserError if it is lost `ATTEMPTS` times.
         """
         for _ in range(ATTEMPTS):
-            report, success, film = self._attempt(trial)
+            report, success, film = self._attempt(trial, watch)
             if not report.fault.startswith(LOST):
                 return result(trial, success, report), film
             self.close()
@@ -82,7 +82,7 @@ class Fr3Runner:
             f"{report.fault} ({ATTEMPTS} times): use fewer --workers, or end what else runs here."
         )
 
-    def _attempt(self, trial: Trial) -> tuple[LoopReport, bool, Film]:
+    def _attempt(self, trial: Trial, watch: Watch | None) -> tuple[LoopReport, bool, Film]:
         config = self._config
         rig = self._rig_with(trial.object_name)
         rng = np.random.default_rng([config.seed, _STREAM, trial.index])
@@ -103,7 +103,7 @@ class Fr3Runner:
         camera = fr3_camera.Fr3Camera(rig.host, clock, self._sense(profile, clock, rng), profile, pose)
         safety = safety_filter(settings, info, "franka")
         loop = ControlLoop(camera, robot, self._policy, safety, clock, loop_settings(settings, info))
-        filming = Filming(camera, config.deploy.film_every)
+        filming = Filming(camera, config.deploy.film_every, watch)
         report = loop.run(config.world.episode_steps, filming.look)
         if report.interrupted:
             raise KeyboardInterrupt

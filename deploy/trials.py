@@ -72,10 +72,14 @@ def plan(config: Config) -> list[Trial]:
     return simulated + real
 
 
+Watch = Callable[[Step, Filmed], None]
+"""Is called after every step, with the camera of the trial for colour pictures."""
+
+
 class Bench(Protocol):
     """Somewhere to try a policy."""
 
-    def run(self, trial: Trial) -> tuple[TrialResult, Film]:
+    def run(self, trial: Trial, watch: Watch | None = None) -> tuple[TrialResult, Film]:
         """One trial."""
         ...
 
@@ -102,7 +106,7 @@ class Rig:
         self._world = make_world(config.world)
         self._camera = make_camera(config, self._world, ideal)
 
-    def run(self, trial: Trial) -> tuple[TrialResult, Film]:
+    def run(self, trial: Trial, watch: Watch | None = None) -> tuple[TrialResult, Film]:
         """Run one trial. The same trial gives the same result on the simulated clock."""
         from rig.camera import camera_pose
 
@@ -118,7 +122,7 @@ class Rig:
         )
         safety = safety_filter(config.deploy, self._policy.info)
         loop = ControlLoop(camera, robot, self._policy, safety, clock, settings)
-        filming = Filming(camera, config.deploy.film_every)
+        filming = Filming(camera, config.deploy.film_every, watch)
         # Drawing for people takes the time of a period: not while time is measured.
         report = loop.run(config.world.episode_steps, None if trial.realtime else filming.look)
         if report.interrupted:
@@ -165,16 +169,18 @@ def run_trials(
 
 
 class Filming:
-    """Collects a picture every few steps."""
+    """Collects a picture every few steps, and shows every step to who watches."""
 
-    def __init__(self, camera: Filmed, every: int):
-        self._camera, self._every = camera, every
+    def __init__(self, camera: Filmed, every: int, watch: Watch | None = None):
+        self._camera, self._every, self._watch = camera, every, watch
         self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
 
     def look(self, step: Step) -> None:
         """Takes the picture if it is due; what the loop's `on_step` is called with."""
         if step.index % self._every == 0 and step.frame is not None:
             self._columns.append((step.index, self._camera.picture(), step.frame.depth))
+        if self._watch is not None:
+            self._watch(step, self._camera)
 
     def film(self) -> Film:
         """The pictures so far."""

@@ -70,6 +70,14 @@ class Series:
             for i in range(self.trials)
         ]
 
+    def configured(self, config: Config, policy: Path) -> Config:
+        """`config` with the trials' length, seed and objects. UserError if `policy` is no file."""
+        if not policy.is_file():
+            raise UserError(f"{policy}: no such file; make one with `ddgrasp export`.")
+        steps = round(self.seconds * contract.CONTROL_HZ)
+        world = replace(config.world, objects=_trained(), episode_steps=steps)
+        return replace(config, seed=seeds.seed(self.split, self.number), world=world)
+
     def make(self) -> Callable[[Config, Path], Bench]:
         """What makes a bench in every worker."""
         if self.rig == "fr3":
@@ -91,12 +99,7 @@ def run(
 
     Leaves trials.jsonl, table.json and a film of every failure and of each object's first success in `out`.
     """
-    if not policy.is_file():
-        raise UserError(f"{policy}: no such file; make one with `ddgrasp export`.")
-    steps = round(series.seconds * contract.CONTROL_HZ)
-    world = replace(config.world, objects=_trained(), episode_steps=steps)
-    config = replace(config, seed=seeds.seed(series.split, series.number), world=world)
-    trials = series.plan()
+    config, trials = series.configured(config, policy), series.plan()
     out.mkdir(parents=True, exist_ok=True)
     log = TrialLog(out / TRIALS_FILE, _header(config, policy, series))
     todo = [trial for trial in trials if (trial.index, False) not in log.results]

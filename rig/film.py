@@ -42,11 +42,15 @@ def _row(frames: np.ndarray) -> np.ndarray:
 
 
 def _colored(depth_mm: np.ndarray) -> np.ndarray:
-    """(T, H, W, 3) uint8, near is bright; one scale over all frames."""
-    import cv2
-
     valid = depth_mm[depth_mm > 0]
     near, far = np.percentile(valid, (1, 99)) if valid.size else (0.0, 1.0)
+    return colored(depth_mm, near, far)
+
+
+def colored(depth_mm: UInt16[np.ndarray, "*T H W"], near: float, far: float) -> UInt8[np.ndarray, "*T H W 3"]:
+    """(..., H, W, 3) uint8: bright at `near` (mm), dark at `far` and beyond, magenta where there is none."""
+    import cv2
+
     nearness = np.clip((far - depth_mm.astype(np.float32)) / max(far - near, 1.0), 0, 1)
     grey = np.rint(255 * nearness).astype(np.uint8)
     flat = cv2.applyColorMap(grey.reshape(-1, 1), cv2.COLORMAP_VIRIDIS)

@@ -19,6 +19,7 @@ from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThres
 from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
 from app.commands.parsing import parsed
+from app.commands.play import Play
 from app.commands.rig import RigFr3
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
@@ -47,6 +48,7 @@ class Run(FromPreset):
 
 
 COMMANDS: dict[str, type] = {
+    "play": Play,
     "run": Run,
     "teacher train": TeacherTrain,
     "teacher eval": TeacherEval,

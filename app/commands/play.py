@@ -1,0 +1,107 @@
+"""ddgrasp play: watch a policy grasp."""
+
+import contextlib
+import os
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from ddgrasp.config.checks import Count, Range
+from ddgrasp.errors import UserError
+
+if TYPE_CHECKING:
+    from deploy.trials import Bench, Trial
+    from deploy.viewers import Viewer
+
+WEB_PORT = 9090
+"""Rerun's own, of its web viewer."""
+
+
+@dataclass(frozen=True)
+class Play:
+    """Watch the pretrained student, or a policy of yours, grasp in simulation: a film, or Rerun's viewer."""
+
+    policy: Path | None = None
+    """ONNX file that `ddgrasp export` wrote; without it the student under pretrained/."""
+    objects: tuple[str, ...] = ("apple", "banana", "can")
+    """Names, or all (`ddgrasp objects list` has them)."""
+    rig: Literal["development", "fr3"] = "development"
+    """development (MuJoCo's Franka, seconds a trial) or fr3 (the test rig: another arm behind Franka's own
+    protocol, meshes; a minute a trial)."""
+    camera: Literal["stereo", "ideal"] = "stereo"
+    """stereo (a D455's errors) or ideal (none)."""
+    trials: Count = 1
+    """How many with every object."""
+    seconds: Annotated[float, Range(0.5, 60)] = 6.0
+    """Length of a trial."""
+    number: Annotated[int, Range(0, 999)] = 0
+    """Another number, other places of the objects."""
+    viewer: Literal["film", "rerun", "web"] = "film"
+    """film (a video file), rerun (a window), or web (in the browser, also of another machine)."""
+    out: Path = Path("runs/play.mp4")
+    """The film, .mp4, or .webm for browsers; .rrd keeps what Rerun would show."""
+
+    def run(self) -> None:
+        """Runs the trials, prints how each ended, and where the film is."""
+        from app.commands.student import config_of
+        from evaluation.rig_trials import Series
+
+        series = Series(
+            self.rig, self.objects, self.trials, number=self.number, camera=self.camera, seconds=self.seconds
+        )
+        trials = series.plan()
+        viewer = self._viewer()
+        policy = self.policy or _pretrained()
+        config = series.configured(config_of(policy, None), policy)
+        bench = series.make()(config, policy)
+        try:
+            lifted = sum(_watched(bench, trial, viewer) for trial in trials)
+            film = f": {self.out}" if self.viewer == "film" else ""
+            print(f"{lifted} of {len(trials)} lifted and held{film}", flush=True)
+            self._wait()
+        finally:
+            bench.close()
+            viewer.close()
+
+    def _viewer(self) -> "Viewer":
+        from deploy.viewers import Rerun, Video
+
+        if self.out.suffix == ".rrd":
+            return Rerun(browser=False, file=self.out)
+        if self.viewer == "film":
+            return Video(self.out)
+        if self.viewer == "rerun" and sys.platform == "linux" and not _has_display():
+            raise UserError("--viewer rerun: there is no display here: choose web, or film.")
+        viewer = Rerun(browser=self.viewer == "web")
+        if self.viewer == "web":
+            print(f"http://localhost:{WEB_PORT}/?url={viewer.address}", flush=True)
+        return viewer
+
+    def _wait(self) -> None:
+        """The browser fetches what it shows from this process."""
+        if self.viewer == "web" and self.out.suffix != ".rrd":
+            print("Ctrl-C ends the viewer.", flush=True)
+            with contextlib.suppress(KeyboardInterrupt):
+                threading.Event().wait()
+
+
+def _watched(bench: "Bench", trial: "Trial", viewer: "Viewer") -> bool:
+    """One trial before `viewer`; whether the object was lifted and held."""
+    viewer.begin(trial.object_name)
+    result, _ = bench.run(trial, viewer.look)
+    verdict = "lifted and held" if result.success else "failed"
+    viewer.end(verdict)
+    print(f"{trial.object_name:<12} {verdict}", flush=True)
+    return result.success
+
+
+def _has_display() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _pretrained() -> Path:
+    from export.pretrained import pretrained_policy
+
+    return pretrained_policy()

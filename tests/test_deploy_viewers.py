@@ -1,0 +1,102 @@
+"""Watching a policy: films that OpenCV reads back, Rerun's absence, the command at its shortest."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from app.commands import parse
+from ddgrasp import contract
+from ddgrasp.errors import UserError
+from deploy.interfaces import Frame, RobotState
+from deploy.loop import Step
+from deploy.viewers import FAR_MM, NEAR_MM, PANEL_PX, VERDICT_S, Rerun, Video, depth_picture
+from export.pretrained import pretrained_policy
+from rig.film import INVALID_RGB
+
+HEIGHT, WIDTH = 90, 160
+
+
+class _RedCamera:
+    def picture(self) -> np.ndarray:
+        return np.full((HEIGHT, WIDTH, 3), (200, 0, 0), np.uint8)
+
+
+def _step(index: int, depth_mm: int) -> Step:
+    frame = Frame(np.full((HEIGHT, WIDTH), depth_mm, np.uint16), 0.1 * index)
+    return Step(index, frame, RobotState(np.zeros(7), 0.08, 0.1 * index), None, None)
+
+
+def _frames(path) -> np.ndarray:
+    import cv2
+
+    film, frames = cv2.VideoCapture(str(path)), []
+    while (read := film.read())[0]:
+        frames.append(read[1][..., ::-1])
+    assert film.get(cv2.CAP_PROP_FPS) == contract.CONTROL_HZ
+    return np.stack(frames)
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.webm"])
+def test_a_film_has_colour_beside_depth_and_stays_at_the_verdict(tmp_path, name):
+    video = Video(tmp_path / name)
+    video.begin("apple")
+    for i in range(3):
+        video.look(_step(i, 0), _RedCamera())
+    assert not (tmp_path / name).exists()
+    video.end("lifted and held")
+    video.close()
+    frames = _frames(tmp_path / name)
+    assert len(frames) == 3 + round(VERDICT_S * contract.CONTROL_HZ)
+    assert frames.shape[2] == 2 * PANEL_PX
+    below = frames[0, 100:300]
+    np.testing.assert_allclose(below[:, 50 : -PANEL_PX - 50].mean((0, 1)), (200, 0, 0), atol=12)
+    np.testing.assert_allclose(below[:, PANEL_PX + 50 : -50].mean((0, 1)), INVALID_RGB, atol=12)
+
+
+def test_a_step_without_a_frame_is_left_out(tmp_path):
+    video = Video(tmp_path / "film.mp4")
+    video.begin("apple")
+    video.look(Step(0, None, RobotState(np.zeros(7), 0.08, 0.0), None, None), _RedCamera())
+    video.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_depth_has_one_colour_scale_for_all_frames():
+    near, far = (depth_picture(np.full((4, 4), value, np.uint16)) for value in (int(NEAR_MM), int(FAR_MM)))
+    assert near.mean() > far.mean() + 50
+    metres = np.full((4, 4), NEAR_MM / 1000, np.float32)
+    np.testing.assert_array_equal(depth_picture(metres), near)
+
+
+def test_another_ending_is_refused_before_anything_runs(tmp_path):
+    with pytest.raises(UserError, match="ends with .mp4 or .webm"):
+        Video(tmp_path / "film.avi")
+
+
+def test_without_rerun_the_remedy_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(UserError, match=r"pip install 'ddgrasp\[view\]'"):
+        Rerun(browser=True)
+
+
+def test_the_pretrained_student_is_exported_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("DDGRASP_CACHE", str(tmp_path))
+    policy = pretrained_policy()
+    made = policy.stat().st_mtime_ns
+    assert pretrained_policy() == policy and policy.stat().st_mtime_ns == made
+    with pytest.raises(UserError, match="holds no student"):
+        pretrained_policy(tmp_path)
+
+
+def test_the_command_plays_the_pretrained_student_into_a_film(tmp_path, capsys):
+    film = tmp_path / "play.mp4"
+    parse("play", ["--objects", "cube", "--camera", "ideal", "--seconds", "1", "--out", str(film)]).run()
+    assert "0 of 1 lifted and held" in capsys.readouterr().out
+    assert len(_frames(film)) == 10 + round(VERDICT_S * contract.CONTROL_HZ)
+
+
+def test_an_unknown_object_is_refused_and_leaves_nothing(tmp_path):
+    with pytest.raises(UserError, match="appel"):
+        parse("play", ["--objects", "appel", "--out", str(tmp_path / "play.mp4")]).run()
+    assert list(tmp_path.iterdir()) == []
