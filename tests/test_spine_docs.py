@@ -20,13 +20,23 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def _packages() -> list[str]:
-    """Packages in the order of the README's tree."""
+    """Packages in the order of the tree in CONTRIBUTING.md."""
     return [name for name in _tree() if (ROOT / name / "__init__.py").exists() and name != "benchmarks"]
 
 
 def _tree() -> list[str]:
-    block = (ROOT / "README.md").read_text().split("## The tree is the data flow")[1].split("```")[1]
+    block = (ROOT / "CONTRIBUTING.md").read_text().split("## The tree is the data flow")[1].split("```")[1]
     return re.findall(r"^(\w+)/", block, re.MULTILINE)
+
+
+def _links(page: str) -> list[str]:
+    return re.findall(r"\]\((?!https?:|#)([^)\s]+)\)", (ROOT / page).read_text())
+
+
+def _anchors(page: Path) -> set[str]:
+    """Those that a renderer makes of the headings."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def _files() -> Iterator[Path]:
@@ -101,7 +111,7 @@ def test_no_file_is_long():
     assert {file: length for file, length in lengths.items() if length > MAX_LINES} == {}
 
 
-def test_the_readme_s_tree_is_the_tree():
+def test_the_tree_in_contributing_is_the_tree():
     folders = {file.parent.relative_to(ROOT).parts[0] for file in ROOT.glob("*/__init__.py")}
     assert folders <= set(_tree())
     assert {name for name in _tree() if not (ROOT / name).is_dir()} == set()
@@ -130,6 +140,27 @@ def test_links_lead_to_files_and_code_names_files_that_exist(page):
     named = {name for name in named if "mine" not in name}  # CONTRIBUTING's examples
     named.discard("tests/__init__.py")  # said not to exist
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
+def test_every_page_of_the_docs_can_be_reached_from_the_readme():
+    reached, new = set(), {ROOT / "README.md"}
+    while new:
+        page = new.pop()
+        reached.add(page)
+        pages = {(page.parent / link.split("#")[0]).resolve() for link in _links(str(page.relative_to(ROOT)))}
+        new |= {other for other in pages if other.suffix == ".md"} - reached
+    assert {ROOT / page for page in PAGES} - reached == set()
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_into_a_page_lead_to_a_heading(page):
+    targets = [link.split("#") for link in _links(page) if "#" in link]
+    assert [f"{file}#{anchor}" for file, anchor in targets
+            if anchor not in _anchors((ROOT / page).parent / file)] == []  # fmt: skip
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
 
 
 def test_docstrings_and_comments_name_files_that_exist():
