@@ -37,6 +37,8 @@ def _dispatch(argv: list[str]) -> int:
     from app.commands import COMMANDS, describe_commands, parse
     from ddgrasp.errors import unknown_name
 
+    if argv and argv[0] == "help":
+        argv = [*argv[1:], "--help"]
     words = argv[: next((i for i, word in enumerate(argv) if word.startswith("-")), len(argv))]
     if argv and argv[0] == "--version":
         from ddgrasp.artifacts import library_versions

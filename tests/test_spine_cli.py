@@ -1,6 +1,7 @@
 """The command line as a person meets it: in a process of its own."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 from operator import attrgetter
@@ -10,6 +11,7 @@ import pytest
 
 from app.commands import COMMANDS, parse
 from app.commands.checks import CHECKPOINTS, check_config_values
+from app.commands.parsing import HELP_ALL
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 
@@ -56,6 +58,24 @@ def test_help_lists_every_command():
     for name, command in COMMANDS.items():
         assert f"  {name}" in result.stdout
         assert command.__doc__
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_help_shows_a_command_s_own_options_and_help_all_every_value(encoding):
+    texts = {}
+    for option in ("--help", HELP_ALL):
+        command = [sys.executable, "-m", "app.cli", "teacher", "train", option]
+        env = {**os.environ, "PYTHONIOENCODING": encoding}
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, encoding=encoding, env=env, timeout=60)
+        texts[option] = done.stdout
+    assert ("╭" in texts["--help"]) == (encoding == "utf-8")
+    assert "--resume" in texts["--help"] and "--teacher." not in texts["--help"]
+    assert texts["--help"].endswith("score, hosts): ddgrasp teacher train --help-all\n")
+    assert "--teacher.num-envs" in texts[HELP_ALL] and "--hosts.process " in texts[HELP_ALL]
+
+
+def test_help_of_a_command_may_stand_before_it():
+    assert ddgrasp("help", "play").stdout == ddgrasp("play", "--help").stdout != ""
 
 
 def test_version_names_the_libraries():

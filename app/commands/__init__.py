@@ -18,7 +18,7 @@ from app.commands.checks import check_config_values, check_devices, check_memory
 from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
-from app.commands.parsing import parsed
+from app.commands.parsing import HELP_ALL, parsed
 from app.commands.play import Play
 from app.commands.rig import RigFr3
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
@@ -82,8 +82,8 @@ COMMANDS: dict[str, type] = {
 
 
 def parse(name: str, args: Sequence[str]) -> Command:
-    """The command `name` with its options; --help prints and raises SystemExit(0), options that are
-    wrong raise UserError."""
+    """The command `name` with its options; --help and --help-all print and raise SystemExit(0), options
+    that are wrong raise UserError."""
     cls = COMMANDS[name]
     options: dict[str, Any] = {}
     if issubclass(cls, FromPreset):
@@ -98,11 +98,10 @@ def parse(name: str, args: Sequence[str]) -> Command:
         options["default"] = Deploy(config=config_of(policy, _option(args, "--preset")), policy=policy)
     elif cls is TeacherEval:
         options["default"] = with_world_of(Path(args[0]) if args and args[0][0] != "-" else None)
-    program = f"ddgrasp {name}"
-    read = partial(
-        tyro.cli, cls, prog=program, args=list(args), config=(tyro.conf.FlagCreatePairsOff,), **options
-    )
-    command = parsed(read, program)
+    program, whole = f"ddgrasp {name}", HELP_ALL in args
+    given = ["--help" if arg == HELP_ALL else arg for arg in args]
+    read = partial(tyro.cli, cls, prog=program, args=given, config=(tyro.conf.FlagCreatePairsOff,), **options)
+    command = parsed(read, program, whole)
     check_options(command)
     return command
 
@@ -116,13 +115,35 @@ def _scaled(preset: Config, scale: str | None) -> Config:
     return scaled(replace(preset, scale=factor), factor)
 
 
+_TASKS = {
+    "begin": ("play", "run", "report"),
+    "teacher and its demonstrations": ("teacher", "demos"),
+    "a depth camera and its noise": ("record", "sensors", "ddg"),
+    "student": ("student", "export", "study"),
+    "robot": ("deploy", "calibrate", "rig"),
+    "objects, networks of other people": ("objects", "weights"),
+}
+"""First words of commands, by what they are for."""
+
+
 def describe_commands(group: str = "") -> str:
     """The list that `ddgrasp --help` (or `ddgrasp teacher`) prints."""
-    names = [name for name in COMMANDS if not group or name.split()[0] == group]
-    lines = [f"  {name:<16} {(COMMANDS[name].__doc__ or '').splitlines()[0]}" for name in names]
-    return "\n".join(
-        ["usage: ddgrasp COMMAND [options]   (each command has --help)", "", *lines, "", *_PRESET_HELP]
-    )
+    lines = [
+        line
+        for task, words in _TASKS.items()
+        if (
+            names := [
+                name for name in COMMANDS if name.split()[0] in words and group in ("", name.split()[0])
+            ]
+        )
+        for line in ("", f"{task}:", *map(_described, names))
+    ]
+    usage = f"usage: ddgrasp COMMAND [options]   (--help for a command's options, {HELP_ALL} for all values)"
+    return "\n".join([usage, *lines, "", *_PRESET_HELP])
+
+
+def _described(name: str) -> str:
+    return f"  {name:<16} {(COMMANDS[name].__doc__ or '').splitlines()[0]}"
 
 
 _PRESET_HELP = (

@@ -11,6 +11,11 @@ from ddgrasp.errors import UserError, unknown_name
 
 T = TypeVar("T")
 
+HELP_ALL = "--help-all"
+"""Asks for the values of the run's configuration too, of which there are hundreds."""
+
+_SECTION = re.compile(r"^(?:╭─ | )(?:(?P<name>\S+) )?options(?: ─+╮)?\s*$")
+"""First line of a section of help, with a frame or, on a terminal without UTF-8, without one."""
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _RULE = re.compile(r"^[─-]{4,}$")
 _CHOICE = re.compile(r"invalid choice '(?P<value>.*)' for argument '-*(?P<option>\S+)'\. Expected one of \(")
@@ -20,20 +25,38 @@ _NUMBER = re.compile(
 )
 
 
-def parsed(parse: Callable[[], T], command: str) -> T:
+def parsed(parse: Callable[[], T], command: str, whole: bool) -> T:
     """What `parse`, a call of tyro, returns; UserError in one line for options that it refuses.
 
-    Help is printed as ever, and ends with SystemExit(0).
+    Help is printed, without the sections of the run's configuration unless the `whole` is asked for, and ends
+    with SystemExit(0).
     """
     told = io.StringIO()
+    helped = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding, newline="")
     try:
-        with contextlib.redirect_stderr(told):
+        with contextlib.redirect_stderr(told), contextlib.redirect_stdout(helped):
             return parse()
     except SystemExit as stop:
         if stop.code != 2:
+            helped.seek(0)
+            text = helped.read()
+            sys.stdout.write(text if whole else shortened(text, command))
             sys.stderr.write(told.getvalue())
             raise
     raise refused(told.getvalue(), command)
+
+
+def shortened(text: str, command: str) -> str:
+    """Help `text` without the sections of the configuration; says which there are and how to see them."""
+    kept, hidden, hiding = [], {}, False
+    for line in text.splitlines():
+        if (match := _SECTION.match(_COLOUR.sub("", line))) is not None:
+            hiding = match["name"] is not None
+            hidden |= {match["name"].split(".")[0]: None} if hiding else {}
+        if not hiding:
+            kept.append(line.rstrip())
+    more = [f"Every value of the run ({', '.join(hidden)}): {command} {HELP_ALL}"] if hidden else []
+    return "\n".join([*kept, *more]) + "\n"
 
 
 def refused(box: str, command: str) -> UserError:
