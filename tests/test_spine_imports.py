@@ -1,8 +1,10 @@
 """The dependency rule: imports go down the list of packages, and the robot side never imports JAX."""
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -229,3 +231,39 @@ def _path_to_jax(module: str, graph: dict[str, list[str]]) -> list[str] | None:
 
 def _under(name: str, prefixes) -> bool:
     return any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes)
+
+
+OTHERWISE_NAMED = {
+    "cv2": "opencv-python-headless",
+    "franky": "franky-control",
+    "mujoco_playground": "playground",
+    "orbax": "orbax-checkpoint",
+    "rerun": "rerun-sdk",
+    "sklearn": "scikit-learn",
+}
+"""Import name -> name on the package index, where they differ by more than a hyphen."""
+
+
+def test_what_is_imported_is_declared():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    groups = [project["dependencies"], *project["optional-dependencies"].values()]
+    declared = {re.split(r"[\[<>=;! ]", line)[0] for group in groups for line in group}
+    wanted = {
+        OTHERWISE_NAMED.get(name, name.replace("_", "-")): file
+        for folder in (*ORDER, "benchmarks")
+        for file in sorted((ROOT / folder).rglob("*.py"))
+        for name in _foreign(file)
+    }
+    assert {name: str(file) for name, file in wanted.items() if name not in declared} == {}
+
+
+def _foreign(file: Path) -> Iterator[str]:
+    """Top-level names of the packages of other people that `file` imports, wherever it does."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+        for name in {name.split(".")[0] for name in names}:
+            if name not in sys.stdlib_module_names and not (ROOT / name).is_dir():
+                yield name
