@@ -54,6 +54,11 @@ def position_jacobian(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "3 7
     return np.cross(joints[:, :3, 2], grip_position(q_rad) - joints[:, :3, 3]).T
 
 
+def grip_jacobian(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "6 7"]:
+    """(6, 7) velocity, then angular velocity of the grip frame by the joints, robot's base frame."""
+    return np.concatenate([position_jacobian(q_rad), np.array(_frames(q_rad)[:7])[:, :3, 2].T])
+
+
 def _frames(q_rad: np.ndarray) -> list[np.ndarray]:
     """(4, 4) poses of the seven joints' frames, then of the hand's mounting face."""
     pose, frames = np.eye(4), []

@@ -17,6 +17,8 @@ from ddgrasp.errors import UserError
 Dictionary = Literal["DICT_4X4_50", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250", "DICT_APRILTAG_36h11"]
 DICTIONARIES: tuple[Dictionary, ...] = get_args(Dictionary)
 PAPERS_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0)}
+HELD_AT_M = 0.020
+"""From the point between the finger pads to the pattern's upper edge: the plate's margin is between them."""
 _INCH_MM = 25.4
 _PRINT_DPI = 300
 _RULER_MM = 100.0
@@ -86,6 +88,17 @@ class CharucoBoard:
         """(4, 3) the pattern's own corners in the board's frame, clockwise from the upper left one."""
         width, height = self.size_m
         return np.array([[0.0, 0.0, 0.0], [width, 0.0, 0.0], [width, height, 0.0], [0.0, height, 0.0]])
+
+    def held_pose(self) -> Float64[np.ndarray, "4 4"]:
+        """(4, 4) T_grip_board of a plate that the fingers hold at the middle of its upper margin.
+
+        The pattern faces along y of the grip frame, in which the fingers open; its lower edge points out of
+        the hand.
+        """
+        T = np.eye(4)
+        T[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+        T[:3, 3] = (-self.size_m[0] / 2, 0.0, HELD_AT_M)
+        return T
 
     def picture(self, px_per_square: int) -> UInt8[np.ndarray, "h w"]:
         """(rows * px, columns * px) uint8 of the pattern, without a margin."""

@@ -21,6 +21,8 @@ class RigFr3:
     """Where object and clutter stand."""
     speed: Annotated[float, Range(0, 1, above=True)] = 1.0
     """Largest share of real time."""
+    board: bool = False
+    """The hand holds the board of `ddgrasp calibrate`."""
 
     def run(self) -> None:
         """Serves, and says how to drive it."""
@@ -28,8 +30,9 @@ class RigFr3:
         from rig.fr3.process import Fr3Rig
 
         thing = (scene.meshed if self.shapes == "mesh" else scene.primitive)(self.object_name)
-        with Fr3Rig(self.host, thing, self.seed, self.speed) as rig:
-            drive = f"ddgrasp deploy --policy FILE.onnx --robot franka --host {self.host} --camera rig"
+        with Fr3Rig(self.host, thing, self.seed, self.speed, with_board=self.board) as rig:
+            what = "calibrate" if self.board else "deploy --policy FILE.onnx --robot franka"
+            drive = f"ddgrasp {what} --host {self.host} --camera rig"
             print(f"FR3 at {self.host} before {self.object_name!r}. Drive it: {drive}", flush=True)
             while rig.running():
                 time.sleep(0.2)

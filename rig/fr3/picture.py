@@ -18,7 +18,6 @@ FAR_M = 10.0
 """What is further away counts as nothing."""
 _T_OPENCV_OPENGL = np.diag([1.0, -1.0, -1.0])
 """MuJoCo's cameras look along -z with y up, OpenCV's along z with y down."""
-_LARGEST_PX = 2048
 _GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
 """As a number: an array compared with the enumeration itself is compared object by object."""
 
@@ -28,15 +27,16 @@ class ScenePicture:
 
     Args:
       scene_xml: what the rig's side channel answers to `scene`, visual meshes included.
+      largest_px: no picture is wider or higher.
     """
 
-    def __init__(self, scene_xml: str):
+    def __init__(self, scene_xml: str, largest_px: int = 2048):
         root = ET.fromstring(scene_xml)
         world = root.find("worldbody")
         assert world is not None
         world.append(ET.Element("camera", {"name": CAMERA}))
         visual = ET.SubElement(root, "visual")
-        ET.SubElement(visual, "global", {"offwidth": str(_LARGEST_PX), "offheight": str(_LARGEST_PX)})
+        ET.SubElement(visual, "global", {"offwidth": str(largest_px), "offheight": str(largest_px)})
         ET.SubElement(visual, "quality", {"offsamples": "0"})  # a pixel is one surface, not a mixture
         self.model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
         self._data = mujoco.MjData(self.model)

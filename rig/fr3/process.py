@@ -36,10 +36,12 @@ class Fr3Rig:
         seed: int = 0,
         speed: float = 1.0,
         q_rad: Sequence[float] = HOME_RAD,
+        with_board: bool = False,
     ):
         """Starts nothing yet.
 
-        `speed` is the largest share of real time, `q_rad` (7,) where the arm stands.
+        `speed` is the largest share of real time, `q_rad` (7,) where the arm stands, `with_board` puts the
+        calibration board into its hand.
 
         Raises UserError: franky-sim is absent, a port is taken, or `speed` makes no sense.
         """
@@ -49,7 +51,7 @@ class Fr3Rig:
             raise UserError("the FR3 rig needs franky-sim: pip install -e '.[fr3]'.")
         check_ports(host)
         self.host = host
-        given = {"host": host, "seed": seed, "speed": speed, "q_rad": list(q_rad)}
+        given = {"host": host, "seed": seed, "speed": speed, "q_rad": list(q_rad), "with_board": with_board}
         self._options = given | {"thing": asdict(thing)}
         self._process: subprocess.Popen[str] | None = None
         self._channel: Channel | None = None

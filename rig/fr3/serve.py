@@ -40,6 +40,8 @@ class Options:
     """Largest share of real time; the machine may give less."""
     q_rad: list[float]
     """Where the arm stands when it is switched on."""
+    with_board: bool = False
+    """Whether the hand holds the calibration board."""
 
 
 class Rig:
@@ -51,6 +53,11 @@ class Rig:
         self._sim = MujocoSimulator()
         self._robot = self._sim.add_robot(initial_q=options.q_rad, initial_hand_width=0.08)
         scene.furnish(self._sim.scene, self.thing, options.seed)
+        if options.with_board:
+            from rig.fr3.board import hold
+            from sensors.charuco_board import CharucoBoard
+
+            hold(self._sim.scene, CharucoBoard(), options.seed)
         self._xml = ET.tostring(self._sim.scene, encoding="unicode")
         _drop_visuals(self._sim.scene)
         self._server = _Server(self._sim, options.host)
