@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8, UInt16
+from jaxtyping import Float, Float32, Float64, UInt8, UInt16
 
 Depth = UInt16[np.ndarray, "H W"] | Float32[np.ndarray, "H W"]
 
@@ -61,6 +61,48 @@ class Camera(Protocol):
 
     def stop(self) -> None:
         """Close the device; also called where `start` failed or was never reached."""
+        ...
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Pinhole camera with distortion, in OpenCV's convention: whole numbers are pixel centres."""
+
+    matrix: Float64[np.ndarray, "3 3"]
+    """(3, 3) focal lengths and principal point, pixels."""
+    distortion: Float64[np.ndarray, " d"]
+    """(d,) OpenCV's coefficients; zeros for a rectified imager."""
+    width_px: int
+    height_px: int
+
+
+@runtime_checkable
+class Imager(Protocol):
+    """The picture that calibration looks for a board in, from where depth is measured."""
+
+    def start(self) -> None:
+        """Open the device."""
+        ...
+
+    def lens(self) -> Lens:
+        """As the device reports it; it must be open."""
+        ...
+
+    def picture(self) -> UInt8[np.ndarray, "H W"]:
+        """(H, W) uint8 brightness of a picture exposed after the call. Raises CameraError."""
+        ...
+
+    def stop(self) -> None:
+        """Close the device; also called where `start` failed or was never reached."""
+        ...
+
+
+@runtime_checkable
+class KnowsItsPlace(Protocol):
+    """An imager before a rig, which knows where it stands."""
+
+    def truth(self) -> Float[np.ndarray, "4 4"]:
+        """(4, 4) pose in the robot's base frame, metres."""
         ...
 
 

@@ -10,12 +10,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from deploy import dry_run
+from deploy.calibration.standing import standing
 from deploy.clock import RealClock, RobotClock
 from deploy.devices.options import SessionOptions, Setup
 from deploy.devices.registry import check_devices, make_devices
@@ -38,13 +40,16 @@ def deploy(
     Raises UserError for an unknown name, a combination that cannot work, or a device that is absent.
     """
     _check(options)
-    with _terminable():
-        return _run(_for_devices(config, options), policy_path, options, say)
+    with terminable():
+        return _run(for_devices(config, options), policy_path, options, say)
 
 
 def _run(
     config: Config, policy_path: Path, options: SessionOptions, say: Callable[[str], None]
 ) -> LoopReport:
+    place = standing(config, options)
+    if place.line:
+        say(place.line)
     policy = OnnxPolicy(
         policy_path,
         noise=config.deploy.noise,
@@ -54,7 +59,7 @@ def _run(
     clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
     confirm = _agreed if options.yes else ask_person
     robot, camera = make_devices(Setup(config, options, policy.info, clock, confirm, say))
-    _keep_time_of(robot, clock, options)
+    keep_time_of(robot, clock, options)
     safety = safety_filter(config.deploy, policy.info, options.robot)
     if options.robot == "franka" and (notice := speed_notice(config.deploy, policy.info)):
         say(notice)
@@ -68,8 +73,9 @@ def _run(
         report = loop.run(steps, kept.look)
     unattended = options.yes or report.interrupted or bool(report.fault)
     success = None if options.dry_run else verdict(camera, _unasked if unattended else ask_success)
-    about = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
-    kept.finish(folder, report, success, {**about, "dry_run": options.dry_run, "created": _stamp()})
+    about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
+    about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
+    kept.finish(folder, report, success, about)
     say(f"report: {folder / REPORT_FILE}")
     if isinstance(driven, DryRun):
         path = folder / "dry-run.png"
@@ -105,7 +111,7 @@ def _agreed(question: str) -> None:
     """`--yes`."""
 
 
-def _for_devices(config: Config, options: SessionOptions) -> Config:
+def for_devices(config: Config, options: SessionOptions) -> Config:
     """The command line's host; before the FR3 rig, a process of this machine, its own time and any kernel."""
     section = config.deploy
     if options.host:
@@ -115,7 +121,8 @@ def _for_devices(config: Config, options: SessionOptions) -> Config:
     return replace(config, deploy=section)
 
 
-def _keep_time_of(robot: Robot, clock: Clock, options: SessionOptions) -> None:
+def keep_time_of(robot: Robot, clock: Clock, options: SessionOptions) -> None:
+    """A clock that follows a robot follows this one. Raises UserError if it has no time of its own."""
     if not isinstance(clock, RobotClock):
         return
     if not isinstance(robot, TimedRobot):
@@ -135,7 +142,7 @@ def _stamp() -> str:
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
+def terminable() -> Iterator[None]:
     """Turns the first SIGTERM into KeyboardInterrupt; a second one does not cut the stopping short."""
 
     def interrupt(signum, frame):

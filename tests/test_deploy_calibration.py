@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from ddgrasp import contract
 from ddgrasp.errors import UserError
 from deploy.calibration import hand_eye
-from deploy.calibration.hand_eye import Lens, View, calibrate, invert, park_martin, project
+from deploy.calibration.hand_eye import View, calibrate, invert, park_martin, project
+from deploy.interfaces import Lens
 from mjx_envs.camera import look_at
 from sensors.charuco_board import CharucoBoard, Corners, printable
 

@@ -87,6 +87,8 @@ class Deploy:
     """Move without asking first."""
     out: Path = Path("runs/deployments")
     """Folder that every run leaves its report in."""
+    calibration: Path | None = None
+    """What `ddgrasp calibrate` wrote, if it is not runs/calibration/calibration.json."""
 
     def run(self) -> None:
         """Runs the loop until the time is over, Ctrl-C or a fault, and prints how it kept time."""
@@ -95,7 +97,7 @@ class Deploy:
         check_objects(self.config.world)
         options = SessionOptions(
             self.robot, self.camera, self.recording, self.object_name, self.seconds,
-            dry_run=self.dry_run, yes=self.yes, host=self.host, out=self.out,
+            dry_run=self.dry_run, yes=self.yes, host=self.host, out=self.out, calibration=self.calibration,
         )  # fmt: skip
         print(describe(deploy(self.config, self.policy, options)))
 

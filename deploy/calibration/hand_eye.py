@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ddgrasp.errors import UserError
+from deploy.interfaces import Lens
 from sensors.charuco_board import CharucoBoard, Corners
 
 MIN_CORNERS = 6
@@ -29,18 +30,6 @@ _HALF_TURN_RAD = np.radians(170.0)
 """A relative turn of nearly half a turn has no axis that could be trusted."""
 
 Pose = Float64[np.ndarray, "4 4"]
-
-
-@dataclass(frozen=True)
-class Lens:
-    """Pinhole camera with distortion, in OpenCV's convention: whole numbers are pixel centres."""
-
-    matrix: Float64[np.ndarray, "3 3"]
-    """(3, 3) focal lengths and principal point, pixels."""
-    distortion: Float64[np.ndarray, " d"]
-    """(d,) OpenCV's coefficients; zeros for a rectified imager."""
-    width_px: int
-    height_px: int
 
 
 @dataclass(frozen=True)

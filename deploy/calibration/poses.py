@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from ddgrasp.errors import UserError
 from deploy import kinematics
-from deploy.calibration.hand_eye import Lens, Pose, invert, project
+from deploy.calibration.hand_eye import Pose, invert, project
+from deploy.interfaces import Lens
 from deploy.safety import SafetyLimits
 from sensors.charuco_board import CharucoBoard
 
@@ -89,7 +90,7 @@ def reach(T_base_grip: Pose, q_guess_rad: Float[np.ndarray, "7"], limits: Safety
 
 
 def is_free(bench: Bench, q_rad: Float[np.ndarray, "7"]) -> bool:
-    """Whether grip point, arm and board are where they may be, and the board touches neither table nor arm."""
+    """Whether grip point, arm and board are where they may be, the board clear of table and arm."""
     limits, T_base_grip = bench.limits, kinematics.grip_pose(q_rad)
     grip = T_base_grip[:3, 3]
     if (grip < limits.workspace_lower_m).any() or (grip > limits.workspace_upper_m).any():

@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ddgrasp import contract
-from deploy.calibration.hand_eye import Lens
 from deploy.devices.fr3_camera import pinhole
 from deploy.devices.options import Setup
-from deploy.interfaces import CameraError
+from deploy.interfaces import CameraError, Lens
 
 if TYPE_CHECKING:
     from rig.fr3.channel import Channel
@@ -32,7 +31,7 @@ def make(setup: Setup) -> "Fr3Imager":
 
 
 class Fr3Imager:
-    """Brightness of the rig's mesh scene at 1280x720, in place of the infrared that a D455 sees by daylight."""
+    """Brightness of the rig's mesh scene at 1280x720, in place of infrared by daylight."""
 
     def __init__(self, host: str, T_world_cam: Pose, seed: int = 0):
         """`T_world_cam` (4, 4) is where the camera stands; `seed` draws the imager's noise."""

@@ -32,6 +32,8 @@ class SessionOptions:
     """Address of the robot's control unit; empty takes deploy.franka.host."""
     out: Path = Path("runs/deployments")
     """Folder that every run leaves its report in."""
+    calibration: Path | None = None
+    """What `ddgrasp calibrate` wrote; without it its usual place is looked at."""
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,18 @@ A new device is a file beside this one with its class and a `make`, and a line h
 from collections.abc import Callable, Mapping
 
 from ddgrasp.errors import UserError, unknown_name
-from deploy.devices import fr3_camera, franka_robot, realsense_camera, replay_camera, rig_camera, rig_robot
+from deploy.devices import (
+    fr3_camera,
+    fr3_imager,
+    franka_robot,
+    realsense_camera,
+    realsense_imager,
+    replay_camera,
+    rig_camera,
+    rig_robot,
+)
 from deploy.devices.options import SessionOptions, Setup
-from deploy.interfaces import Camera, Robot
+from deploy.interfaces import Camera, Imager, Robot
 
 ROBOTS: Mapping[str, Callable[[Setup], Robot]] = {"sim": rig_robot.make, "franka": franka_robot.make}
 CAMERAS: Mapping[str, Callable[[Setup, Robot], Camera]] = {
@@ -18,6 +27,11 @@ CAMERAS: Mapping[str, Callable[[Setup, Robot], Camera]] = {
     "rig": fr3_camera.make,
     "rig-ideal": fr3_camera.make_ideal,
 }
+IMAGERS: Mapping[str, Callable[[Setup], Imager]] = {
+    "realsense": realsense_imager.make,
+    "rig": fr3_imager.make,
+}
+"""What calibration looks through, by the camera's name."""
 REFUSED: Mapping[tuple[str, str], str] = {
     ("franka", "stereo"): "camera 'stereo' sees the simulated rig alone, not robot 'franka': "
     "use --camera realsense.",

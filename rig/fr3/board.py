@@ -1,4 +1,4 @@
-"""The calibration board in the hand of the rig's FR3, held as a person would put it there: not quite straight.
+"""The calibration board in the hand of the rig's FR3, held as by a person: not quite straight.
 
 It weighs nothing, and nothing collides with it.
 """
@@ -50,9 +50,8 @@ def hold(scene: ET.Element, board: CharucoBoard, seed: int) -> None:
     ET.SubElement(assets, "material", {"name": _NAME, "texture": _NAME, "specular": "0", "shininess": "0"})
     ET.SubElement(assets, "mesh", {"name": _NAME, **sheet})
     shows = {"class": "visual", "contype": "0", "conaffinity": "0", "mass": "0", "group": "1"}
-    ET.SubElement(
-        body, "geom", {"type": "mesh", "mesh": _NAME, "material": _NAME, "rgba": "1 1 1 1", **shows}
-    )
+    front = {"type": "mesh", "mesh": _NAME, "material": _NAME, "rgba": "1 1 1 1"}
+    ET.SubElement(body, "geom", front | shows)
     back = {
         "type": "box",
         "size": _numbers((width / 2 + MARGIN_M, height / 2 + MARGIN_M, HALF_THICK_M)),
