@@ -14,6 +14,7 @@ import tyro
 
 from app import pipeline
 from app.commands.base import DEFAULT_PRESET, Command, FromPreset
+from app.commands.calibrate import Calibrate, CalibrateBoard
 from app.commands.checks import check_config_values, check_devices, check_memory, check_options
 from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
@@ -71,6 +72,8 @@ COMMANDS: dict[str, type] = {
     "export": Export,
     "deploy": Deploy,
     "deploy trials": DeployTrials,
+    "calibrate": Calibrate,
+    "calibrate board": CalibrateBoard,
     "rig fr3": RigFr3,
     "weights convert": WeightsConvert,
     "weights list": WeightsList,
@@ -96,6 +99,8 @@ def parse(name: str, args: Sequence[str]) -> Command:
     elif cls is Deploy:
         policy = Path(_option(args, "--policy") or Path("runs") / DEFAULT_PRESET / "export" / "policy.onnx")
         options["default"] = Deploy(config=config_of(policy, _option(args, "--preset")), policy=policy)
+    elif cls is Calibrate:
+        options["default"] = Calibrate(get_preset(_option(args, "--preset") or DEFAULT_PRESET))
     elif cls is TeacherEval:
         options["default"] = with_world_of(Path(args[0]) if args and args[0][0] != "-" else None)
     program, whole = f"ddgrasp {name}", HELP_ALL in args

@@ -21,7 +21,7 @@ DEFAULT_FILE = Path("runs/calibration/calibration.json")
 VERSION = 1
 _MOVES = (
     ("towards the robot", "away from the robot"),
-    ("to the robot's right", "to its left"),
+    ("to the robot's right", "to the robot's left"),
     ("down", "up"),
 )
 """What brings the camera back whose shift along base x, y, z is positive, negative."""
@@ -126,7 +126,7 @@ def is_trained_for(away: Offset, spread: RandomConfig) -> bool:
 
 
 def describe(away: Offset, spread: RandomConfig) -> str:
-    """One line: how far the camera is from where it was trained, and which way to move it if that is too far."""
+    """One line: how far the camera is from where it was trained, and what to move if that is too far."""
     place = f"the camera is {_size(away)} from where it was trained"
     if is_trained_for(away, spread):
         return f"{place}, within the {_spread(spread)} that training draws"

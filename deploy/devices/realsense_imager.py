@@ -29,7 +29,7 @@ def make(setup: Setup) -> "RealSenseImager":
 
 
 class RealSenseImager:
-    """Brightness at 1280x720, the size at which a pixel is smallest; intrinsics as the camera reports them."""
+    """Brightness at 1280x720, where a pixel is smallest; intrinsics as the camera reports them."""
 
     def __init__(self, serial: str = ""):
         """`serial` empty takes the first camera found."""
@@ -51,8 +51,8 @@ class RealSenseImager:
             active = pipeline.start(config)
         except RuntimeError as error:
             raise UserError(
-                f"no RealSense infrared stream {size[0]}x{size[1]} at {STREAM_HZ} Hz ({error}); check the USB "
-                f"3 cable and deploy.realsense.serial {self._serial!r}."
+                f"no RealSense infrared stream {size[0]}x{size[1]} at {STREAM_HZ} Hz ({error}); check the "
+                f"USB 3 cable and deploy.realsense.serial {self._serial!r}."
             ) from error
         self._pipeline = pipeline
         self._sensor = active.get_device().first_depth_sensor()

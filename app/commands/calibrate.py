@@ -1,0 +1,94 @@
+"""ddgrasp calibrate: where the camera stands, measured as in a lab."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from ddgrasp.config import Config
+from ddgrasp.config.checks import Range
+from ddgrasp.errors import UserError
+
+_Squares = Annotated[int, Range(3, 30)]
+_Millimetres = Annotated[float, Range(5, 200)]
+Dictionary = Literal["DICT_4X4_50", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250", "DICT_APRILTAG_36h11"]
+
+
+@dataclass(frozen=True)
+class BoardOptions:
+    """A ChArUco board; measure the squares on the print."""
+
+    columns: _Squares = 5
+    """Squares across."""
+    rows: _Squares = 7
+    """Squares down."""
+    square_mm: _Millimetres = 30.0
+    """Side of a square."""
+    marker_mm: _Millimetres = 22.0
+    """Side of a marker."""
+    dictionary: Dictionary = "DICT_4X4_50"
+    """OpenCV's name of the set of markers."""
+
+    def made(self):
+        """The `sensors.charuco_board.CharucoBoard`. Raises UserError for measures that cannot be."""
+        from sensors.charuco_board import CharucoBoard
+
+        return CharucoBoard(
+            self.columns, self.rows, 1e-3 * self.square_mm, 1e-3 * self.marker_mm, self.dictionary
+        )
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Hand-eye calibration: the robot shows the fixed camera a ChArUco board that its gripper holds."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    """Values of the preset; what the policy was trained for is compared with what is measured."""
+    camera: Literal["realsense", "rig"] = "realsense"
+    """realsense (its left infrared imager), or rig (the FR3 rig at --host, `ddgrasp rig fr3 --board`)."""
+    robot: Literal["franka"] = "franka"
+    """franka."""
+    host: str = ""
+    """Address of the robot's control unit; empty takes deploy.franka.host."""
+    board: BoardOptions = BoardOptions()
+    poses: Annotated[int, Range(6, 100)] = 20
+    """Views to take."""
+    speed: Annotated[float, Range(0.02, 0.6)] = 0.3
+    """Of the fastest joint, rad/s; deploy.franka.dynamics may allow less."""
+    dry_run: bool = False
+    """Connect and look, print the poses, move nothing."""
+    yes: bool = False
+    """Move without asking first."""
+    out: Path = Path("runs/calibration/calibration.json")
+    """What deploy reads; a picture lies beside it."""
+
+    def run(self) -> None:
+        """Drives the poses, prints the errors, writes the calibration."""
+        from deploy.calibration.session import CalibrationOptions, run
+
+        run(self.config, CalibrationOptions(
+            self.camera, self.host, self.board.made(), self.poses, self.speed,
+            dry_run=self.dry_run, yes=self.yes, out=self.out,
+        ))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CalibrateBoard:
+    """Write the board as a page to print at 100 %, PDF or PNG."""
+
+    board: BoardOptions = BoardOptions()
+    out: Path = Path("board.pdf")
+    """File, .pdf or .png."""
+
+    def run(self) -> None:
+        """Writes the page and says what it shows."""
+        from ddgrasp.files import atomic_write_bytes
+        from sensors.charuco_board import printable
+
+        kind = self.out.suffix.lower()
+        if kind not in (".pdf", ".png"):
+            raise UserError(f"--out is {self.out}; expected a name that ends with .pdf or .png.")
+        board = self.board.made()
+        atomic_write_bytes(self.out, printable(board, "pdf" if kind == ".pdf" else "png"))
+        print(f"{self.out}: {board.describe()}")

@@ -1,0 +1,278 @@
+"""`ddgrasp calibrate`: where the camera stands, measured with a board that the robot shows it."""
+
+import sys
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddgrasp import policy_metadata
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.files import atomic_write_bytes
+from deploy import kinematics
+from deploy.calibration import picture, poses, standing
+from deploy.calibration.drive import Driver
+from deploy.calibration.hand_eye import HandEye, View, calibrate
+from deploy.calibration.standing import Calibration
+from deploy.clock import RealClock, RobotClock
+from deploy.devices.options import SessionOptions, Setup
+from deploy.devices.registry import IMAGERS, ROBOTS
+from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, Robot, RobotError
+from deploy.session import ask_person, for_devices, keep_time_of, terminable
+from deploy.setup import safety_filter
+from mjx_envs.scene import HOME_RAD
+from sensors.charuco_board import CharucoBoard, Corners
+
+HOPELESS = 4
+"""So many poses without a glimpse of the board end the run."""
+MOVED_RAD = 1e-3
+"""An arm that moved by more while the picture was taken spoils the view."""
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """What to calibrate, with what."""
+
+    camera: str
+    """realsense or rig."""
+    host: str = ""
+    """Address of the robot's control unit; empty takes deploy.franka.host."""
+    board: CharucoBoard = field(default_factory=CharucoBoard)
+    poses: int = 20
+    speed_rad_s: float = 0.3
+    """Of the fastest joint."""
+    dry_run: bool = False
+    """Connect and look, say where the arm would go, move nothing."""
+    yes: bool = False
+    """Move without asking first."""
+    out: Path = standing.DEFAULT_FILE
+
+
+@dataclass
+class Taken:
+    """What the poses gave so far; lists of the same length."""
+
+    views: list[View] = field(default_factory=list)
+    pictures: list[np.ndarray] = field(default_factory=list)
+    joints_rad: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def seen(self) -> int:
+        """Pictures with any of the board."""
+        return sum(len(view.corners.ids) > 0 for view in self.views)
+
+
+def run(
+    config: Config, options: CalibrationOptions, say: Callable[[str], None] = print
+) -> Calibration | None:
+    """Drives the poses, solves, writes `options.out` and a picture beside it; None after a dry run.
+
+    Raises UserError: a device is absent, nobody agrees, the board is not seen, the views do not suffice.
+    """
+    session = SessionOptions(
+        "franka", options.camera, dry_run=options.dry_run, yes=options.yes, host=options.host
+    )
+    if options.camera not in IMAGERS:
+        raise unknown_name("camera", options.camera, IMAGERS)
+    config = for_devices(config, session)
+    info = policy_metadata.describe(config.student, config.export, config.world.profile)
+    clock: Clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
+    confirm = (lambda question: None) if options.yes else ask_person
+    setup = Setup(config, session, info, clock, confirm, say)
+    robot, imager = ROBOTS["franka"](setup), IMAGERS[options.camera](setup)
+    keep_time_of(robot, clock, session)
+    safety = safety_filter(config.deploy, info, "franka")
+    driver = Driver(robot, safety, clock, min(options.speed_rad_s, *config.deploy.franka.speed_rad_s))
+    with terminable(), _started(imager, robot) as start_robot:
+        bench = poses.Bench(safety.limits, imager.lens(), standing.nominal_pose(), options.board)
+        say(f"looking for: {options.board.describe()}")
+        ways = poses.plan(bench, options.poses, np.array(HOME_RAD), np.random.default_rng(config.seed))
+        start_robot()
+        if options.dry_run:
+            _look_once(ways, imager, options, say)
+            return None
+        taken = _take(driver, imager, ways, options, confirm, say)
+    return _solved(taken, bench.lens, options, config, _truth(imager), say)
+
+
+def describe(found: HandEye, board: CharucoBoard, truth: np.ndarray | None) -> list[str]:
+    """Lines for a terminal: errors in pixels, what was left out, standard errors, error against the truth."""
+    corners = f"{int(found.used.sum())} of {len(found.used)} views"
+    lines = [
+        f"reprojection error {found.rms_px:.3f} px RMS over {corners} "
+        f"(closed form, before refinement: {found.closed_form_rms_px:.3f} px)"
+    ]
+    out = [
+        f"view {i + 1} ({'too few corners' if np.isnan(rms) else f'{rms:.2f} px'})"
+        for i, rms in enumerate(found.view_rms_px)
+        if not found.used[i]
+    ]
+    lines += [f"left out: {', '.join(out)}"] * bool(out)
+    mm, deg = 1e3 * found.position_std_m.max(), np.degrees(found.angle_std_rad.max())
+    lines.append(f"standard error of an axis, from corners alone: {mm:.2f} mm, {deg:.3f} degrees at most")
+    if truth is not None:
+        away = standing.offset(found.T_base_cam, truth)
+        lines.append(
+            f"against the truth, which the rig knows: {1e3 * away.distance_m:.2f} mm, "
+            f"{np.degrees(away.angle_rad):.3f} degrees"
+        )
+    return lines
+
+
+def _take(
+    driver: Driver,
+    imager: Imager,
+    ways: np.ndarray,
+    options: CalibrationOptions,
+    confirm: Callable[[str], None],
+    say: Callable[[str], None],
+) -> Taken:
+    """A view of every pose that is reached. Raises UserError if the arm fails or the board is never seen."""
+    taken = Taken()
+    confirm(
+        "Hold the board between the fingers by the middle of its upper margin, its printed face to the robot's "
+        f"right, and keep clear: the hand closes, then the arm moves through {len(ways)} poses. Ready?"
+    )
+    number = 0
+    try:
+        driver.grip(close=True)
+        for number, q_target in enumerate(ways, start=1):
+            say(f"pose {number} of {len(ways)}: {_one(driver, imager, q_target, options.board, taken)}")
+            if number >= HOPELESS and not taken.seen:
+                break
+        _give_back(driver, options, say)
+    except RobotError as error:
+        raise UserError(f"calibration ended at pose {number} of {len(ways)}: {error}.") from error
+    if not taken.seen and taken.pictures:
+        path = options.out.with_name("not-seen.png")
+        atomic_write_bytes(path, picture.encode(taken.pictures[-1]))
+        say(f"the last picture: {path}")
+    return taken
+
+
+def _one(driver: Driver, imager: Imager, q_target: np.ndarray, board: CharucoBoard, taken: Taken) -> str:
+    """One pose and its view; what came of it in a few words. Raises RobotError."""
+    if not driver.go(q_target):
+        driver.rest()
+        return "not reached, left out"
+    before = driver.rest()
+    try:
+        gray = imager.picture()
+    except CameraError as error:
+        return f"no picture ({error})"
+    after = driver.joints()
+    if np.abs(after - before).max() > MOVED_RAD:
+        return "the arm moved while the picture was taken, left out"
+    q_rad, corners = (before + after) / 2, board.find(gray)
+    taken.views.append(View(kinematics.grip_pose(q_rad), corners))
+    taken.pictures.append(gray)
+    taken.joints_rad.append(q_rad)
+    return f"{len(corners.ids)} of {board.corner_count} corners" if len(corners.ids) else "board not seen"
+
+
+def _give_back(driver: Driver, options: CalibrationOptions, say: Callable[[str], None]) -> None:
+    """The board into a person's hand, where there is one."""
+    if options.yes or not sys.stdin.isatty():
+        say("the hand keeps the board")
+        return
+    try:
+        ask_person("Take hold of the board: the hand opens. Ready?")
+    except UserError:
+        say("the hand keeps the board")
+        return
+    driver.grip(close=False)
+
+
+def _look_once(
+    ways: np.ndarray, imager: Imager, options: CalibrationOptions, say: Callable[[str], None]
+) -> None:
+    """What a dry run does: says where the grip point would go, and whether the board is in view now."""
+    for number, q in enumerate(ways, start=1):
+        x, y, z = kinematics.grip_position(q)
+        joints = " ".join(f"{value:+.2f}" for value in q)
+        say(f"pose {number} of {len(ways)}: joints {joints} rad, grip at {x:.3f} {y:.3f} {z:.3f} m")
+    try:
+        gray = imager.picture()
+    except CameraError as error:
+        raise UserError(f"camera {options.camera!r} gives no picture: {error}.") from error
+    corners: Corners = options.board.find(gray)
+    path = options.out.with_name("dry-run.png")
+    atomic_write_bytes(path, picture.encode(gray))
+    say(f"nothing moved; {len(corners.ids)} of {options.board.corner_count} corners in view now: {path}")
+
+
+def _solved(
+    taken: Taken,
+    lens: Lens,
+    options: CalibrationOptions,
+    config: Config,
+    truth: np.ndarray | None,
+    say: Callable[[str], None],
+) -> Calibration:
+    found = calibrate(taken.views, lens, options.board)
+    for line in describe(found, options.board, truth):
+        say(line)
+    details = _details(taken, found, lens, options.board, truth)
+    host = config.deploy.franka.host
+    result = Calibration(standing.now(), options.camera, host, found.T_base_cam, found.rms_px, details)
+    standing.save(options.out, result)
+    sheet = options.out.with_suffix(".png")
+    atomic_write_bytes(sheet, picture.sheet(taken.pictures, taken.views, found, lens, options.board))
+    say(f"{options.out}, {sheet}: `ddgrasp deploy` reads the first, look at the second")
+    away = standing.offset(found.T_base_cam, standing.nominal_pose())
+    say(standing.describe(away, config.world.random))
+    return result
+
+
+def _details(
+    taken: Taken, found: HandEye, lens: Lens, board: CharucoBoard, truth: np.ndarray | None
+) -> dict[str, Any]:
+    """Enough to solve it again: joints and corners of every view."""
+    views = [
+        {
+            "q_rad": q, "used": bool(found.used[i]), "rms_px": float(found.view_rms_px[i]),
+            "corner_ids": view.corners.ids, "corners_px": view.corners.pixels.round(3),
+        }
+        for i, (view, q) in enumerate(zip(taken.views, taken.joints_rad, strict=True))
+    ]  # fmt: skip
+    details: dict[str, Any] = {
+        "T_grip_board": found.T_grip_board, "position_std_m": found.position_std_m,
+        "angle_std_rad": found.angle_std_rad, "board": board,
+        "lens": {"matrix": lens.matrix, "distortion": lens.distortion},
+    }  # fmt: skip
+    if truth is not None:
+        away = standing.offset(found.T_base_cam, truth)
+        details["against_truth"] = {"distance_m": away.distance_m, "angle_rad": away.angle_rad}
+    return details | {"views": views}
+
+
+def _truth(imager: Imager) -> np.ndarray | None:
+    return np.asarray(imager.truth(), float) if isinstance(imager, KnowsItsPlace) else None
+
+
+@contextmanager
+def _started(imager: Imager, robot: Robot):
+    """The imager started, a function that starts the robot; both stopped at the end, come what may."""
+    begun = False
+
+    def start_robot() -> None:
+        nonlocal begun
+        begun = True
+        robot.start()
+
+    try:
+        imager.start()
+        yield start_robot
+    finally:
+        try:
+            if begun:
+                robot.stop()
+        except RobotError as error:
+            if sys.exc_info()[0] is None:
+                raise UserError(f"the arm did not stop as it should: {error}.") from error
+        finally:
+            imager.stop()
