@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -10,8 +10,9 @@ from ddgrasp.config import Config
 from ddgrasp.config.checks import Range
 from ddgrasp.errors import UserError
 
-_Squares = Annotated[int, Range(3, 30)]
-_Millimetres = Annotated[float, Range(5, 200)]
+if TYPE_CHECKING:
+    from sensors.charuco_board import CharucoBoard
+
 Dictionary = Literal["DICT_4X4_50", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250", "DICT_APRILTAG_36h11"]
 
 
@@ -19,19 +20,19 @@ Dictionary = Literal["DICT_4X4_50", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_25
 class BoardOptions:
     """A ChArUco board; measure the squares on the print."""
 
-    columns: _Squares = 5
+    columns: int = 5
     """Squares across."""
-    rows: _Squares = 7
+    rows: int = 7
     """Squares down."""
-    square_mm: _Millimetres = 30.0
+    square_mm: float = 30.0
     """Side of a square."""
-    marker_mm: _Millimetres = 22.0
+    marker_mm: float = 22.0
     """Side of a marker."""
     dictionary: Dictionary = "DICT_4X4_50"
     """OpenCV's name of the set of markers."""
 
-    def made(self):
-        """The `sensors.charuco_board.CharucoBoard`. Raises UserError for measures that cannot be."""
+    def made(self) -> "CharucoBoard":
+        """With metres. Raises UserError for measures that cannot be."""
         from sensors.charuco_board import CharucoBoard
 
         return CharucoBoard(

@@ -26,6 +26,8 @@ _JOINT_MARGIN_RAD = 0.05
 _PATH_STEP_RAD = 0.1
 _TRIES = 60
 """Random poses tried for each that is asked for."""
+_SPARE = 4
+"""More than are asked for, as the straight way to some is not free; so is half of them."""
 _LINKS = slice(0, 7)
 """Of the arm's spheres, those that the board could touch; hand and flange hold it."""
 
@@ -52,13 +54,15 @@ def plan(
     reached: list[np.ndarray] = []
     for _ in range(_TRIES * count):
         T_base_grip = bench.T_base_cam @ _random_view(bench, rng) @ invert(T_grip_board)
+        if not _is_board_free(bench, T_base_grip):
+            continue  # before the arm's joints are looked for, which takes longer
         for turned in (np.pi / 2, -np.pi / 2):
             guess = np.append(q_start_rad[:6], q_start_rad[6] + turned)
             q = reach(T_base_grip, guess, bench.limits)
             if q is not None and is_free(bench, q):
                 reached.append(q)
                 break
-        if len(reached) >= count + count // 2:
+        if len(reached) >= count + max(count // 2, _SPARE):
             break
     ordered = _ordered(reached, q_start_rad, lambda a, b: _is_free_way(bench, a, b))[:count]
     if len(ordered) < count:
@@ -92,16 +96,12 @@ def reach(T_base_grip: Pose, q_guess_rad: Float[np.ndarray, "7"], limits: Safety
 def is_free(bench: Bench, q_rad: Float[np.ndarray, "7"]) -> bool:
     """Whether grip point, arm and board are where they may be, the board clear of table and arm."""
     limits, T_base_grip = bench.limits, kinematics.grip_pose(q_rad)
-    grip = T_base_grip[:3, 3]
-    if (grip < limits.workspace_lower_m).any() or (grip > limits.workspace_upper_m).any():
+    if not _is_board_free(bench, T_base_grip):
         return False
     centers, radii = kinematics.part_centers(q_rad), kinematics.PART_RADII_M[:, None]
     if (centers - radii < limits.arm_lower_m).any() or (centers + radii > limits.arm_upper_m).any():
         return False
-    T = T_base_grip @ bench.board.held_pose()
-    points = _sheet_m(bench.board) @ T[:3, :3].T + T[:3, 3]
-    if points[:, 2].min() < limits.arm_lower_m[2] + TABLE_GAP_M:
-        return False
+    points = _sheet_m(bench.board, T_base_grip)
     apart = np.linalg.norm(points[:, None] - centers[None, _LINKS], axis=-1) - radii[None, _LINKS, 0]
     return bool(apart.min() > LINK_GAP_M)
 
@@ -131,10 +131,21 @@ def _random_view(bench: Bench, rng: np.random.Generator) -> np.ndarray:
             return T
 
 
-def _sheet_m(board: CharucoBoard) -> np.ndarray:
-    """(9, 3) corners, edges' middles and middle of the pattern, board frame."""
+def _is_board_free(bench: Bench, T_base_grip: np.ndarray) -> bool:
+    """Whether the grip point is in its box, and the board clear of the table."""
+    limits, grip = bench.limits, T_base_grip[:3, 3]
+    if (grip < limits.workspace_lower_m).any() or (grip > limits.workspace_upper_m).any():
+        return False
+    lowest_m = _sheet_m(bench.board, T_base_grip)[:, 2].min()
+    return bool(lowest_m >= limits.arm_lower_m[2] + TABLE_GAP_M)
+
+
+def _sheet_m(board: CharucoBoard, T_base_grip: np.ndarray) -> np.ndarray:
+    """(9, 3) corners, edges' middles and middle of the pattern in the robot's base frame."""
     width, height = board.size_m
-    return np.array([[x, y, 0.0] for x in (0.0, width / 2, width) for y in (0.0, height / 2, height)])
+    points = [[x, y, 0.0] for x in (0.0, width / 2, width) for y in (0.0, height / 2, height)]
+    T = T_base_grip @ board.held_pose()
+    return np.array(points) @ T[:3, :3].T + T[:3, 3]
 
 
 def _ordered(

@@ -99,7 +99,7 @@ def run(
     return _solved(taken, bench.lens, options, config, _truth(imager), say)
 
 
-def describe(found: HandEye, board: CharucoBoard, truth: np.ndarray | None) -> list[str]:
+def describe(found: HandEye, truth: np.ndarray | None) -> list[str]:
     """Lines for a terminal: errors in pixels, what was left out, standard errors, error against the truth."""
     corners = f"{int(found.used.sum())} of {len(found.used)} views"
     lines = [
@@ -134,8 +134,8 @@ def _take(
     """A view of every pose that is reached. Raises UserError if the arm fails or the board is never seen."""
     taken = Taken()
     confirm(
-        "Hold the board between the fingers by the middle of its upper margin, its printed face to the robot's "
-        f"right, and keep clear: the hand closes, then the arm moves through {len(ways)} poses. Ready?"
+        "Hold the board between the fingers by the middle of its upper margin, its printed face to the "
+        f"robot's right: the hand closes, then the arm moves through {len(ways)} poses. Ready?"
     )
     number = 0
     try:
@@ -214,7 +214,7 @@ def _solved(
     say: Callable[[str], None],
 ) -> Calibration:
     found = calibrate(taken.views, lens, options.board)
-    for line in describe(found, options.board, truth):
+    for line in describe(found, truth):
         say(line)
     details = _details(taken, found, lens, options.board, truth)
     host = config.deploy.franka.host

@@ -131,12 +131,12 @@ def describe(away: Offset, spread: RandomConfig) -> str:
     if is_trained_for(away, spread):
         return f"{place}, within the {_spread(spread)} that training draws"
     moves = [
-        f"{1e3 * abs(value):.0f} mm {words[value < 0]}"
+        f"{1e3 * abs(value):.0f} mm {words[int(value < 0)]}"
         for value, words in zip(away.shift_m, _MOVES, strict=True)
         if abs(value) > spread.camera_position_m
     ]
     turns = [
-        f"{np.degrees(abs(value)):.1f} degrees {words[value < 0]}"
+        f"{np.degrees(abs(value)):.1f} degrees {words[int(value < 0)]}"
         for value, words in zip(away.turn_rad, _TURNS, strict=True)
         if abs(value) > spread.camera_angle_rad
     ]

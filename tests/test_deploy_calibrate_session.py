@@ -1,0 +1,344 @@
+"""`ddgrasp calibrate` from the first pose to what deploy says, the poses it plans, and what may go wrong.
+
+The robot is an arm without inertia, the imager draws the board where the arm holds it.
+"""
+
+import json
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from app.cli import main
+from ddgrasp import policy_metadata
+from ddgrasp.config import RandomConfig
+from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
+from deploy import kinematics
+from deploy.calibration import poses, session, standing
+from deploy.calibration.drive import Driver
+from deploy.calibration.hand_eye import invert, project, rotation_spread_rad
+from deploy.calibration.session import CalibrationOptions
+from deploy.calibration.standing import Offset, describe, nominal_pose, offset
+from deploy.clock import RobotClock
+from deploy.devices import registry
+from deploy.devices.fr3_imager import look, nominal_lens
+from deploy.devices.options import SessionOptions
+from deploy.devices.realsense_imager import lens_of
+from deploy.interfaces import RobotError
+from deploy.session import for_devices
+from deploy.setup import safety_filter
+from deploy_support import HOME_RAD, KinematicRobot
+from mjx_envs import draws
+from mjx_envs import kinematics as quaternions
+from mjx_envs.camera import nominal_camera
+from rig.fr3.board import held_pose, hold
+from sensors.charuco_board import CharucoBoard
+
+BOARD = CharucoBoard()
+LENS = nominal_lens()
+CONFIG = get_preset("debug")
+SPREAD = RandomConfig()
+INFO = policy_metadata.describe(CONFIG.student, CONFIG.export, CONFIG.world.profile)
+SHIFT_M, TURN_RAD = np.array([0.004, -0.015, 0.003]), np.array([0.02, 0.0, -0.004])
+T_BASE_CAM = draws.displaced(nominal_pose(), SHIFT_M, quaternions.quat_from_rotation_vector(TURN_RAD))
+T_GRIP_BOARD = held_pose(BOARD, 3)
+"""A few millimetres and degrees beside `CharucoBoard.held_pose`."""
+
+
+class Arm(KinematicRobot):
+    """Its own time passes whenever it is asked for: nobody waits."""
+
+    fails_at = 10**9
+    slack_rad = 0.0
+
+    def __init__(self):
+        super().__init__(SimpleNamespace(now=lambda: 0.0))
+        self._time_s, self.commands = 0.0, 0
+
+    def time_s(self) -> float:
+        self._time_s += 0.11
+        return self._time_s
+
+    def command(self, q_target_rad, close):
+        self.commands += 1
+        if self.commands > self.fails_at:
+            raise RobotError("the arm stopped itself: cartesian_reflex (it met something)")
+        super().command(q_target_rad, close)
+
+
+class DrawnImager:
+    """The board's pattern, warped to where the arm holds it before a grey wall."""
+
+    blind = False
+
+    def __init__(self, arm: Arm):
+        self._arm, self.calls = arm, []
+        self._rng = np.random.default_rng(0)
+
+    def start(self):
+        self.calls.append("start")
+
+    def lens(self):
+        return LENS
+
+    def truth(self):
+        return T_BASE_CAM
+
+    def stop(self):
+        self.calls.append("stop")
+
+    def picture(self):
+        size = (2 * LENS.width_px, 2 * LENS.height_px)
+        gray = np.full(size[::-1], 120, np.uint8)
+        if not self.blind:
+            px, margin = 80, 40
+            pattern = cv2.copyMakeBorder(
+                BOARD.picture(px), margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(255,)
+            )
+            to_board = np.array([[1, 0, 0.5 - margin], [0, 1, 0.5 - margin], [0, 0, px / BOARD.square_m]])
+            to_board *= BOARD.square_m / px
+            T = invert(T_BASE_CAM) @ kinematics.grip_pose(self._arm.q_rad) @ T_GRIP_BOARD
+            finer = np.array([[2.0, 0, 0.5], [0, 2.0, 0.5], [0, 0, 1]])
+            H = finer @ LENS.matrix @ T[:3, [0, 1, 3]] @ to_board
+            cv2.warpPerspective(pattern, H, size, gray, cv2.INTER_AREA, cv2.BORDER_TRANSPARENT)
+        small = cv2.resize(gray, (LENS.width_px, LENS.height_px), interpolation=cv2.INTER_AREA)
+        noisy = 0.7 * small + 30 + 2 * self._rng.standard_normal(small.shape)
+        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def planned():
+    """Seven poses as `plan` finds them, once for all tests."""
+    limits = safety_filter(CONFIG.deploy, INFO, "franka").limits
+    return poses.plan(poses.Bench(limits, LENS, nominal_pose(), BOARD), 7, HOME_RAD, np.random.default_rng(0))
+
+
+@pytest.fixture
+def bench(monkeypatch, planned):
+    """The arm and its imager under the names that the command line knows."""
+    monkeypatch.setattr(poses, "plan", lambda bench, count, *rest: planned[:count])
+    arm = Arm()
+    imager = DrawnImager(arm)
+    monkeypatch.setitem(registry.ROBOTS, "franka", lambda setup: arm)  # type: ignore[arg-type]
+    monkeypatch.setitem(registry.IMAGERS, "rig", lambda setup: imager)  # type: ignore[arg-type]
+    return SimpleNamespace(arm=arm, imager=imager)
+
+
+def options(tmp_path: Path, **changes) -> CalibrationOptions:
+    given = CalibrationOptions("rig", "127.0.0.9", poses=7, speed_rad_s=0.6, yes=True)
+    return replace(given, out=tmp_path / "cal.json", **changes)
+
+
+def fast() -> object:
+    deploy = CONFIG.deploy
+    return replace(CONFIG, deploy=replace(deploy, franka=replace(deploy.franka, dynamics=1.0)))
+
+
+def test_a_run_finds_the_camera_and_deploy_says_so(tmp_path, bench):
+    said: list[str] = []
+    found = session.run(fast(), options(tmp_path), said.append)
+    assert found is not None and bench.imager.calls == ["start", "stop"] and bench.arm.calls[-1] == "stop"
+    away = offset(found.T_base_cam, T_BASE_CAM)
+    assert away.distance_m < 1e-3 and away.angle_rad < np.radians(0.1) and found.rms_px < 0.25
+    assert "pose 7 of 7: 24 of 24 corners" in said and any("against the truth" in line for line in said)
+    assert bench.arm.close, "the hand keeps the board"
+    kept = json.loads((tmp_path / "cal.json").read_text())
+    assert len(kept["views"]) == 7 and all(view["used"] for view in kept["views"])
+    assert kept["against_truth"]["distance_m"] == pytest.approx(away.distance_m)
+    sheet = cv2.imread(str(tmp_path / "cal.png"))
+    assert sheet is not None and sheet.shape == (720, 1280, 3)
+    drawn = np.array(sheet, int)
+    assert ((drawn[..., 1] - drawn[..., 2]) > 80).sum() > 500, "green rings"
+
+    given = SessionOptions("franka", "rig", host="127.0.0.9", calibration=tmp_path / "cal.json")
+    place = standing.standing(for_devices(CONFIG, given), given)
+    assert place.line.startswith(f"calibrated {found.created[:10]}: the camera is 1")
+    assert place.line.endswith("move it 15 mm to the robot's left; turn it 1.1 degrees down")
+    record = place.as_dict()
+    assert record is not None and record["trained_for"] is False
+    np.testing.assert_allclose(record["shift_m"], SHIFT_M, atol=1e-3)
+    np.testing.assert_allclose(record["turn_rad"], TURN_RAD, atol=2e-3)
+
+
+def test_a_board_that_is_not_seen_ends_the_run_early_and_leaves_a_picture(tmp_path, bench):
+    bench.imager.blind = True
+    said: list[str] = []
+    with pytest.raises(UserError, match=r"in none of 4 pictures; looked for: ChArUco board of 5 x 7"):
+        session.run(fast(), options(tmp_path), said.append)
+    assert (tmp_path / "not-seen.png").exists() and not (tmp_path / "cal.json").exists()
+    assert "pose 4 of 7: board not seen" in said and bench.arm.calls[-1] == "stop"
+
+
+def test_an_arm_that_stops_ends_the_run_in_one_line(tmp_path, bench):
+    bench.arm.fails_at = 30
+    with pytest.raises(UserError, match=r"ended at pose \d of 7: the arm stopped itself: .*\.$") as refused:
+        session.run(fast(), options(tmp_path), lambda text: None)
+    assert "\n" not in str(refused.value) and bench.imager.calls[-1] == "stop"
+
+
+def test_a_dry_run_moves_nothing(tmp_path, bench):
+    said: list[str] = []
+    assert session.run(fast(), options(tmp_path, dry_run=True), said.append) is None
+    assert bench.arm.commands == 0 and np.array_equal(bench.arm.q_rad, HOME_RAD)
+    assert said[-1].startswith("nothing moved; ") and (tmp_path / "dry-run.png").exists()
+    assert sum(line.startswith("pose ") for line in said) == 7
+
+
+def test_nobody_to_ask_moves_nothing(tmp_path, bench, monkeypatch):
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: False))
+    with pytest.raises(UserError, match=r"Ready\? Nobody can be asked here: give --yes"):
+        session.run(fast(), options(tmp_path, yes=False), lambda text: None)
+    assert bench.arm.commands == 0
+
+
+def test_planned_poses_show_the_whole_board_and_turn_about_several_axes(planned):
+    limits = safety_filter(CONFIG.deploy, INFO, "franka").limits
+    bench = poses.Bench(limits, LENS, nominal_pose(), BOARD)
+    hands = [kinematics.grip_pose(q) for q in planned]
+    for q, T_base_grip in zip(planned, hands, strict=True):
+        assert poses.is_free(bench, q)
+        assert (q > limits.lower_rad).all() and (q < limits.upper_rad).all()
+        T_cam_board = invert(nominal_pose()) @ T_base_grip @ BOARD.held_pose()
+        pixels = project(T_cam_board, BOARD.outline_m(), LENS)
+        assert (pixels > 20).all() and (pixels < (1260, 700)).all()
+        assert T_cam_board[2, 2] > np.cos(poses.TILT_RAD * np.sqrt(2)), "face to face"
+    assert np.degrees(rotation_spread_rad(hands)).min() > 7
+
+
+def test_a_workspace_without_room_is_said():
+    limits = replace(safety_filter(CONFIG.deploy, INFO, "franka").limits, workspace_upper_m=(0.3, 0.1, 0.05))
+    with pytest.raises(UserError, match=r"0 of 2 poses .* deploy\.workspace"):
+        poses.plan(poses.Bench(limits, LENS, nominal_pose(), BOARD), 2, HOME_RAD, np.random.default_rng(0))
+
+
+def test_the_jacobian_is_the_derivative_of_the_grip_pose():
+    q = HOME_RAD + 0.1 * np.arange(7)
+    J, step = kinematics.grip_jacobian(q), 1e-6
+    T = kinematics.grip_pose(q)
+    for joint in range(7):
+        moved = kinematics.grip_pose(q + step * np.eye(7)[joint])
+        turn = Rotation.from_matrix(moved[:3, :3] @ T[:3, :3].T).as_rotvec()
+        expected = np.concatenate([moved[:3, 3] - T[:3, 3], turn]) / step
+        np.testing.assert_allclose(J[:, joint], expected, atol=1e-5)
+
+
+def test_an_arm_that_is_held_up_is_given_up_and_steps_keep_the_speed():
+    arm, clock = Arm(), RobotClock()
+    clock.follow(arm.time_s)
+    driver = Driver(arm, safety_filter(CONFIG.deploy, INFO, "franka"), clock, 0.3)
+    steps = []
+    free = arm.command
+
+    def stuck(q_target_rad, close):
+        steps.append(np.abs(q_target_rad - arm.q_rad).max())
+        if arm.q_rad[0] < 0.2:
+            free(q_target_rad, close)
+
+    arm.command = stuck  # type: ignore[method-assign]
+    assert driver.go(HOME_RAD + [0.15, 0, 0, 0, 0, 0, 0])
+    assert not driver.go(HOME_RAD + [0.5, 0, 0, 0, 0, 0, 0])
+    assert max(steps) <= 0.03 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("shift_mm", "turn_deg", "said"),
+    [
+        ((3, -4, 0), (0, 0.5, 0), "within the 10 mm / 0.86 degrees an axis that training draws"),
+        ((12, 0, -20), (0, 0, 0), "move it 12 mm towards the robot, 20 mm up"),
+        ((0, 15, 0), (-2, 0, 1.5), "move it 15 mm to the robot's right; turn it 2.0 degrees up, 1.5 degrees "
+         "anticlockwise"),
+    ],
+)  # fmt: skip
+def test_which_way_to_move_the_camera(shift_mm, turn_deg, said):
+    away = Offset(1e-3 * np.array(shift_mm, float), np.radians(np.array(turn_deg, float)))
+    assert describe(away, SPREAD).endswith(said)
+
+
+def test_offsets_are_what_training_displaces_by():
+    assert np.allclose(nominal_pose(), nominal_camera(CONFIG.world.profile).T_world_cam)
+    away = offset(T_BASE_CAM, nominal_pose())
+    np.testing.assert_allclose(away.shift_m, SHIFT_M, atol=1e-12)
+    np.testing.assert_allclose(away.turn_rad, TURN_RAD, atol=1e-9)
+
+
+def test_without_a_calibration_deploy_says_what_it_assumes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    place = standing.standing(CONFIG, SessionOptions("franka", "realsense"))
+    assert place.line == (
+        "not calibrated: assumes the camera at (0.94, 0.00, 0.56) m in the robot's base frame, looking at "
+        "(0.48, 0.00, 0.05), within 10 mm / 0.86 degrees an axis; `ddgrasp calibrate` measures it"
+    )
+    assert place.as_dict() is None and standing.standing(CONFIG, SessionOptions()).line == ""
+
+
+def test_a_calibration_of_another_robot_is_not_taken(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = standing.Calibration("2026-11-23T10:00:00", "rig", "127.0.0.9", nominal_pose(), 0.1)
+    standing.save(standing.DEFAULT_FILE, made)
+    place = standing.standing(CONFIG, SessionOptions("franka", "realsense"))
+    assert "is of camera 'rig' and the robot at 127.0.0.9): assumes the camera at" in place.line
+    named = SessionOptions("franka", "realsense", calibration=standing.DEFAULT_FILE)
+    with pytest.raises(UserError, match=r"not of 'realsense' at 172\.16\.0\.2: `ddgrasp calibrate`"):
+        standing.standing(CONFIG, named)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "does not exist"),
+        ("{", "is not valid JSON"),
+        ("{}", r"is no calibration \('version'\)"),
+        ('{"version": 9}', "has version 9, 1 is read"),
+        ('{"version": 1, "T_base_cam": [[1, 2]], "rms_px": 1}', "no rigid transform"),
+    ],
+)
+def test_files_that_are_no_calibration(tmp_path, text, said):
+    path = tmp_path / "mine.json"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(UserError, match=said):
+        standing.load(path)
+
+
+def test_the_rig_s_hand_holds_the_board_where_the_truth_says(open_gl, planned):
+    simulator = pytest.importorskip("franky_sim.mujoco_simulator", reason="needs pip install -e '.[fr3]'")
+    from rig.fr3 import scene
+    from rig.fr3.picture import ScenePicture
+
+    sim = simulator.MujocoSimulator()
+    sim.add_robot(initial_q=list(HOME_RAD), initial_hand_width=0.0)
+    scene.furnish(sim.scene, scene.primitive("cube"), 0)
+    hold(sim.scene, BOARD, 3)
+    shown = ScenePicture(ET.tostring(sim.scene, encoding="unicode"), 2560)
+    q = planned[1]
+    qpos = shown.model.qpos0.copy()
+    qpos[:7] = q
+    shown.pose(qpos)
+    found = BOARD.find(look(shown, T_BASE_CAM, np.random.default_rng(0)))
+    shown.close()
+    T_cam_board = invert(T_BASE_CAM) @ kinematics.grip_pose(q) @ T_GRIP_BOARD
+    away_px = found.pixels - project(T_cam_board, BOARD.corners_m(), LENS)[found.ids]
+    assert len(found.ids) == 24
+    assert np.abs(away_px.mean(axis=0)).max() < 0.05 and np.abs(away_px).max() < 0.3
+
+
+def test_the_realsense_s_intrinsics_are_opencv_s():
+    told = SimpleNamespace(fx=630.0, fy=631.0, ppx=641.5, ppy=358.2, width=1280, height=720, coeffs=[0.0] * 5)
+    lens = lens_of(told)
+    np.testing.assert_array_equal(lens.matrix, [[630, 0, 641.5], [0, 631, 358.2], [0, 0, 1]])
+    assert (lens.width_px, lens.height_px, lens.distortion.shape) == (1280, 720, (5,))
+
+
+def test_the_board_command_writes_a_page_and_refuses_other_files(tmp_path, capsys):
+    assert main(["calibrate", "board", "--out", str(tmp_path / "b.pdf"), "--board.square-mm", "25"]) == 0
+    assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
+    assert "5 x 7 squares, 25 mm each" in capsys.readouterr().out
+    assert main(["calibrate", "board", "--out", str(tmp_path / "b.docx")]) == 2
+    assert main(["calibrate", "board", "--board.square-mm", "90"]) == 2
+    assert "fits no page of A4, A3" in capsys.readouterr().err
