@@ -24,10 +24,9 @@ TABLE_GAP_M, LINK_GAP_M = 0.02, 0.04
 """Room between the board and the table, and between it and the arm's own links."""
 _JOINT_MARGIN_RAD = 0.05
 _PATH_STEP_RAD = 0.1
-_TRIES = 60
-"""Random poses tried for each that is asked for."""
-_SPARE = 4
-"""More than are asked for, as the straight way to some is not free; so is half of them."""
+_TRIES = 15
+"""Random poses drawn for each that is wanted, in each of `_ROUNDS`: the straight way to some is not free."""
+_ROUNDS = 4
 _LINKS = slice(0, 7)
 """Of the arm's spheres, those that the board could touch; hand and flange hold it."""
 
@@ -50,27 +49,17 @@ def plan(
 
     Raises UserError if the arm's limits leave too few.
     """
-    T_grip_board = bench.board.held_pose()
     reached: list[np.ndarray] = []
-    for _ in range(_TRIES * count):
-        T_base_grip = bench.T_base_cam @ _random_view(bench, rng) @ invert(T_grip_board)
-        if not _is_board_free(bench, T_base_grip):
-            continue  # before the arm's joints are looked for, which takes longer
-        for turned in (np.pi / 2, -np.pi / 2):
-            guess = np.append(q_start_rad[:6], q_start_rad[6] + turned)
-            q = reach(T_base_grip, guess, bench.limits)
-            if q is not None and is_free(bench, q):
-                reached.append(q)
-                break
-        if len(reached) >= count + max(count // 2, _SPARE):
-            break
-    ordered = _ordered(reached, q_start_rad, lambda a, b: _is_free_way(bench, a, b))[:count]
-    if len(ordered) < count:
-        raise UserError(
-            f"{len(ordered)} of {count} poses with the board in view can be reached within deploy.workspace "
-            "and deploy.arm: give fewer --poses, a smaller board, or wider limits if there is room."
-        )
-    return np.array(ordered)
+    ordered: list[np.ndarray] = []
+    for _ in range(_ROUNDS):
+        reached += _reached(bench, count + count // 2, q_start_rad, rng)
+        ordered = _ordered(reached, q_start_rad, lambda a, b: _is_free_way(bench, a, b))[:count]
+        if len(ordered) == count:
+            return np.array(ordered)
+    raise UserError(
+        f"{len(ordered)} of {count} poses with the board in view can be reached within deploy.workspace and "
+        "deploy.arm: give fewer --poses, a smaller board, or wider limits if there is room."
+    )
 
 
 def reach(T_base_grip: Pose, q_guess_rad: Float[np.ndarray, "7"], limits: SafetyLimits) -> np.ndarray | None:
@@ -104,6 +93,24 @@ def is_free(bench: Bench, q_rad: Float[np.ndarray, "7"]) -> bool:
     points = _sheet_m(bench.board, T_base_grip)
     apart = np.linalg.norm(points[:, None] - centers[None, _LINKS], axis=-1) - radii[None, _LINKS, 0]
     return bool(apart.min() > LINK_GAP_M)
+
+
+def _reached(bench: Bench, count: int, q_start_rad: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+    """Up to `count` joint positions with the board in view, in the order in which they were drawn."""
+    T_board_grip = invert(bench.board.held_pose())
+    found: list[np.ndarray] = []
+    for _ in range(_TRIES * count):
+        T_base_grip = bench.T_base_cam @ _random_view(bench, rng) @ T_board_grip
+        if not _is_board_free(bench, T_base_grip):
+            continue  # before the arm's joints are looked for, which takes longer
+        for turned in (np.pi / 2, -np.pi / 2):
+            q = reach(T_base_grip, np.append(q_start_rad[:6], q_start_rad[6] + turned), bench.limits)
+            if q is not None and is_free(bench, q):
+                found.append(q)
+                break
+        if len(found) == count:
+            break
+    return found
 
 
 def _is_free_way(bench: Bench, a_rad: np.ndarray, b_rad: np.ndarray) -> bool:
