@@ -15,6 +15,8 @@ TILE_WIDTH_PX = 640
 BOARD_AXIS_M, BASE_AXIS_M = 0.06, 0.2
 _FOUND, _EXPECTED, _TEXT = (80, 220, 80), (40, 40, 255), (255, 255, 255)
 """Blue, green, red."""
+_AXES = ((40, 40, 255), (40, 200, 40), (255, 80, 40))
+"""x, y, z."""
 
 
 def sheet(
@@ -56,13 +58,21 @@ def _tile(
         cv2.circle(shown, _whole(found), 7, _FOUND, 2, cv2.LINE_AA)
         cv2.drawMarker(shown, _whole(should), _EXPECTED, cv2.MARKER_CROSS, 9, 2)
     for T, length_m in ((T_cam_board, BOARD_AXIS_M), (T_cam_base, BASE_AXIS_M)):
-        turn, _ = cv2.Rodrigues(T[:3, :3])
-        cv2.drawFrameAxes(shown, lens.matrix, lens.distortion, turn, T[:3, 3], length_m, 4)
+        _draw_axes(shown, T, length_m, lens)
     height_px = round(lens.height_px * TILE_WIDTH_PX / lens.width_px)
     small = cv2.resize(shown, (TILE_WIDTH_PX, height_px), interpolation=cv2.INTER_AREA)
     text = f"view {index + 1}: {len(view.corners.ids)} corners, {hand_eye.view_rms_px[index]:.2f} px RMS"
     cv2.putText(small, text, (10, height_px - 12), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT, 1, cv2.LINE_AA)
     return small
+
+
+def _draw_axes(shown: np.ndarray, T_cam_frame: np.ndarray, length_m: float, lens: Lens) -> None:
+    """As cv2.drawFrameAxes, which complains on the terminal of axes that leave the picture."""
+    if T_cam_frame[2, 3] < 2 * length_m:  # behind the camera, or so near that an end might be
+        return
+    origin, *ends = project(T_cam_frame, length_m * np.vstack([np.zeros(3), np.eye(3)]), lens)
+    for end, colour in zip(ends, _AXES, strict=True):
+        cv2.line(shown, _whole(origin), _whole(end), colour, 4, cv2.LINE_AA)
 
 
 def _whole(pixel: np.ndarray) -> tuple[int, int]:

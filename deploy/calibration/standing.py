@@ -129,7 +129,7 @@ def describe(away: Offset, spread: RandomConfig) -> str:
     """One line: how far the camera is from where it was trained, and what to move if that is too far."""
     place = f"the camera is {_size(away)} from where it was trained"
     if is_trained_for(away, spread):
-        return f"{place}, within the {_spread(spread)} that training draws"
+        return f"{place}, within training's {_spread(spread)}"
     moves = [
         f"{1e3 * abs(value):.0f} mm {words[int(value < 0)]}"
         for value, words in zip(away.shift_m, _MOVES, strict=True)
@@ -141,7 +141,7 @@ def describe(away: Offset, spread: RandomConfig) -> str:
         if abs(value) > spread.camera_angle_rad
     ]
     remedy = [f"move it {', '.join(moves)}"] * bool(moves) + [f"turn it {', '.join(turns)}"] * bool(turns)
-    return f"{place}, more than the {_spread(spread)} that training draws: {'; '.join(remedy)}"
+    return f"{place}, more than training's {_spread(spread)}: {'; '.join(remedy)}"
 
 
 def save(path: Path, calibration: Calibration) -> None:
@@ -191,4 +191,4 @@ def _size(away: Offset) -> str:
 
 def _spread(spread: RandomConfig) -> str:
     angle = np.degrees(spread.camera_angle_rad)
-    return f"{1e3 * spread.camera_position_m:g} mm / {angle:.2f} degrees an axis"
+    return f"±{1e3 * spread.camera_position_m:g} mm and ±{angle:.2f} degrees on each axis"
