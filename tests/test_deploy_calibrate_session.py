@@ -29,7 +29,7 @@ from deploy.devices import registry
 from deploy.devices.fr3_imager import Fr3Imager, nominal_lens
 from deploy.devices.options import SessionOptions
 from deploy.devices.realsense_imager import lens_of
-from deploy.interfaces import RobotError
+from deploy.interfaces import CameraError, RobotError
 from deploy.session import for_devices
 from deploy.setup import safety_filter
 from deploy_support import HOME_RAD, KinematicRobot
@@ -172,6 +172,17 @@ def test_a_board_that_is_not_seen_ends_the_run_early_and_leaves_a_picture(tmp_pa
         session.run(fast(), options(tmp_path), said.append)
     assert (tmp_path / "not-seen.png").exists() and not (tmp_path / "cal.json").exists()
     assert "pose 4 of 7: board not seen" in said and bench.arm.calls[-1] == "stop"
+
+
+def test_a_camera_without_pictures_is_told_from_a_board_that_is_not_seen(tmp_path, bench, monkeypatch):
+    def unplugged():
+        raise CameraError("unplugged")
+
+    monkeypatch.setattr(bench.imager, "picture", unplugged)
+    said: list[str] = []
+    with pytest.raises(UserError, match="none of 7 poses gave a picture"):
+        session.run(fast(), options(tmp_path), said.append)
+    assert "pose 7 of 7: no picture (unplugged)" in said
 
 
 def test_an_arm_that_stops_ends_the_run_in_one_line(tmp_path, bench):

@@ -56,7 +56,7 @@ class Calibrate:
     poses: Annotated[int, Range(6, 100)] = 20
     """Views to take."""
     speed: Annotated[float, Range(0.02, 0.6)] = 0.3
-    """Of the fastest joint, rad/s; deploy.franka.dynamics may allow less."""
+    """Speed of the fastest joint, rad/s; deploy.franka.dynamics may allow less."""
     dry_run: bool = False
     """Connect and look, print the poses, move nothing."""
     yes: bool = False

@@ -56,7 +56,7 @@ class HandEye:
     used: Bool[np.ndarray, " n"]
     """(n,) which views were used."""
     closed_form_rms_px: float
-    """Of the closed form, over the same views."""
+    """The same of the closed form, over the same views."""
     position_std_m: Float64[np.ndarray, "3"]
     """(3,) standard error of the camera's position, base frame, if corners alone were noisy."""
     angle_std_rad: Float64[np.ndarray, "3"]

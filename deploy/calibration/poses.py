@@ -28,7 +28,7 @@ _TRIES = 15
 """Random poses drawn for each that is wanted, in each of `_ROUNDS`: the straight way to some is not free."""
 _ROUNDS = 4
 _LINKS = slice(0, 7)
-"""Of the arm's spheres, those that the board could touch; hand and flange hold it."""
+"""Those of the arm's spheres that the board could touch; hand and flange hold it."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from mjx_envs.scene import HOME_RAD
 from sensors.charuco_board import CharucoBoard, Corners
 
 HOPELESS = 4
-"""So many poses without a glimpse of the board end the run."""
+"""So many pictures without a glimpse of the board end the run."""
 MOVED_RAD = 1e-3
 """An arm that moved by more while the picture was taken spoils the view."""
 
@@ -44,7 +44,7 @@ class CalibrationOptions:
     board: CharucoBoard = field(default_factory=CharucoBoard)
     poses: int = 20
     speed_rad_s: float = 0.3
-    """Of the fastest joint."""
+    """Speed of the fastest joint."""
     dry_run: bool = False
     """Connect and look, say where the arm would go, move nothing."""
     yes: bool = False
@@ -142,12 +142,14 @@ def _take(
         driver.grip(close=True)
         for number, q_target in enumerate(ways, start=1):
             say(f"pose {number} of {len(ways)}: {_one(driver, imager, q_target, options.board, taken)}")
-            if number >= HOPELESS and not taken.seen:
+            if len(taken.views) >= HOPELESS and not taken.seen:
                 break
         _give_back(driver, options, say)
     except RobotError as error:
         raise UserError(f"calibration ended at pose {number} of {len(ways)}: {error}.") from error
-    if not taken.seen and taken.pictures:
+    if not taken.views:
+        raise UserError(f"none of {len(ways)} poses gave a picture; what happened is said above.")
+    if not taken.seen:
         path = options.out.with_name("not-seen.png")
         atomic_write_bytes(path, picture.encode(taken.pictures[-1]))
         say(f"the last picture: {path}")

@@ -19,7 +19,7 @@ Pose = Float[np.ndarray, "4 4"]
 FINER = 2
 """Pixels drawn per side of one that is seen."""
 BLUR_PX, NOISE_GRAY = 0.5, 2.0
-"""Of the optics and of the imager, standard deviations."""
+"""Standard deviations: of the optics, of the imager."""
 
 
 def make(setup: Setup) -> "Fr3Imager":
