@@ -139,12 +139,13 @@ def _random_view(bench: Bench, rng: np.random.Generator) -> np.ndarray:
 
 
 def _is_board_free(bench: Bench, T_base_grip: np.ndarray) -> bool:
-    """Whether the grip point is in its box, and the board clear of the table."""
+    """Whether the grip point is in its box, and the board in the arm's, clear of the table."""
     limits, grip = bench.limits, T_base_grip[:3, 3]
     if (grip < limits.workspace_lower_m).any() or (grip > limits.workspace_upper_m).any():
         return False
-    lowest_m = _sheet_m(bench.board, T_base_grip)[:, 2].min()
-    return bool(lowest_m >= limits.arm_lower_m[2] + TABLE_GAP_M)
+    points = _sheet_m(bench.board, T_base_grip)
+    lower_m = np.array(limits.arm_lower_m) + (0.0, 0.0, TABLE_GAP_M)
+    return bool((points >= lower_m).all() and (points <= limits.arm_upper_m).all())
 
 
 def _sheet_m(board: CharucoBoard, T_base_grip: np.ndarray) -> np.ndarray:

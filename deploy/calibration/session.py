@@ -135,7 +135,8 @@ def _take(
     taken = Taken()
     confirm(
         "Hold the board between the fingers by the middle of its upper margin, its printed face to the "
-        f"robot's right: the hand closes, then the arm moves through {len(ways)} poses. Ready?"
+        "robot's right, and clear the table of everything else: the hand closes, then the arm moves through "
+        f"{len(ways)} poses. Ready?"
     )
     number = 0
     try:
