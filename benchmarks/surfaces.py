@@ -22,7 +22,7 @@ from ddgrasp.depth import to_metres, to_millimetres
 from evaluation.depth_score import features as score_features
 from evaluation.depth_score.data import REAL, SIM, Episode, load_episode
 from evaluation.depth_score.distances import fid
-from evaluation.depth_score.domains import inpainted
+from sensors.inpainting import inpainted
 
 Make = Callable[[np.ndarray], np.ndarray]
 """Sensed depth (T, H, W) metres -> geometry, the same."""

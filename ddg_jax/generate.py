@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Key, UInt8, UInt16
 
-from ddg_jax.sample import Generator, batch_size, condition, grafted, predict
+from ddg_jax.sample import Generated, Generator, batch_size, condition, grafted, predict
 from ddgrasp import depth
 from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
@@ -44,6 +44,8 @@ def noisy_episodes(
     lengths: Sequence[int],
     read: Callable[[int], Clip],
     first: int = 0,
+    *,
+    grafting: bool = True,
 ) -> Iterator[UInt16[np.ndarray, "T H W"]]:
     """Yields the grafted depth, (T, H, W) uint16 millimetres, of episodes `first`, `first` + 1, ... in order.
 
@@ -52,6 +54,7 @@ def noisy_episodes(
     Args:
       lengths: frames of every episode, those before `first` included: they say where batches are cut.
       read: episode's position in `lengths` -> its frames.
+      grafting: off gives the generator's own map instead of grafted depth.
     """
     starts = np.concatenate([[0], np.cumsum(lengths)]).astype(int)
     size = batch_size(generator.config)
@@ -75,8 +78,12 @@ def noisy_episodes(
             x = np.stack([made.popleft() for _ in range(starts[i + 1] - used)])
             used = starts[i + 1]
             if i >= first:
-                made_m = grafted(generator.config, depth.to_metres(clip.depth_mm), x).depth_m
-                yield depth.to_millimetres(made_m)
+                yield made_mm(grafted(generator.config, depth.to_metres(clip.depth_mm), x), grafting)
+
+
+def made_mm(made: Generated, grafting: bool) -> UInt16[np.ndarray, "B H W"]:
+    """(B, H, W) uint16 millimetres: grafted depth, or without `grafting` the generator's own map."""
+    return depth.to_millimetres(made.depth_m if grafting else made.predicted_m)
 
 
 def run(job: Job) -> Artifact:

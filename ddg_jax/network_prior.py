@@ -88,6 +88,8 @@ class DepthNetworkPrior:
             return np.stack(list(stream(network, params, rgb, side)))
 
         def pictures(rgb: np.ndarray) -> np.ndarray:
+            if len(rgb) == 1:
+                return np.asarray(predict(network, params, rgb, side))
             parts = [rgb[start : start + _BATCH] for start in range(0, len(rgb), _BATCH)]
             filled = [np.concatenate([part, np.repeat(part[-1:], _BATCH - len(part), 0)]) for part in parts]
             return np.concatenate([np.asarray(predict(network, params, f, side)) for f in filled])[: len(rgb)]

@@ -17,6 +17,7 @@ from deploy.devices.franka_robot import LOST, FrankaRobot
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
+from deploy.treatment import Treatment, treated
 from deploy.trials import Filming, Trial, TrialResult, Watch, result
 from rig.camera import camera_pose
 from rig.film import Film
@@ -47,6 +48,8 @@ class Fr3Bench:
     """A D455 in the mode that it is run in, the same matching at the policy's size, or no errors at all."""
     contact: float = 100.0
     """Newtons at the hand, and newton metres at it and at the joints, at which the arm stops itself."""
+    treatment: Treatment | None = None
+    """What is done to depth before the policy sees it."""
 
     def __call__(self, config: Config, policy_path: Path) -> "Fr3Runner":
         return Fr3Runner(config, policy_path, self)
@@ -102,7 +105,8 @@ class Fr3Runner:
         pose = camera_pose(config, rng)
         camera = fr3_camera.Fr3Camera(rig.host, clock, self._sense(profile, clock, rng), profile, pose)
         safety = safety_filter(settings, info, "franka")
-        loop = ControlLoop(camera, robot, self._policy, safety, clock, loop_settings(settings, info))
+        seen = treated(camera, self._bench.treatment)
+        loop = ControlLoop(seen, robot, self._policy, safety, clock, loop_settings(settings, info))
         filming = Filming(camera, config.deploy.film_every, watch)
         report = loop.run(config.world.episode_steps, filming.look)
         if report.interrupted:

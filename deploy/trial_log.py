@@ -46,6 +46,11 @@ class TrialLog:
             os.fsync(file.fileno())
 
 
+def read_results(path: Path) -> list[TrialResult]:
+    """The finished trials in a log, whatever they belong to; none if there is no log."""
+    return [TrialResult(**line) for line in _complete_lines(path)[1:]]
+
+
 def _line(value: dict[str, Any]) -> str:
     return json.dumps(value, allow_nan=False) + "\n"
 

@@ -23,6 +23,7 @@ from deploy.interfaces import Depth, Filmed
 from deploy.loop import ControlLoop, LoopReport, Step
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
+from deploy.treatment import Treatment, treated
 from rig.film import Film
 
 _STREAM = 0x526967
@@ -91,15 +92,18 @@ class Bench(Protocol):
 class Rig:
     """World, camera and policy, built once and used for one trial after the other."""
 
-    def __init__(self, config: Config, policy_path: Path, ideal: bool = False):
-        """`ideal` looks through a camera without errors instead of the stereo camera."""
+    def __init__(
+        self, config: Config, policy_path: Path, ideal: bool = False, treatment: Treatment | None = None
+    ):
+        """`ideal` looks through a camera without errors instead of the stereo camera; `treatment` is what is
+        done to depth before the policy sees it."""
         import cv2
 
         from rig.camera import make_camera
         from rig.world import make_world
 
         cv2.setNumThreads(1)
-        self._config = config
+        self._config, self._treatment = config, treatment
         self._policy = OnnxPolicy(
             policy_path, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None
         )
@@ -121,7 +125,8 @@ class Rig:
             self._world, self._camera, camera_pose(config, rng), rng, robot.catch_up, trial.object_name
         )
         safety = safety_filter(config.deploy, self._policy.info)
-        loop = ControlLoop(camera, robot, self._policy, safety, clock, settings)
+        seen = treated(camera, self._treatment)
+        loop = ControlLoop(seen, robot, self._policy, safety, clock, settings)
         filming = Filming(camera, config.deploy.film_every, watch)
         # Drawing for people takes the time of a period: not while time is measured.
         report = loop.run(config.world.episode_steps, None if trial.realtime else filming.look)

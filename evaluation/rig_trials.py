@@ -18,6 +18,7 @@ from deploy.stage import STAGE
 from deploy.trial_log import TrialLog
 from deploy.trials import Bench, Rig, Trial, TrialResult, run_trials
 from evaluation import wilson
+from evaluation.treatments import RECORDED, TreatmentName, make_treatment
 from rig import seeds
 from rig.film import Film, contact_sheet
 
@@ -50,6 +51,10 @@ class Series:
     contact: float = 100.0
     """On rig fr3: newtons at the hand, and newton metres, at which the arm stops itself."""
 
+    depth: TreatmentName = RECORDED
+    """What the policy sees: depth as recorded, inpaint (holes filled on line), or monocular (a network on
+    colour, made metric by recorded depth)."""
+
     def names(self) -> tuple[str, ...]:
         """The objects. UserError for an unknown one, or a choice that the rig does not have."""
         if self.rig == "development" and (self.camera == "coarse" or self.shapes != "mesh"):
@@ -78,11 +83,12 @@ class Series:
         world = replace(config.world, objects=_trained(), episode_steps=steps)
         return replace(config, seed=seeds.seed(self.split, self.number), world=world)
 
-    def make(self) -> Callable[[Config, Path], Bench]:
-        """What makes a bench in every worker."""
+    def make(self, config: Config) -> Callable[[Config, Path], Bench]:
+        """What makes a bench in every worker. UserError where a network's weights are missing."""
+        treatment = make_treatment(self.depth, config)
         if self.rig == "fr3":
-            return Fr3Bench(self.shapes, self.camera, self.contact)
-        return partial(Rig, ideal=self.camera == "ideal")
+            return Fr3Bench(self.shapes, self.camera, self.contact, treatment)
+        return partial(Rig, ideal=self.camera == "ideal", treatment=treatment)
 
     def _known(self) -> tuple[str, ...]:
         if self.rig == "development" or self.shapes == "primitive":
@@ -105,7 +111,7 @@ def run(
     todo = [trial for trial in trials if (trial.index, False) not in log.results]
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(trials) - len(todo))
-        for result, film in run_trials(config, policy, todo, workers, series.make()):
+        for result, film in run_trials(config, policy, todo, workers, series.make(config)):
             shown = {r.object_name for r in log.results.values() if r.success}
             log.append(result)
             if film.steps and not (result.success and result.object_name in shown):
@@ -161,7 +167,8 @@ def _success(results: Iterable[TrialResult]) -> dict[str, Any]:
 
 def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     """What the trials belong to; how many of which objects may grow."""
-    bench = {key: value for key, value in asdict(series).items() if key not in ("objects", "trials")}
+    left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
+    bench = {key: value for key, value in asdict(series).items() if key not in left_out}
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),

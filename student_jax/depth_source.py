@@ -1,6 +1,7 @@
 """Where the student's depth comes from in training: clean depth in, depth as a camera would report it out.
 
-`student.depth_source` names one: `learned` is the run's fitted generator, the others are the camera models of
+`student.depth_source` names one: `learned` is the run's fitted generator, `learned_ungrafted` its own map,
+`monocular` a network on colour (`ddg_jax/monocular.py`), the others are the camera models of
 `ddg_jax/sensor.py`.
 """
 
@@ -15,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int, Key, UInt8, UInt16
 
-from ddg_jax.generate import Clip, noisy_episodes
+from ddg_jax.generate import Clip, made_mm, noisy_episodes
+from ddg_jax.monocular import MonocularDepth
 from ddg_jax.prior import Prior
 from ddg_jax.sample import Generator, generate
 from ddg_jax.sensor import BY_COLOUR, make_sensor
@@ -25,6 +27,8 @@ from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
 from sensors.models.sense import Sense
 
+LEARNED = ("learned", "learned_ungrafted")
+"""Sources that are the run's generator."""
 _BATCH = 16
 """Frames that a camera model gets at once: one size, compiled once."""
 
@@ -75,6 +79,8 @@ class GeneratorSource:
 
     generator: Generator
     key: Key[jax.Array, ""]
+    grafting: bool = True
+    """Off: the generator's own map, as in the paper's ablation (IV-C)."""
 
     @property
     def needs_rgb(self) -> bool:
@@ -85,7 +91,7 @@ class GeneratorSource:
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
     ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
         """See `DepthSource`."""
-        return noisy_episodes(self.key, self.generator, lengths, read, first)
+        return noisy_episodes(self.key, self.generator, lengths, read, first, grafting=self.grafting)
 
     def frames(
         self,
@@ -97,7 +103,35 @@ class GeneratorSource:
         """See `DepthSource`."""
         rgb = rgb if self.needs_rgb else None
         noisy = generate(self.key, self.generator, to_metres(depth_mm), rgb, episode=episode, frame=frame)
-        return to_millimetres(noisy.depth_m)
+        return made_mm(noisy, self.grafting)
+
+
+@dataclass(frozen=True)
+class MonocularSource:
+    """Depth that a network estimates from simulated colour, made metric by clean depth; without noise."""
+
+    network: MonocularDepth
+    needs_rgb: bool = True
+
+    def episodes(
+        self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
+    ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
+        """See `DepthSource`."""
+        for i in range(first, len(lengths)):
+            clip = read(i)
+            assert clip.rgb is not None  # `check_colour` sees to it
+            yield self.network(clip.depth_mm, clip.rgb)
+
+    def frames(
+        self,
+        depth_mm: UInt16[np.ndarray, "B H W"],
+        rgb: UInt8[np.ndarray, "B H W 3"] | None,
+        episode: Int[np.ndarray, " B"],
+        frame: Int[np.ndarray, " B"],
+    ) -> UInt16[np.ndarray, "B H W"]:
+        """See `DepthSource`."""
+        assert rgb is not None
+        return self.network(depth_mm, rgb)
 
 
 @dataclass(frozen=True)
@@ -144,19 +178,26 @@ class SenseSource:
 def make_source(config: Config, ddg: Path) -> DepthSource:
     """The source that `config.student.depth_source` names; `ddg` is the stage directory of the generator.
 
-    Raises UserError for an unknown name, or where `learned` finds no generator.
+    Raises UserError for an unknown name, or where `learned` finds no generator or `monocular` no weights.
     """
     name, key = config.student.depth_source, jax.random.key(config.seed)
-    if name == "learned":
-        return GeneratorSource(Generator.load(ddg), key)
+    if name in LEARNED:
+        return GeneratorSource(Generator.load(ddg), key, grafting=name == "learned")
+    if name == "monocular":
+        return MonocularSource(MonocularDepth(config.ddg))
     sensor = SensorConfig(name=name, stereo=config.record.stereo)
     return SenseSource(make_sensor(sensor, config.world.profile), key, name in BY_COLOUR)
 
 
 def check_source(config: Config, prior: Prior) -> None:
-    """UserError if the demos will lack the colour that the source needs; `prior` is the generator's."""
+    """UserError if the source's weights are missing, or the demos will lack the colour that it needs.
+
+    `prior` is the generator's.
+    """
     name = config.student.depth_source
-    needs_rgb = prior.needs_sim_rgb if name == "learned" else name in BY_COLOUR
+    if name == "monocular":
+        MonocularDepth(config.ddg)
+    needs_rgb = prior.needs_sim_rgb if name in LEARNED else name in (*BY_COLOUR, "monocular")
     if needs_rgb and not config.demos.rgb:
         raise UserError(
             f"student.depth_source {name!r} needs colour in the demos, and demos.rgb is false: add "

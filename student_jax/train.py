@@ -170,9 +170,9 @@ def encode(
     crop_rc: Int[AnyArray, "B 2"],
     key: Key[Array, ""] | None = None,
 ) -> Any:
-    """`policy.Seen` of a batch; with `key`, under the disparity noise of training."""
+    """`policy.Seen` of a batch; with `key`, under the disparity noise of training, if it has any."""
     depth_m = to_metres(depth_mm)
-    if key is not None:
+    if key is not None and config.training.disparity_noise_px:
         depth_m = disparity_noise(key, depth_m, profile, config)
     return StudentPolicy(config, profile).apply({"params": params}, depth_m, state, crop_rc, method="encode")
 

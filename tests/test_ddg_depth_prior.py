@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 
 from ddg_jax import network_prior, sample
+from ddg_jax.generate import Clip
 from ddg_jax.inverse_depth import invert, normalise
+from ddg_jax.monocular import MonocularDepth
 from ddg_jax.prior import InverseDepthPrior, make_prior
-from ddgrasp.config import DDGConfig, DDGDepthConfig, PriorConfig, PriorInSim
+from ddgrasp.config import Config, DDGConfig, DDGDepthConfig, PriorConfig, PriorInSim, StudentConfig
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json
 from demos.rollout import Scene
+from evaluation.treatments import Monocular, make_treatment
 from foundation import convert, store
 from student_jax.act import SourceCamera
-from student_jax.depth_source import GeneratorSource
+from student_jax.depth_source import GeneratorSource, MonocularSource, check_source
 
 
 @pytest.fixture(scope="module")
@@ -125,3 +128,47 @@ def test_monocular_depth_is_fitted_to_the_measured_one():
     np.testing.assert_allclose(network_prior.metric_depth(relative, measured, 10.0), truth, rtol=1e-5)
     with pytest.raises(UserError, match="no two valid"):
         network_prior.metric_depth(relative, np.zeros((6, 8)), 10.0)
+
+
+def test_monocular_depth_has_the_scale_of_what_was_measured_and_no_holes(weights):
+    settings = config(weights)
+    network = MonocularDepth(settings, str(weights))
+    rng = np.random.default_rng(5)
+    rgb = rng.integers(0, 256, (2, 28, 42, 3)).astype(np.uint8)
+    relative = make_prior(config(weights, in_sim="rgb")).from_sim(np.ones((2, 28, 42), np.float32), rgb)
+    truth_m = 1 / (0.2 * relative + 1.5)
+    truth_m[:, :3] = 0.0  # a hole does not count, and is filled
+    made_mm = network(np.round(1000 * truth_m).astype(np.uint16), rgb)
+    np.testing.assert_allclose(made_mm[:, 3:], 1000 * truth_m[:, 3:], atol=3)
+    assert made_mm.dtype == np.uint16 and (made_mm > 0).all()
+    nothing = network(np.zeros((1, 28, 42), np.uint16), rgb[:1])
+    assert not nothing.any()
+
+
+def test_student_and_rig_get_the_same_monocular_depth(weights):
+    settings = config(weights)
+    source = MonocularSource(MonocularDepth(settings, str(weights)))
+    rng = np.random.default_rng(6)
+    rgb = rng.integers(0, 256, (2, 28, 42, 3)).astype(np.uint8)
+    depth_mm = rng.integers(500, 900, (2, 28, 42)).astype(np.uint16)
+    number = np.zeros(2, int)
+    frames = source.frames(depth_mm, rgb, number, number)
+    (episode,) = source.episodes([2], lambda i: Clip(i, depth_mm, rgb))
+    np.testing.assert_array_equal(episode, frames)
+    treatment = Monocular(settings, str(weights))
+    on_line = np.stack([treatment(d, c) for d, c in zip(depth_mm, rgb, strict=True)])
+    assert np.abs(on_line.astype(int) - frames).max() <= 1  # alone or in a batch, up to rounding
+    metres = treatment((depth_mm[0] / 1000).astype(np.float32), rgb[0])
+    assert metres.dtype == np.float32 and np.abs(1000 * metres - on_line[0]).max() <= 1
+
+
+def test_monocular_depth_without_weights_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "WEIGHTS_DIR", tmp_path)
+    settings = Config(preset="test", student=StudentConfig(depth_source="monocular"))
+    for ask in (
+        lambda: check_source(settings, InverseDepthPrior(settings.ddg)),
+        lambda: make_treatment("monocular", settings),
+    ):
+        with pytest.raises(UserError, match="depth_anything_v2_small holds no converted weights: get a file"):
+            ask()
+    assert make_treatment("recorded", settings) is None

@@ -40,7 +40,6 @@ from evaluation.depth_score.domains import (
     LIMIT,
     REFERENCES,
     Methods,
-    inpainted,
     sense,
     wanted_domains,
 )
@@ -49,6 +48,7 @@ from evaluation.depth_score.figures import draw_efficiency
 from evaluation.report.stage import write_report
 from foundation import convert, store
 from job_support import make_job
+from sensors.inpainting import inpainted
 from sensors.recordings.recording import RecordingWriter
 
 ROOT = Path(__file__).parents[1]

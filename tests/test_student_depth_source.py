@@ -170,6 +170,26 @@ def test_learned_is_the_generator_of_the_run_to_the_bit(demos, generator, tmp_pa
     )
 
 
+def test_without_grafting_the_student_sees_the_generators_own_map(demos, generator, tmp_path):
+    save_params(tmp_path / "ddg" / sample.PARAMS_FILE, generator.params)
+    artifacts.finish(tmp_path / "ddg", "ddg", CONFIG, seconds=1, metrics={})
+    settings = with_source("learned_ungrafted")
+    source = make_source(settings, tmp_path / "ddg")
+    seen = training_depth(settings, source, demos, tmp_path, have=1)
+    key = jax.random.key(CONFIG.seed)
+    starts = [0, *demos.ends.tolist()]
+    for i, (first, last) in enumerate(zip(starts, starts[1:], strict=False)):
+        metres = demos.steps("depth_mm", first, last).astype(np.float32) * contract.DEPTH_UNIT_M
+        made = sample.generate(key, generator, metres, episode=i)
+        own_mm = np.round(made.predicted_m / contract.DEPTH_UNIT_M).astype(np.uint16)
+        np.testing.assert_array_equal(seen[first:last], own_mm)
+        number = np.array([i]), np.zeros(1, int)
+        alone = sample.generate(key, generator, metres[:1], episode=number[0], frame=number[1])
+        direct = source.frames(demos.steps("depth_mm", first, first + 1), None, *number)
+        np.testing.assert_array_equal(direct, np.round(alone.predicted_m / contract.DEPTH_UNIT_M))
+        assert np.any(made.depth_m != made.predicted_m)
+
+
 def test_the_rigs_camera_looks_at_clean_depth_in_colour(demos, tmp_path):
     settings = with_source("stereo")
     source = make_source(settings, tmp_path)

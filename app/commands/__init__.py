@@ -24,6 +24,7 @@ from app.commands.play import Play
 from app.commands.rig import RigFr3
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
+from app.commands.study import StudyTable2
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
 from app.commands.trials import DeployTrials
 from ddgrasp.config import Config
@@ -74,6 +75,7 @@ COMMANDS: dict[str, type] = {
     "deploy trials": DeployTrials,
     "calibrate": Calibrate,
     "calibrate board": CalibrateBoard,
+    "study table2": StudyTable2,
     "rig fr3": RigFr3,
     "weights convert": WeightsConvert,
     "weights list": WeightsList,
@@ -91,7 +93,7 @@ def parse(name: str, args: Sequence[str]) -> Command:
     options: dict[str, Any] = {}
     if issubclass(cls, FromPreset):
         preset = _scaled(get_preset(_option(args, "--preset") or DEFAULT_PRESET), _option(args, "--scale"))
-        options["default"] = cls(config=preset, out=Path("runs") / preset.preset)
+        options["default"] = cls(config=preset, out=cls.default_out(preset.preset))
     elif issubclass(cls, Scoring):
         preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
         default = cls(preset.score, preset.preset, Path("runs") / preset.preset)

@@ -34,6 +34,11 @@ class FromPreset:
     resume: bool = False
     """Continue what is there; finished stages are not redone."""
 
+    @classmethod
+    def default_out(cls, preset: str) -> Path:
+        """Where it goes without --out."""
+        return Path("runs") / preset
+
 
 class OneStage(FromPreset):
     """A command that makes one stage of a run."""

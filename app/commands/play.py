@@ -55,7 +55,7 @@ class Play:
         viewer = self._viewer()
         policy = self.policy or _pretrained()
         config = series.configured(config_of(policy, None), policy)
-        bench = series.make()(config, policy)
+        bench = series.make(config)(config, policy)
         try:
             lifted = sum(_watched(bench, trial, viewer) for trial in trials)
             film = f": {self.out}" if self.viewer == "film" else ""

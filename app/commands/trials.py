@@ -32,6 +32,8 @@ class DeployTrials:
     """Length of a trial."""
     contact: Annotated[float, Range(1, 100)] = 100.0
     """On rig fr3: newtons at the hand, and newton metres, at which the arm stops itself."""
+    depth: Literal["recorded", "inpaint", "monocular"] = "recorded"
+    """What the policy sees: recorded, inpaint (holes filled on line), or monocular (a network on colour)."""
     preset: str | None = None
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
     workers: Annotated[int, Range(1, 64)] = 2
@@ -55,6 +57,7 @@ class DeployTrials:
             self.camera,
             self.seconds,
             self.contact,
+            self.depth,
         )
         config = config_of(self.policy, self.preset)
         progress = Progress(name="deploy trials")

@@ -27,8 +27,8 @@ Stem = Literal["conv7", "space_to_depth"]
 Norm = Literal["group", "none"]
 Pooling = Literal["spatial_softmax", "tokens", "mean"]
 Conditioning = Literal["film", "concat"]
-Source = Sensor
-"""Every camera model is a depth source; others (student_jax/depth_source.py) are added to this Literal."""
+Source = Literal[Sensor, "learned_ungrafted", "monocular"]
+"""Every camera model is a depth source; so are others (student_jax/depth_source.py)."""
 STEM_STRIDE = 4
 """Picture pixels per side and position after the encoder's stem; sizes must be multiples of it."""
 GROUP_CHANNELS = 8
@@ -187,7 +187,7 @@ class StudentTrainingConfig(Section, name="student.training"):
     """Random shift of the crop window in training, pixels of the scaled picture, each way."""
     disparity_noise_px: Annotated[float, Range(0, 100)] = 0.25
     """Largest standard deviation of the noise on valid pixels in training, pixels of disparity at the
-    picture's scale (the rig: about 0.07); 0 keeps them exact."""
+    picture's scale (the rig: about 0.07), and with it a few wrong matches; 0 keeps pixels as they come."""
 
 
 @dataclass(frozen=True)
@@ -230,8 +230,10 @@ class StudentConfig(Section, name="student"):
     init_from: Text = ""
     """Run directory or pretrained folder whose student to start from; empty starts from nothing."""
     depth_source: Source = "learned"
-    """What gives the demos' clean depth a camera's artefacts: learned (the run's generator), ideal (nothing),
-    dextrah, kinect or stereo (the rig's camera on the clean picture; needs demos.rgb)."""
+    """What gives the demos' clean depth a camera's artefacts: learned (the run's generator),
+    learned_ungrafted (its own map instead of grafted depth), ideal (nothing), dextrah, kinect, stereo (the
+    rig's camera on the clean picture) or monocular (depth from colour, by a network with weights); the last
+    two need demos.rgb."""
 
     def check(self) -> None:
         """See `Section.check`."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from jaxtyping import UInt16
 
@@ -17,6 +16,7 @@ from ddgrasp import contract
 from ddgrasp.config import DextrahConfig, ScoreConfig
 from ddgrasp.depth import to_metres, to_millimetres
 from evaluation.depth_score.data import REAL, SIM, Episode
+from sensors.inpainting import inpainted
 
 if TYPE_CHECKING:
     import ddg_jax.prior
@@ -124,12 +124,9 @@ def _dextrah(profile: contract.CameraProfile) -> Callable[..., Any]:
     return jax.jit(dextrah(DextrahConfig(), profile))
 
 
-def inpainted(depth_mm: UInt16[np.ndarray, "T H W"], radius_px: float) -> UInt16[np.ndarray, "T H W"]:
-    """(T, H, W) with every hole filled by OpenCV (Telea 2004); the paper names OpenCV and no method."""
-    filled = [
-        cv2.inpaint(frame, (frame == 0).astype(np.uint8), radius_px, cv2.INPAINT_TELEA) for frame in depth_mm
-    ]
-    return np.stack(filled)
+def _real_inpaint(methods: Methods, episode: Episode) -> Maps:
+    radius_px = methods.config.inpaint_radius_px
+    return {"real_inpaint": inpainted(episode.sensed_mm, radius_px)}
 
 
 def _monocular(name: str) -> Callable[[Methods, Episode], Maps]:
@@ -165,11 +162,7 @@ DOMAINS: dict[str, Domain] = {
     "sim_gt": Domain("Sim GT", SIM, lambda m, e: {"sim_gt": e.clean_mm}),
     LIMIT: Domain("Camera's holes, exact depth", SIM, _graft_limit),
     "sim_rand_noise": Domain("Sim Rand Noise", SIM, _rand_noise),
-    "real_inpaint": Domain(
-        "Real Inpaint",
-        REAL,
-        lambda m, e: {"real_inpaint": inpainted(e.sensed_mm, m.config.inpaint_radius_px)},
-    ),
+    "real_inpaint": Domain("Real Inpaint", REAL, _real_inpaint),
     "real_monocular": Domain("Real monocular", REAL, _monocular("real_monocular")),
     "sim_monocular": Domain("Sim monocular", SIM, _monocular("sim_monocular")),
     "sim_ddg_no_graft": Domain("Sim DDG w/o graft", SIM, _generated),

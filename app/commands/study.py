@@ -1,0 +1,100 @@
+"""ddgrasp study table2: the paper's Table II, its ablation of grafting, and hand-made ripple beside them."""
+
+import sys
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from app.commands.base import FromPreset
+from app.commands.checks import check_config_values, check_devices, check_memory
+from ddgrasp.config import Config
+from ddgrasp.config.checks import Count, Range
+from ddgrasp.errors import UserError
+
+if TYPE_CHECKING:
+    from app.table2 import Study
+
+_FR3_MODULES = ("franky_sim", "franky")
+
+
+@dataclass(frozen=True)
+class StudyTable2(FromPreset):
+    """Train one student per depth source, all else equal, and try them on the same trials: Table II."""
+
+    rows: tuple[str, ...] = ()
+    """Rows by name, instead of whole tables: sim_gt, rand_noise, inpaint, monocular, ddg_no_graft, ddg,
+    upper_bound, sim_gt_ripple, rand_noise_ripple, ddg_ripple, paper_ddg_no_graft, paper_ddg."""
+    table: tuple[str, ...] = ("main",)
+    """main (hand-made noise off), ripple (off and on), grafting (with the paper's own generator)."""
+    trials: Count = 50
+    """How many with every object, the same for every row."""
+    objects: tuple[str, ...] = ("all",)
+    """Names, or all."""
+    rig: Literal["development", "fr3"] = "development"
+    """development (that everything was tuned on) or fr3 (the test rig)."""
+    split: Literal["development", "test"] = "development"
+    """development seeds, which choose, or test seeds, which are to be looked at once per row."""
+    number: Annotated[int, Range(0, 999)] = 0
+    """Which seed of the split."""
+    workers: Annotated[int, Range(1, 64)] = 2
+    """Rigs that run side by side."""
+
+    @classmethod
+    def default_out(cls, preset: str) -> Path:
+        """See FromPreset."""
+        return Path("runs") / f"table2-{preset}"
+
+    def run(self) -> None:
+        """Makes what is missing of every row and prints the tables."""
+        from app import table2
+        from evaluation.table2 import page, results
+
+        study = self.planned()
+        table2.check_place(study, self.resume)
+        print(*check_memory(study.config, self.out / results.SHARED), sep="\n", file=sys.stderr, flush=True)
+        made = table2.run(study)
+        print(*(self.out / name for name in (table2.STUDY_JSON, table2.STUDY_HTML)), sep="\n")
+        print(page.describe(made, results.set_name(study.series)))
+
+    def planned(self) -> "Study":
+        """The study. UserError for whatever could not work hours later."""
+        from app.table2 import Study
+        from evaluation.rig_trials import Series
+        from evaluation.table2 import results, rows
+
+        names = rows.chosen(self.rows, self.table)
+        series = Series(self.rig, self.objects, self.trials, self.split, self.number)
+        series.names()
+        if self.rig == "fr3" and (missing := [name for name in _FR3_MODULES if find_spec(name) is None]):
+            raise UserError(f"--rig fr3 needs {' and '.join(missing)}: pip install -e '.[fr3]'.")
+        config = rows.shared_config(self.config)
+        check_config_values(config)
+        left_out = {} if self.rows else _impossible(config, names)
+        names = tuple(name for name in names if name not in left_out)
+        for name in names:
+            _check_row(config, name)
+        check_devices(config, self.out / results.SHARED)
+        return Study(config, self.out, names, series, self.workers, left_out)
+
+
+def _check_row(config: Config, name: str) -> None:
+    from evaluation.table2.rows import ROWS, row_config
+    from evaluation.treatments import make_treatment
+
+    check_config_values(row_config(config, ROWS[name]))
+    make_treatment(ROWS[name].depth, config)
+
+
+def _impossible(config: Config, names: tuple[str, ...]) -> dict[str, str]:
+    """Rows whose network has no weights here, and why: a table is made without them."""
+    from evaluation.table2.rows import ROWS
+
+    why = {}
+    for name in names:
+        if ROWS[name].depth == "monocular":
+            try:
+                _check_row(config, name)
+            except UserError as error:
+                why[name] = str(error)
+    return why

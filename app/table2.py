@@ -1,0 +1,122 @@
+"""Table II by one command: one teacher, one set of demos, a student per training depth, the same trials.
+
+The stages are the pipeline's own. What all rows share is made once, in a folder of its own; a student's
+manifest names it by hash. Every trial that was run is on disk before the next one ends.
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from app import pipeline
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.config import Config
+from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text, to_json
+from ddgrasp.progress import Progress
+from ddgrasp.stages import get_stage
+from evaluation.rig_trials import Series
+from evaluation.table2 import results
+from evaluation.table2.results import PAPER, SHARED, STUDENTS
+from evaluation.table2.rows import ROWS, Row, row_config
+
+STUDY_JSON, STUDY_HTML, STUDY_PNG = "study.json", "study.html", "study.png"
+LAST_STAGE = "deploy"
+"""A study depends on what this stage depends on."""
+_COMMON = ("teacher", "demos", "record", "ddg")
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is to be done; everything in it was checked."""
+
+    config: Config
+    """What the rows have in common (`evaluation.table2.rows.shared_config`)."""
+    out: Path
+    rows: tuple[str, ...]
+    series: Series
+    """Trials of every row."""
+    workers: int
+    left_out: Mapping[str, str]
+    """Rows of the tables that cannot be made here, and why."""
+
+
+def check_place(study: Study, resume: bool) -> None:
+    """Marks the folder as this study's. UserError if it holds one and `resume` is off, or another one."""
+    pipeline.check_place(study.out / SHARED, resume=resume)
+    artifacts.begin(study.out, LAST_STAGE, study.config)
+
+
+def run(study: Study) -> dict[str, Any]:
+    """Makes what is missing, row after row, and writes the tables after every one; returns study.json."""
+    note = Progress(name="study table2").note
+    for name, why in study.left_out.items():
+        note(f"{ROWS[name].title} left out: {why}")
+    common = {name: _shared(study, name) for name in _COMMON}
+    written = {}
+    for place, name in enumerate(study.rows, 1):
+        row = ROWS[name]
+        note(f"row {place} of {len(study.rows)}, {row.title}: student {row.student!r}")
+        exported = _student(study, row, common)
+        _try(study, name, row_config(study.config, row), exported)
+        written = write(study)
+    return written
+
+
+def _shared(study: Study, stage: str) -> Artifact:
+    return pipeline.make(get_stage(stage), study.config, study.out / SHARED, resume=True)
+
+
+def _student(study: Study, row: Row, common: Mapping[str, Artifact]) -> Artifact:
+    """The row's exported student, made if no other row that trains alike has made it."""
+    config, folder = row_config(study.config, row), study.out / STUDENTS / row.student
+    parents = {name: common[name] for name in get_stage("student").parents}
+    if row.paper_generator:
+        recordings = {"record": common["record"]}
+        parents["ddg"] = pipeline.make(
+            get_stage("ddg"), config, study.out / PAPER, resume=True, parents=recordings
+        )
+    pipeline.make(get_stage("student"), config, folder, resume=True, parents=parents)
+    return pipeline.make(get_stage("export"), config, folder, resume=True)
+
+
+def _try(study: Study, name: str, config: Config, exported: Artifact) -> None:
+    from deploy.policy import POLICY_FILE
+    from evaluation import rig_trials
+
+    series = replace(study.series, depth=ROWS[name].depth)
+    folder = results.row_folder(study.out, results.set_name(series), name)
+    progress = Progress(name=f"trials, {name}")
+    try:
+        rig_trials.run(config, exported.directory / POLICY_FILE, series, folder, study.workers, progress)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"Interrupted in the trials of row {name!r}. Finished ones are kept: the same command with "
+            "--resume goes on."
+        ) from None
+
+
+def write(study: Study) -> dict[str, Any]:
+    """Writes study.json, study.html and study.png from what is there; returns what study.json holds."""
+    from evaluation.report.summary import describe_machine
+    from evaluation.table2 import page
+
+    config = to_json(study.config)
+    made = {
+        "preset": study.config.preset,
+        "seed": study.config.seed,
+        "scale": study.config.scale,
+        "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "machine": describe_machine(),
+        "versions": artifacts.library_versions(),
+        "left_out": dict(study.left_out),
+        **results.collect(study.out),
+        "config": config,
+    }
+    picture = page.draw(made)
+    atomic_write_bytes(study.out / STUDY_PNG, picture)
+    atomic_write_text(study.out / STUDY_HTML, page.render(made, picture))
+    atomic_write_json(study.out / STUDY_JSON, made)
+    return made

@@ -1,0 +1,150 @@
+"""study.html, study.png and what the terminal shows of a study."""
+
+from collections.abc import Mapping
+from html import escape
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ddgrasp import contract
+from evaluation import wilson
+from evaluation.report.figures import to_png
+from evaluation.report.html import image, page, table
+from evaluation.table2.rows import DEPLOYED, ROWS, TABLES, TRAINING
+
+_COLUMNS = (
+    "row", "training depth", "depth of the policy", "in simulation, own depth", "seen", "unseen", "all",
+    "reference alone / row alone", "p", "p (Holm)",
+)  # fmt: skip
+_GROUPS = ("seen", "unseen", "all")
+
+
+def table_rows(study: Mapping[str, Any], set_of_trials: str, name: str) -> list[tuple[str, ...]]:
+    """The lines of one table for one set of trials, cells as in `_COLUMNS`; "" where nothing is known."""
+    of = study["sets"][set_of_trials]
+    tests = {test["row"]: test for test in of["tables"][name]}
+    return [_line(study, of["rows"].get(row), row, tests.get(row)) for row in TABLES[name].rows]
+
+
+def _line(
+    study: Mapping[str, Any], tried: Mapping[str, Any] | None, name: str, test: Mapping[str, Any] | None
+) -> tuple[str, ...]:
+    row = ROWS[name]
+    simulated = study["rows"].get(name, {}).get("student", {}).get("simulation", {}).get("own", {})
+    rig = ("not tried", "", "") if tried is None else tuple(_rate(tried.get(group)) for group in _GROUPS)
+    pairs = f"{test['only_reference']} / {test['only_row']} of {test['n']}" if test else ""
+    p_values = (_p(test["p"]), _p(test["p_holm"])) if test else ("", "")
+    own = _rate(simulated.get("success"))
+    return (row.title, TRAINING[row.source], DEPLOYED[row.depth], own, *rig, pairs, *p_values)
+
+
+def _rate(success: Mapping[str, Any] | None) -> str:
+    return wilson.describe(dict(success)) if success else ""
+
+
+def _p(value: float) -> str:
+    return "< 0.0001" if value < 1e-4 else f"{value:.4f}"
+
+
+def object_rows(study: Mapping[str, Any], set_of_trials: str) -> tuple[list[str], list[list[str]]]:
+    """(objects, lines) of successes by object: title, then "k of n" per object."""
+    tried = study["sets"][set_of_trials]["rows"]
+    names = _objects(tried)
+    return names, [
+        [ROWS[row].title, *(_count(made["objects"].get(name)) for name in names)]
+        for row, made in tried.items()
+    ]
+
+
+def _objects(tried: Mapping[str, Any]) -> list[str]:
+    order = (*contract.SEEN_OBJECTS, *contract.UNSEEN_OBJECTS)
+    found = dict.fromkeys(name for made in tried.values() for name in made["objects"])
+    return sorted(found, key=lambda name: order.index(name) if name in order else len(order))
+
+
+def _count(success: Mapping[str, Any] | None) -> str:
+    return f"{success['successes']} of {success['n']}" if success else ""
+
+
+def render(study: Mapping[str, Any], picture: bytes) -> str:
+    """The page: one file with every set of trials, tables and picture."""
+    title = f"Table II: what training depth does to grasping, preset {escape(str(study['preset']))}"
+    body = [
+        f"<h1>{title}</h1>",
+        "<p class=note>Success: rate of n trials, Wilson 95 % interval. p: McNemar's exact test on the same "
+        "trials (seed, object, camera), two-sided, against the table's reference; Holm: corrected for all "
+        "rows of the table that were tried. Both rigs are simulated; no real robot was used. "
+        f"{escape(study['created'])}, {escape(study['machine']['processor'])}.</p>",
+        *(
+            f"<p>{escape(ROWS[row].title)} left out: {escape(why)}</p>"
+            for row, why in study["left_out"].items()
+        ),
+    ]
+    for name in study["sets"]:
+        body.append(f"<h2>{escape(name)}</h2>")
+        for key, of in TABLES.items():
+            if any(row in study["sets"][name]["rows"] for row in of.rows):
+                body.append(f"<h3>{of.title}, reference {ROWS[of.reference].title}</h3>")
+                body.append(table(_COLUMNS, table_rows(study, name, key)))
+        objects, lines = object_rows(study, name)
+        body.append("<h3>By object</h3>" + table(["row", *objects], lines))
+    if study["sets"]:
+        body.append(image(picture, "success with intervals, and by object"))
+    return page(title, body)
+
+
+def describe(study: Mapping[str, Any], set_of_trials: str) -> str:
+    """One set's tables as text, of the rows that were tried."""
+    lines = []
+    for name, of in TABLES.items():
+        made = [line for line in table_rows(study, set_of_trials, name) if line[4] != "not tried"]
+        if made:
+            lines.append(f"{of.title} ({set_of_trials}; reference: {ROWS[of.reference].title})")
+            lines += [
+                f"  {line[0]:<36} {line[6]:<36} {line[7]:<18} p (Holm) {line[9] or '-'}" for line in made
+            ]
+    return "\n".join(lines)
+
+
+# --- picture -------------------------------------------------------------------------------------
+
+
+def draw(study: Mapping[str, Any]) -> bytes:
+    """PNG: per set of trials, success of every row tried with its interval, and by object."""
+    sets = {name: of["rows"] for name, of in study["sets"].items() if of["rows"]}
+    tallest = max((len(rows) for rows in sets.values()), default=1)
+    figure = Figure(figsize=(14, max(1, len(sets)) * (1.6 + 0.36 * tallest)), layout="constrained")
+    for index, (name, rows) in enumerate(sets.items()):
+        bars = figure.add_subplot(len(sets), 2, 2 * index + 1)
+        _draw_bars(bars, rows)
+        bars.set_title(f"{name}: success, Wilson 95 %", fontsize=9)
+        _draw_objects(figure.add_subplot(len(sets), 2, 2 * index + 2), rows)
+    return to_png(figure)
+
+
+def _draw_bars(axes: Axes, rows: Mapping[str, Any]) -> None:
+    total = [made["all"] for made in rows.values()]
+    rates = np.array([success["rate"] for success in total])
+    whiskers = np.abs(np.array([[s["low"], s["high"]] for s in total]).T - rates)
+    places = np.arange(len(rows))
+    axes.barh(places, 100 * rates, xerr=100 * whiskers, height=0.6, color="#7a9cc6", capsize=3)
+    axes.set_yticks(places, [ROWS[name].title for name in rows], fontsize=8)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.set_xlim(0, 100)
+    axes.set_xlabel("%", fontsize=8)
+    axes.tick_params(axis="x", labelsize=8)
+
+
+def _draw_objects(axes: Axes, rows: Mapping[str, Any]) -> None:
+    names = _objects(rows)
+    rates = [[made["objects"].get(name, {}).get("rate") for name in names] for made in rows.values()]
+    values = 100 * np.array([[np.nan if rate is None else rate for rate in line] for line in rates], float)
+    axes.imshow(values, vmin=0, vmax=100, cmap="RdYlGn", aspect="auto")
+    for (i, j), value in np.ndenumerate(values):
+        if np.isfinite(value):
+            axes.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=7)
+    axes.set_xticks(np.arange(len(names)), names, rotation=60, ha="right", fontsize=8)
+    axes.set_yticks([])
+    axes.set_title("by object, %", fontsize=9)

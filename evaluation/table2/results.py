@@ -1,0 +1,113 @@
+"""A study's outcome, read from what its rows left on disk: success, paired tests, simulation, times.
+
+DIR/shared/{teacher, demos, record, ddg}   what all rows have in common
+DIR/paper/ddg                              the paper's own generator
+DIR/students/<student>/{student, export}   rows that train alike share one
+DIR/trials/<set>/<row>/trials.jsonl        outcome of every trial
+DIR/study.{json, html, png}                the tables
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
+from ddgrasp.files import read_json
+from deploy.trial_log import read_results
+from deploy.trials import TrialResult
+from evaluation import paired, rig_trials
+from evaluation.report.summary import with_intervals
+from evaluation.rig_trials import Series
+from evaluation.table2.rows import DEPLOYED, ROWS, TABLES, TRAINING, Row, Table
+
+SHARED, PAPER, STUDENTS, TRIALS = "shared", "paper", "students", "trials"
+SIMULATED = {"clean": "student_clean", "own": "student_ddg"}
+"""Depth in simulation -> what the student's manifest calls the success on it (own: as in its training)."""
+
+
+def set_name(series: Series) -> str:
+    """Folder of the trials that are paired: one rig, one split, one seed."""
+    return f"{series.rig}-{series.split}-{series.number}"
+
+
+def row_folder(out: Path, set_of_trials: str, row: str) -> Path:
+    """Where a row's trials lie."""
+    return out / TRIALS / set_of_trials / row
+
+
+def collect(out: Path) -> dict[str, Any]:
+    """What study.json holds of rows and trials.
+
+    Keys: `rows.<row>` = {title, training, deployment, ripple, student: {seconds, simulation}} of rows whose
+    student is finished; `sets.<set>` = {trials: how they were run, rows:
+    `evaluation.rig_trials.tabulate` of each, tables: see `compare`}. A success rate is {rate, n, successes, low, high}.
+    """
+    rows = {
+        name: _describe(row, artifacts.read_artifact(out / STUDENTS / row.student / "student"))
+        for name, row in ROWS.items()
+        if artifacts.is_finished(out / STUDENTS / row.student / "student")
+    }
+    return {"rows": rows, "sets": {folder.name: _set(folder) for folder in sorted((out / TRIALS).glob("*"))}}
+
+
+def _describe(row: Row, student: Artifact) -> dict[str, Any]:
+    measured = with_intervals(student.manifest.metrics)
+    return {
+        "title": row.title,
+        "training": TRAINING[row.source],
+        "deployment": DEPLOYED[row.depth],
+        "ripple_px": student.manifest.config["student"]["training"]["disparity_noise_px"],
+        "student": {
+            "name": row.student,
+            "seconds": student.manifest.seconds,
+            "simulation": {name: measured[key] for name, key in SIMULATED.items() if key in measured},
+        },
+    }
+
+
+def _set(folder: Path) -> dict[str, Any]:
+    outcomes = {name: read_results(folder / name / rig_trials.TRIALS_FILE) for name in ROWS}
+    tried = {name: results for name, results in outcomes.items() if results}
+    how = [read_json(path)["series"] for path in sorted(folder.glob(f"*/{rig_trials.TABLE_FILE}"))]
+    same = ("rig", "split", "number", "shapes", "camera", "seconds", "contact")
+    return {
+        "trials": {key: how[0][key] for key in same} if how else {},
+        "rows": {name: rig_trials.tabulate(results) for name, results in tried.items()},
+        "tables": {name: compare(table, tried) for name, table in TABLES.items()},
+    }
+
+
+def compare(table: Table, tried: Mapping[str, Sequence[TrialResult]]) -> list[dict[str, Any]]:
+    """A row of `table` each, but its reference: the reference against it on the trials that both had.
+
+    Args:
+      tried: row -> what came of its trials.
+
+    Keys: row; n, pairs of trials; only_reference, only_row, pairs in which one alone succeeded; p, McNemar's
+    exact two-sided one; p_holm, the same corrected for all rows of the table that were tried; difference, the
+    reference's success less the row's. Rows that were not tried, or without the reference, are left out.
+    """
+    made = [
+        _against(table.reference, name, tried)
+        for name in table.rows
+        if name != table.reference and name in tried and table.reference in tried
+    ]
+    made = [comparison for comparison in made if comparison["n"]]
+    adjusted = paired.holm([comparison["p"] for comparison in made])
+    return [comparison | {"p_holm": p} for comparison, p in zip(made, adjusted, strict=True)]
+
+
+def _against(reference: str, row: str, tried: Mapping[str, Sequence[TrialResult]]) -> dict[str, Any]:
+    ours, theirs = ({r.index: r.success for r in tried[name]} for name in (reference, row))
+    both = ours.keys() & theirs.keys()
+    only_reference = sum(ours[i] and not theirs[i] for i in both)
+    only_row = sum(theirs[i] and not ours[i] for i in both)
+    return {
+        "row": row,
+        "n": len(both),
+        "only_reference": only_reference,
+        "only_row": only_row,
+        "difference": (only_reference - only_row) / len(both) if both else 0.0,
+        "p": paired.mcnemar_exact(only_reference, only_row),
+    }

@@ -1,0 +1,150 @@
+"""What Table II compares: its rows as differences of one configuration, and which rows make a table.
+
+A row is a training depth, with or without hand-made ripple, and what is done to recorded depth before its
+policy sees it. Rows that train alike share a student.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from ddgrasp.config import DEPTH, DPM_SOLVER, SQUARED, UNIFORM, Config, DDGConfig
+from ddgrasp.config.student import Source
+from ddgrasp.errors import UserError, unknown_name
+from evaluation.treatments import RECORDED, TreatmentName
+
+PAPER_THRESHOLD = -0.2
+"""Below it a pixel of a generated depth map is a hole: surfaces are 0 to 1 there, holes -1."""
+PAPER_EVALUATIONS = 10
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method."""
+
+    title: str
+    source: Source
+    """Where training depth comes from (`student.depth_source`)."""
+    depth: TreatmentName = RECORDED
+    """What its policy sees on the rig."""
+    ripple: bool = False
+    """Whether training ripples surfaces by hand (`student.training.disparity_noise_px`)."""
+    paper_generator: bool = False
+    """Whether the generator is the paper's: depth itself, uniform weights."""
+
+    @property
+    def student(self) -> str:
+        """Name of the student that it needs, the same for rows that train alike."""
+        parts = (self.source, "paper" * self.paper_generator, "ripple" * self.ripple)
+        return "_".join(part for part in parts if part)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows side by side."""
+
+    title: str
+    reference: str
+    """Row that the others are tested against."""
+    rows: tuple[str, ...]
+
+
+ROWS: dict[str, Row] = {
+    "sim_gt": Row("Sim GT", "ideal"),
+    "rand_noise": Row("Rand Noise", "dextrah"),
+    "inpaint": Row("Inpaint", "ideal", depth="inpaint"),
+    "monocular": Row("Monocular", "monocular", depth="monocular"),
+    "ddg_no_graft": Row("DDG without grafting", "learned_ungrafted"),
+    "ddg": Row("DDG", "learned"),
+    "upper_bound": Row("Upper bound: the rig's camera", "stereo"),
+    "sim_gt_ripple": Row("Sim GT, ripple", "ideal", ripple=True),
+    "rand_noise_ripple": Row("Rand Noise, ripple", "dextrah", ripple=True),
+    "ddg_ripple": Row("DDG, ripple", "learned", ripple=True),
+    "paper_ddg_no_graft": Row(
+        "Paper's generator without grafting", "learned_ungrafted", paper_generator=True
+    ),
+    "paper_ddg": Row("Paper's generator, grafted", "learned", paper_generator=True),
+}
+TABLES: dict[str, Table] = {
+    "main": Table(
+        "Table II: hand-made noise off",
+        "ddg",
+        ("sim_gt", "rand_noise", "inpaint", "monocular", "ddg_no_graft", "ddg", "upper_bound"),
+    ),
+    "ripple": Table(
+        "Hand-made ripple, off and on",
+        "ddg",
+        ("sim_gt", "sim_gt_ripple", "rand_noise", "rand_noise_ripple", "ddg", "ddg_ripple"),
+    ),
+    "grafting": Table(
+        "Grafting, with the paper's generator", "paper_ddg", ("paper_ddg_no_graft", "paper_ddg")
+    ),
+}
+TRAINING = {
+    "ideal": "clean",
+    "dextrah": "DextrAH-G's formulas",
+    "learned": "generator, grafted",
+    "learned_ungrafted": "generator's own map",
+    "stereo": "the rig's camera on clean pictures",
+    "monocular": "network on simulated colour",
+}
+DEPLOYED = {"recorded": "as recorded", "inpaint": "inpainted on line", "monocular": "network on colour"}
+
+
+def chosen(rows: Sequence[str], tables: Sequence[str]) -> tuple[str, ...]:
+    """Names of the rows asked for, in the order of `ROWS`: those named, else the tables', each once.
+
+    Raises UserError for an unknown row or table.
+    """
+    for name in rows:
+        if name not in ROWS:
+            raise unknown_name("row", name, ROWS)
+    for name in tables:
+        if name not in TABLES:
+            raise unknown_name("table", name, TABLES)
+    wanted = set(rows) or {row for name in tables for row in TABLES[name].rows}
+    return tuple(name for name in ROWS if name in wanted)
+
+
+def shared_config(config: Config) -> Config:
+    """What teacher, demos, recordings and generator of all rows are made with: colour for rows that need it.
+
+    Raises UserError if the students would start from one that has already seen some row's depth.
+    """
+    if start := config.student.init_from:
+        raise UserError(
+            f"student.init_from is {start!r}: a student that has seen one row's depth is no start for the "
+            'others; give --student.init-from "", or preset laptop.'
+        )
+    return replace(config, demos=replace(config.demos, rgb=True))
+
+
+def row_config(shared: Config, row: Row) -> Config:
+    """`shared_config` with the row's differences.
+
+    Raises UserError if the row wants a ripple and the configuration has none.
+    """
+    ripple_px = shared.student.training.disparity_noise_px
+    if row.ripple and not ripple_px:
+        raise UserError(
+            f"student.training.disparity_noise_px is 0: row {row.title!r} needs its strength, for example "
+            "0.25."
+        )
+    training = replace(shared.student.training, disparity_noise_px=ripple_px if row.ripple else 0.0)
+    student = replace(shared.student, depth_source=row.source, training=training)
+    ddg = paper_generator(shared.ddg) if row.paper_generator else shared.ddg
+    return replace(shared, student=student, ddg=ddg)
+
+
+def paper_generator(config: DDGConfig) -> DDGConfig:
+    """The generator that draws the depth map itself by squared errors of equal weight, sampled undistilled.
+
+    Network, prior and number of training steps stay.
+    """
+    return replace(
+        config,
+        depth=replace(config.depth, representation=DEPTH),
+        graft=replace(config.graft, noise_threshold=PAPER_THRESHOLD),
+        training=replace(config.training, loss_weight=UNIFORM, hole_loss=SQUARED),
+        sampling=replace(config.sampling, sampler=DPM_SOLVER, steps=PAPER_EVALUATIONS),
+        init_from="",
+    )
