@@ -39,9 +39,10 @@ def row_folder(out: Path, set_of_trials: str, row: str) -> Path:
 def collect(out: Path) -> dict[str, Any]:
     """What study.json holds of rows and trials.
 
-    Keys: `rows.<row>` = {title, training, deployment, ripple, student: {seconds, simulation}} of rows whose
-    student is finished; `sets.<set>` = {trials: how they were run, rows:
-    `evaluation.rig_trials.tabulate` of each, tables: see `compare`}. A success rate is {rate, n, successes, low, high}.
+    Keys: `rows.<row>` = {title, training, deployment, ripple_px, student: {name, seconds, simulation}}, of
+    rows whose student is finished; `sets.<set>` = {trials: how they were run, rows: each as
+    `evaluation.rig_trials.tabulate` gives it, tables: see `compare`}. A success rate is {rate, n, successes,
+    low, high}.
     """
     rows = {
         name: _describe(row, artifacts.read_artifact(out / STUDENTS / row.student / "student"))

@@ -1,0 +1,251 @@
+"""Table II: statistics against known values, its rows, its tables from outcomes made up for the purpose."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from app import cli
+from app.commands import parse
+from app.commands.study import StudyTable2
+from ddgrasp import artifacts
+from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json
+from ddgrasp.presets import get_preset
+from deploy.trial_log import TrialLog
+from deploy.trials import TrialResult
+from evaluation import paired, rig_trials
+from evaluation.rig_trials import Series
+from evaluation.table2 import page, results, rows
+from evaluation.table2.rows import ROWS, TABLES
+from foundation import store
+
+LAPTOP = get_preset("laptop")
+
+
+# --- statistics ----------------------------------------------------------------------------------
+
+
+def test_mcnemar_s_exact_p_is_that_of_published_tables():
+    # Fagerland, Lydersen and Laake (2013), Table 1 after Bentur et al. (2009): 1 and 7 discordant pairs
+    assert paired.mcnemar_exact(1, 7) == pytest.approx(0.0703, abs=5e-5)
+    # by hand: 2 (C(6, 0) + C(6, 1)) / 2^6
+    assert paired.mcnemar_exact(5, 1) == 14 / 64
+    assert paired.mcnemar_exact(10, 0) == 2 / 1024
+
+
+def test_mcnemar_s_p_is_one_without_evidence_and_does_not_mind_the_order():
+    assert paired.mcnemar_exact(0, 0) == paired.mcnemar_exact(4, 4) == 1.0
+    for b in range(12):
+        for c in range(12):
+            assert paired.mcnemar_exact(b, c) == paired.mcnemar_exact(c, b) <= 1.0
+    assert 0 < paired.mcnemar_exact(0, 600) < 1e-100
+    with pytest.raises(ValueError, match="-1 and 2 pairs differ"):
+        paired.mcnemar_exact(-1, 2)
+
+
+def test_holm_s_step_down():
+    # by Holm (1979): 4 * 0.005, 3 * 0.01, 2 * 0.03, and no less than the one before for 0.04
+    adjusted = paired.holm([0.01, 0.04, 0.03, 0.005])
+    assert adjusted == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert paired.holm([0.6, 0.5]) == [1.0, 1.0]
+    assert paired.holm([]) == [] and paired.holm([0.2]) == [0.2]
+
+
+# --- rows ----------------------------------------------------------------------------------------
+
+
+def test_the_main_table_is_the_paper_s_with_hand_made_noise_off():
+    shared = rows.shared_config(LAPTOP)
+    assert [ROWS[name].source for name in TABLES["main"].rows] == [
+        "ideal", "dextrah", "ideal", "monocular", "learned_ungrafted", "learned", "stereo",
+    ]  # fmt: skip
+    for name in TABLES["main"].rows:
+        made = rows.row_config(shared, ROWS[name])
+        assert made.student.training.disparity_noise_px == 0.0 and made.ddg == LAPTOP.ddg
+        assert made.student.depth_source == ROWS[name].source
+        same = replace(
+            made.student, depth_source="learned", training=LAPTOP.student.training
+        )  # the recipe is one
+        assert same == LAPTOP.student
+    assert {name: ROWS[name].depth for name in TABLES["main"].rows if ROWS[name].depth != "recorded"} == {
+        "inpaint": "inpaint",
+        "monocular": "monocular",
+    }
+
+
+def test_rows_differ_in_the_student_s_section_alone_so_that_they_share_what_comes_before():
+    shared = rows.shared_config(LAPTOP)
+    for row in ROWS.values():
+        made = rows.row_config(shared, row)
+        stages = (
+            ("teacher", "demos", "record") if row.paper_generator else ("teacher", "demos", "record", "ddg")
+        )
+        for stage in stages:
+            assert artifacts.config_hash(made, stage) == artifacts.config_hash(shared, stage)
+    by_student = {}
+    for row in ROWS.values():
+        by_student.setdefault(row.student, set()).add(
+            artifacts.config_hash(rows.row_config(shared, row), "student")
+        )
+    assert all(len(hashes) == 1 for hashes in by_student.values())
+    assert len(set().union(*by_student.values())) == len(by_student) == len(ROWS) - 1
+    assert ROWS["inpaint"].student == ROWS["sim_gt"].student
+
+
+def test_ripple_and_the_paper_s_generator_are_one_difference_each():
+    shared = rows.shared_config(LAPTOP)
+    rippled = rows.row_config(shared, ROWS["ddg_ripple"])
+    assert rippled.student.training == LAPTOP.student.training
+    assert rippled.student.training.disparity_noise_px == 0.25
+    paper = rows.row_config(shared, ROWS["paper_ddg"]).ddg
+    assert (paper.depth.representation, paper.training.loss_weight) == ("depth", "uniform")
+    assert (paper.training.steps, paper.unet, paper.prior) == (
+        LAPTOP.ddg.training.steps, LAPTOP.ddg.unet, LAPTOP.ddg.prior,
+    )  # fmt: skip
+    no_ripple = replace(LAPTOP.student.training, disparity_noise_px=0.0)
+    still = replace(shared, student=replace(shared.student, training=no_ripple))
+    with pytest.raises(UserError, match=r"disparity_noise_px is 0: row 'DDG, ripple' needs its strength"):
+        rows.row_config(still, ROWS["ddg_ripple"])
+
+
+def test_rows_are_chosen_by_name_or_by_table():
+    assert rows.chosen((), ("main",)) == TABLES["main"].rows
+    assert rows.chosen(("ddg", "sim_gt"), ("main",)) == ("sim_gt", "ddg")
+    assert set(rows.chosen((), ("main", "ripple", "grafting"))) == set(ROWS)
+
+
+# --- tables --------------------------------------------------------------------------------------
+
+
+def outcome(index: int, name: str, success: bool) -> TrialResult:
+    return TrialResult(index, name, False, success, 60, 0, 0, {}, [], *([] for _ in range(5)))
+
+
+def write_row(out: Path, series: Series, row: str, wins: dict[str, list[bool]]) -> None:
+    """The trials of a row as `rig_trials.run` leaves them."""
+    folder = results.row_folder(out, results.set_name(series), row)
+    folder.mkdir(parents=True)
+    log = TrialLog(folder / rig_trials.TRIALS_FILE, {"row": row})
+    for place, (name, successes) in enumerate(wins.items()):
+        for i, success in enumerate(successes):
+            log.append(outcome(1000 * place + i, name, success))
+    how = {"rig": series.rig, "split": series.split, "number": 0, "shapes": "mesh", "camera": "stereo"}
+    atomic_write_json(folder / rig_trials.TABLE_FILE, {"series": how | {"seconds": 6.0, "contact": 100.0}})
+
+
+@pytest.fixture
+def study(tmp_path) -> dict:
+    """DDG wins 10 trials that Sim GT loses and loses one that it wins; Rand Noise was tried on fewer."""
+    series = Series("development")
+    ddg, sim_gt = [True] * 19 + [False], [True] * 9 + [False] * 10 + [True]
+    write_row(tmp_path, series, "ddg", {"apple": ddg[:10], "wheel": ddg[10:]})
+    write_row(tmp_path, series, "sim_gt", {"apple": sim_gt[:10], "wheel": sim_gt[10:]})
+    write_row(tmp_path, series, "rand_noise", {"apple": [True] * 4})
+    about = {"preset": "laptop", "created": "now", "machine": {"processor": "two cores"}}
+    return {**about, "left_out": {"monocular": "no <weights>"}, **results.collect(tmp_path)}
+
+
+def test_rows_are_tested_on_the_trials_that_both_had(study):
+    (of,) = study["sets"].values()
+    assert list(study["sets"]) == ["development-development-0"]
+    assert of["trials"]["seconds"] == 6.0
+    by_row = {test["row"]: test for test in of["tables"]["main"]}
+    assert set(by_row) == {"sim_gt", "rand_noise"}
+    against = by_row["sim_gt"]
+    assert (against["n"], against["only_reference"], against["only_row"]) == (20, 10, 1)
+    assert against["p"] == 2 * (1 + 11) / 2**11 and against["p_holm"] == 2 * against["p"]
+    assert against["difference"] == 9 / 20
+    assert (by_row["rand_noise"]["n"], by_row["rand_noise"]["p"]) == (4, 1.0)
+    assert of["tables"]["grafting"] == []
+    assert of["rows"]["ddg"]["seen"]["n"] == 10 and of["rows"]["ddg"]["unseen"]["successes"] == 9
+
+
+def test_the_page_has_every_row_tried_or_not(study, tmp_path):
+    lines = page.table_rows(study, "development-development-0", "main")
+    cells = {line[0]: line for line in lines}
+    assert list(cells) == [ROWS[name].title for name in TABLES["main"].rows]
+    assert cells["DDG"][6].startswith("95.0 % of 20 (")
+    assert cells["Sim GT"][7:] == ("10 / 1 of 20", "0.0117", "0.0234")
+    assert cells["Inpaint"][2] == "inpainted on line" and cells["Inpaint"][4] == "not tried"
+    names, by_object = page.object_rows(study, "development-development-0")
+    assert names == ["apple", "wheel"] and ["Rand Noise", "4 of 4", ""] in by_object
+    picture = page.draw(study)
+    assert picture[:8] == b"\x89PNG\r\n\x1a\n"
+    html = page.render(study, picture)
+    assert "10 / 1 of 20" in html and "Monocular left out: no &lt;weights&gt;" in html
+    assert html.count("data:image/png;base64,") == 1
+    text = page.describe(study, "development-development-0")
+    assert "Sim GT" in text and "p (Holm) 0.0234" in text and "Inpaint" not in text
+
+
+def test_a_study_without_trials_has_a_page(tmp_path):
+    about = {"preset": "laptop", "created": "now", "machine": {"processor": "x"}, "left_out": {}}
+    empty = {**about, **results.collect(tmp_path)}
+    assert empty["sets"] == {} and "Table II" in page.render(empty, page.draw(empty))
+
+
+def test_both_rigs_and_splits_stand_apart(tmp_path):
+    for series in (Series("development"), Series("fr3", split="test", number=3)):
+        write_row(tmp_path, series, "ddg", {"apple": [True]})
+    assert list(results.collect(tmp_path)["sets"]) == ["development-development-0", "fr3-test-3"]
+
+
+# --- the command before anything runs ------------------------------------------------------------
+
+
+def command(*args: str) -> StudyTable2:
+    made = parse("study table2", ["--preset", "debug", *args])
+    assert isinstance(made, StudyTable2)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("--rows", "ddg", "sim_tg"), "Unknown row 'sim_tg'. Did you mean 'sim_gt'"),
+        (("--table", "mian"), "Unknown table 'mian'. Did you mean 'main'"),
+        (("--objects", "aple"), "Unknown object 'aple'. Did you mean 'apple'"),
+        (("--rows", "monocular"), "depth_anything_v2_small holds no converted weights: get a file"),
+        (
+            ("--student.init-from", "pretrained/student"),
+            "a student that has seen one row's depth is no start",
+        ),
+        (("--table", "ripple", "--student.training.disparity-noise-px", "0"), "needs its strength"),
+    ],
+)
+def test_wrong_input_is_one_line_before_anything_is_written(args, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(store, "WEIGHTS_DIR", tmp_path / "no weights")
+    out = tmp_path / "study"
+    status = cli.main(["study", "table2", "--preset", "debug", "--out", str(out), *args])
+    told = capsys.readouterr().err
+    assert status == 2 and message in told and told.count("\n") == 1
+    assert not out.exists()
+
+
+def test_a_table_without_its_network_is_made_without_that_row_which_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "WEIGHTS_DIR", tmp_path / "no weights")
+    study = command("--out", str(tmp_path)).planned()
+    assert set(study.left_out) == {"monocular"} and "weights convert FILE" in study.left_out["monocular"]
+    assert study.rows == tuple(name for name in TABLES["main"].rows if name != "monocular")
+    assert study.config.demos.rgb and study.series.trials == 50
+
+
+def test_a_study_is_continued_only_with_its_own_configuration(tmp_path):
+    from app import table2
+
+    first = command("--out", str(tmp_path), "--rows", "ddg").planned()
+    table2.check_place(first, resume=False)
+    (tmp_path / "shared" / "teacher" / "params").write_text("begun")
+    with pytest.raises(UserError, match="holds an unfinished stage: continue with --resume"):
+        table2.check_place(first, resume=False)
+    more = command("--out", str(tmp_path), "--rows", "sim_gt", "--trials", "99", "--workers", "1").planned()
+    table2.check_place(more, resume=True)
+    other = command("--out", str(tmp_path), "--rows", "ddg", "--demos.episodes", "9").planned()
+    with pytest.raises(UserError, match=r"begun with another configuration .* demos.episodes is 4 there, 9"):
+        table2.check_place(other, resume=True)
+
+
+def test_without_out_a_study_has_a_folder_of_its_own():
+    assert command().out == Path("runs") / "table2-debug"
+    assert parse("run", ["--preset", "debug"]).out == Path("runs") / "debug"
