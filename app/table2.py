@@ -25,6 +25,8 @@ from evaluation.table2.rows import ROWS, Row, row_config
 STUDY_JSON, STUDY_HTML, STUDY_PNG = "study.json", "study.html", "study.png"
 LAST_STAGE = "deploy"
 """A study depends on what this stage depends on."""
+FILMED_FAILURES = 3
+"""Films that are kept of an object's failures, per row."""
 _COMMON = ("teacher", "demos", "record", "ddg")
 
 
@@ -90,7 +92,8 @@ def _try(study: Study, name: str, config: Config, exported: Artifact) -> None:
     folder = results.row_folder(study.out, results.set_name(series), name)
     progress = Progress(name=f"trials, {name}")
     try:
-        rig_trials.run(config, exported.directory / POLICY_FILE, series, folder, study.workers, progress)
+        policy = exported.directory / POLICY_FILE
+        rig_trials.run(config, policy, series, folder, study.workers, progress, FILMED_FAILURES)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"Interrupted in the trials of row {name!r}. Finished ones are kept: the same command with "

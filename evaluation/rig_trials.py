@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -99,11 +100,12 @@ class Series:
 
 
 def run(
-    config: Config, policy: Path, series: Series, out: Path, workers: int, progress: Progress
-) -> dict[str, Any]:
+    config: Config, policy: Path, series: Series, out: Path, workers: int, progress: Progress,
+    failures: float = math.inf,
+) -> dict[str, Any]:  # fmt: skip
     """The table of `series`; trials that `out` has already are not run again.
 
-    Leaves trials.jsonl, table.json and a film of every failure and of each object's first success in `out`.
+    Leaves trials.jsonl, table.json and films in `out`: each object's first success, its first `failures`.
     """
     config, trials = series.configured(config, policy), series.plan()
     out.mkdir(parents=True, exist_ok=True)
@@ -112,9 +114,10 @@ def run(
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(trials) - len(todo))
         for result, film in run_trials(config, policy, todo, workers, series.make(config)):
-            shown = {r.object_name for r in log.results.values() if r.success}
+            alike = [(r.object_name, r.success) for r in log.results.values()]
+            shown = alike.count((result.object_name, result.success))
             log.append(result)
-            if film.steps and not (result.success and result.object_name in shown):
+            if film.steps and shown < (1 if result.success else failures):
                 _keep(out, result, film)
             task.advance(success=sum(r.success for r in log.results.values()) / len(log.results))
     table = tabulate([log.results[trial.index, False] for trial in trials])

@@ -105,3 +105,42 @@ def test_a_finished_run_is_only_reported_again(finished):
     assert again.returncode == 0, errors[-3000:]
     assert time.monotonic() - start < 60
     assert _manifests(out) == before
+
+
+def test_table_2_of_two_rows_from_the_run_s_own_parts(finished, tmp_path):
+    out = tmp_path / "study"
+    out.mkdir()
+    (out / "shared").symlink_to(finished[0], target_is_directory=True)
+    before = _manifests(finished[0])
+    chosen = ("--rows", "sim_gt", "inpaint", "--objects", "cube", "--trials", "2", "--workers", "1")
+    command = [sys.executable, "-m", "app.cli", "study", "table2", "--preset", "debug", "--out", str(out)]
+
+    def run(*more: str) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            [*command, *chosen, "--resume", *more],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+        )
+
+    made = run()
+    assert made.returncode == 0, made.stderr[-3000:]
+    assert "Inpaint" in made.stdout and "Table II" in made.stdout
+    assert _manifests(finished[0]) == before
+    student = artifacts.read_artifact(out / "students" / "ideal" / "student").manifest
+    assert student.config["student"]["depth_source"] == "ideal"
+    assert student.config["student"]["training"]["disparity_noise_px"] == 0
+    for parent in ("teacher", "demos", "ddg"):
+        assert student.parents[parent] == artifacts.read_artifact(finished[0] / parent).hash
+    study = json.loads((out / "study.json").read_text())
+    (of,) = study["sets"].values()
+    assert {row: table["all"]["n"] for row, table in of["rows"].items()} == {"sim_gt": 2, "inpaint": 2}
+    assert study["rows"]["inpaint"]["student"] == study["rows"]["sim_gt"]["student"]
+    for name in ("study.html", "study.png", "trials/development-development-0/inpaint/trials.jsonl"):
+        assert (out / name).stat().st_size > 0
+    trials = (out / "trials").rglob("trials.jsonl")
+    kept = {path: path.read_text() for path in trials}
+    assert run().returncode == 0 and all(path.read_text() == text for path, text in kept.items())
+    other = run("--student.poses.steps", "11")
+    assert other.returncode == 2 and "begun with another configuration" in other.stderr
