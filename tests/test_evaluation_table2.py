@@ -177,6 +177,7 @@ def test_the_page_has_every_row_tried_or_not(study, tmp_path):
     assert html.count("data:image/png;base64,") == 1
     text = page.describe(study, "development-development-0")
     assert "Sim GT" in text and "p (Holm) 0.0234" in text and "Inpaint" not in text
+    assert TABLES["main"].title in text and TABLES["ripple"].title not in text + html
 
 
 def test_a_study_without_trials_has_a_page(tmp_path):

@@ -84,10 +84,10 @@ def render(study: Mapping[str, Any], picture: bytes) -> str:
     ]
     for name in study["sets"]:
         body.append(f"<h2>{escape(name)}</h2>")
-        for key, of in TABLES.items():
-            if any(row in study["sets"][name]["rows"] for row in of.rows):
-                body.append(f"<h3>{of.title}, reference {ROWS[of.reference].title}</h3>")
-                body.append(table(_COLUMNS, table_rows(study, name, key)))
+        for key in _begun(study["sets"][name]["rows"]):
+            of = TABLES[key]
+            body.append(f"<h3>{of.title}, reference {ROWS[of.reference].title}</h3>")
+            body.append(table(_COLUMNS, table_rows(study, name, key)))
         objects, lines = object_rows(study, name)
         body.append("<h3>By object</h3>" + table(["row", *objects], lines))
     if study["sets"]:
@@ -98,14 +98,24 @@ def render(study: Mapping[str, Any], picture: bytes) -> str:
 def describe(study: Mapping[str, Any], set_of_trials: str) -> str:
     """One set's tables as text, of the rows that were tried."""
     lines = []
-    for name, of in TABLES.items():
-        made = [line for line in table_rows(study, set_of_trials, name) if line[4] != "not tried"]
-        if made:
-            lines.append(f"{of.title} ({set_of_trials}; reference: {ROWS[of.reference].title})")
-            lines += [
-                f"  {line[0]:<36} {line[6]:<36} {line[7]:<18} p (Holm) {line[9] or '-'}" for line in made
-            ]
+    for name in _begun(study["sets"][set_of_trials]["rows"]):
+        of = TABLES[name]
+        lines.append(f"{of.title} ({set_of_trials}; reference: {ROWS[of.reference].title})")
+        for line in table_rows(study, set_of_trials, name):
+            if line[4] != "not tried":
+                p = f"p (Holm) {line[9]}" if line[9] else ""
+                lines.append(f"  {line[0]:<36} {line[6]:<36} {line[7]:<18} {p}".rstrip())
     return "\n".join(lines)
+
+
+def _begun(tried: Mapping[str, Any]) -> list[str]:
+    """Tables of which a row was tried that no table before them has."""
+    names, seen = [], set()
+    for name, of in TABLES.items():
+        if any(row in tried for row in of.rows if row not in seen):
+            names.append(name)
+        seen |= set(of.rows)
+    return names
 
 
 # --- picture -------------------------------------------------------------------------------------
@@ -131,7 +141,7 @@ def _draw_bars(axes: Axes, rows: Mapping[str, Any]) -> None:
     places = np.arange(len(rows))
     axes.barh(places, 100 * rates, xerr=100 * whiskers, height=0.6, color="#7a9cc6", capsize=3)
     axes.set_yticks(places, [ROWS[name].title for name in rows], fontsize=8)
-    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlim(0, 100)
     axes.set_xlabel("%", fontsize=8)
     axes.tick_params(axis="x", labelsize=8)
