@@ -237,3 +237,15 @@ def test_disparity_noise_grows_with_the_square_of_depth_and_keeps_holes():
     assert far == pytest.approx(0.674 * 0.1 / (PROFILE.fx_px * PROFILE.baseline_m), rel=0.35)
     one = error[:, 0, ::2, :30:2] > 0.2
     assert 0.0 < one.mean() < 0.004  # wrong matches are rare
+
+
+@pytest.mark.parametrize(("strength_px", "exact"), [(0.0, True), (0.25, False)])
+def test_without_disparity_noise_perception_is_told_of_pixels_as_they_come(strength_px, exact):
+    training = dataclasses.replace(CONFIG.training, disparity_noise_px=strength_px)
+    config = dataclasses.replace(CONFIG, training=training)
+    params = init_params(jax.random.key(0), config, PROFILE)
+    depth_mm = np.full((1, 3, PROFILE.height_px, PROFILE.width_px), 700, np.uint16)
+    given = config, PROFILE, params, depth_mm, np.zeros((1, 8), np.float32), np.zeros((1, 2), np.int32)
+    plain, noisy = train.encode(*given), train.encode(*given, jax.random.key(1))
+    same = [np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (plain, noisy)), strict=True)]
+    assert all(same) == exact
