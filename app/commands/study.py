@@ -52,7 +52,9 @@ class StudyTable2(FromPreset):
 
         study = self.planned()
         table2.check_place(study, self.resume)
-        print(*check_memory(study.config, self.out / results.SHARED), sep="\n", file=sys.stderr, flush=True)
+        if not results.has_students(self.out, study.rows):
+            need = check_memory(study.config, self.out / results.SHARED)
+            print(*need, sep="\n", file=sys.stderr, flush=True)
         made = table2.run(study)
         print(*(self.out / name for name in (table2.STUDY_JSON, table2.STUDY_HTML)), sep="\n")
         print(page.describe(made, results.set_name(study.series)))

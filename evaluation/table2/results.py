@@ -36,6 +36,11 @@ def row_folder(out: Path, set_of_trials: str, row: str) -> Path:
     return out / TRIALS / set_of_trials / row
 
 
+def has_students(out: Path, rows: Sequence[str]) -> bool:
+    """Whether the students of all `rows` are finished."""
+    return all(artifacts.is_finished(out / STUDENTS / ROWS[row].student / "student") for row in rows)
+
+
 def collect(out: Path) -> dict[str, Any]:
     """What study.json holds of rows and trials.
 
