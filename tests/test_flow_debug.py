@@ -113,6 +113,7 @@ def test_table_2_of_two_rows_from_the_run_s_own_parts(finished, tmp_path):
     (out / "shared").symlink_to(finished[0], target_is_directory=True)
     before = _manifests(finished[0])
     chosen = ("--rows", "sim_gt", "inpaint", "--objects", "cube", "--trials", "2", "--workers", "1")
+    chosen += ("--student.dagger.rounds", "0")
     command = [sys.executable, "-m", "app.cli", "study", "table2", "--preset", "debug", "--out", str(out)]
 
     def run() -> subprocess.CompletedProcess:

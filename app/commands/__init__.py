@@ -92,7 +92,9 @@ def parse(name: str, args: Sequence[str]) -> Command:
     cls = COMMANDS[name]
     options: dict[str, Any] = {}
     if issubclass(cls, FromPreset):
-        preset = _scaled(get_preset(_option(args, "--preset") or DEFAULT_PRESET), _option(args, "--scale"))
+        preset = _scaled(
+            get_preset(_option(args, "--preset") or cls.default_preset()), _option(args, "--scale")
+        )
         options["default"] = cls(config=preset, out=cls.default_out(preset.preset))
     elif issubclass(cls, Scoring):
         preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)

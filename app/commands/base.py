@@ -35,6 +35,11 @@ class FromPreset:
     """Continue what is there; finished stages are not redone."""
 
     @classmethod
+    def default_preset(cls) -> str:
+        """Which one without --preset."""
+        return DEFAULT_PRESET
+
+    @classmethod
     def default_out(cls, preset: str) -> Path:
         """Where it goes without --out."""
         return Path("runs") / preset
