@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.commands import parse
 from ddgrasp.presets import get_preset
 from deploy import session
 from deploy.devices.options import SessionOptions
@@ -108,3 +109,21 @@ def test_a_disk_that_takes_no_frames_stops_nothing(run, monkeypatch):
     report, folder = run()
     kept = json.loads((folder / "report.json").read_text())
     assert report.steps == 5 and "No space left" in kept["frames_lost"] and not (folder / "depth").exists()
+
+
+def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
+    _, judged = run()
+    _, other = run()
+    values = json.loads((judged / "report.json").read_text())
+    (judged / "report.json").write_text(json.dumps({**values, "success": True}))
+    (judged.parent / "begun").mkdir()
+    parse("report", [str(judged.parent)]).run()
+    said = capsys.readouterr().out
+    assert "Success 100.0 % of 1" in said and "Missed deadlines: 0 in 10 steps." in said
+    text = (judged.parent / "report.html").read_text()
+    assert text.count("data:image/png;base64,") == 2
+    for words in (f"{judged.name}: lifted and held", f"{other.name}: not judged", "width=device-width"):
+        assert words in text
+    assert find_recordings(judged.parent), "the page beside them does not disturb a fit"
+    parse("report", [str(other)]).run()
+    assert "none was judged" in capsys.readouterr().out

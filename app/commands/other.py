@@ -59,13 +59,18 @@ class WeightsList:
 
 @dataclass(frozen=True)
 class Report:
-    """Write report.json and report.html of a run anew, and print the table."""
+    """Write the report of a run, or of a folder of deployments, anew, and print what it says."""
 
     out: tyro.conf.Positional[Path]
-    """Directory of the run."""
+    """Directory of a run; or one deployment's, or the folder of all (runs/deployments)."""
 
     def run(self) -> None:
-        """Writes both reports and prints the table."""
+        """Writes the files and prints their places and the table."""
+        from evaluation.report import deployments
+
+        if found := deployments.find(self.out):
+            print(f"{deployments.write(self.out, found)}\n\n{deployments.verdict(found)}")
+            return
         from evaluation.report.stage import write_report
         from evaluation.report.summary import print_summary
 

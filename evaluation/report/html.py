@@ -24,6 +24,7 @@ body { color: #1b1f24; background: #fff; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; border-bottom: 1px solid #d5d9de; }
 h3 { font-size: 1rem; margin-bottom: .3rem; }
 table { border-collapse: collapse; margin: .6rem 0; font-variant-numeric: tabular-nums; }
+table { display: block; overflow-x: auto; }
 th, td { text-align: left; padding: .2rem .9rem .2rem 0; vertical-align: top; }
 tr { border-bottom: 1px solid #eceef1; }
 tr.last td { font-weight: 600; }
@@ -58,7 +59,8 @@ def render_html(report: Mapping[str, Any], run_dir: Path) -> str:
 
 def page(title: str, body: Sequence[str]) -> str:
     """An HTML document with the report's style; `title` and `body` are HTML already."""
-    head = f"<meta charset=utf-8><title>{title}</title><style>{_STYLE}</style>"
+    phone = '<meta name=viewport content="width=device-width, initial-scale=1">'
+    head = f"<meta charset=utf-8>{phone}<title>{title}</title><style>{_STYLE}</style>"
     lines = "\n".join(body)
     return f"<!doctype html><html lang=en><head>{head}</head><body>\n{lines}\n</body></html>\n"
 

@@ -1,0 +1,84 @@
+"""Deployments as one page: how each ended, how it kept time, its film, what happened in it."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from ddgrasp.files import atomic_write_text
+from deploy.record import FILM_FILE, REPORT_FILE, STEPS_FILE
+from evaluation import wilson
+from evaluation.report.html import REPORT_HTML, image, page, table
+
+_HEADER = ("deployment", "policy", "robot", "camera", "ended", "steps", "missed", "holds", "frame to command")
+_ENDED = {True: "lifted and held", False: "failed", None: "not judged"}
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """What one folder holds."""
+
+    folder: Path
+    report: Mapping[str, Any]
+
+    @property
+    def ended(self) -> str:
+        """In a few words."""
+        if self.report["fault"]:
+            return f"fault: {self.report['fault']}"
+        return "dry run" if self.report.get("dry_run") else _ENDED[self.report["success"]]
+
+
+def find(folder: Path) -> list[Deployment]:
+    """Those in `folder`, oldest first; `folder` itself if it is one. Unfinished ones are left out."""
+    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
+    finished = (place for place in places if (place / STEPS_FILE).exists() and (place / REPORT_FILE).exists())
+    return [Deployment(place, json.loads((place / REPORT_FILE).read_text())) for place in finished]
+
+
+def write(folder: Path, deployments: Sequence[Deployment]) -> Path:
+    """Writes the page into `folder`; returns its path."""
+    path = folder / REPORT_HTML
+    atomic_write_text(path, render(deployments))
+    return path
+
+
+def render(deployments: Sequence[Deployment]) -> str:
+    """The page."""
+    body = [
+        "<h1>Deployments</h1>",
+        f"<p><strong>{escape(verdict(deployments))}</strong></p>",
+        table(_HEADER, [_row(deployment) for deployment in deployments]),
+        *(part for deployment in deployments for part in _section(deployment)),
+    ]
+    return page("Deployments: DiffuDepGrasp-JAX", body)
+
+
+def verdict(deployments: Sequence[Deployment]) -> str:
+    """How many of those that somebody judged succeeded, what ended by a fault, deadlines missed."""
+    judged = [d.report["success"] for d in deployments if d.report["success"] is not None]
+    rate = wilson.describe(wilson.success(sum(judged), len(judged))) if judged else "none was judged"
+    faults = sum(bool(d.report["fault"]) for d in deployments)
+    missed = sum(d.report["missed_deadlines"] for d in deployments)
+    steps = sum(d.report["steps"] for d in deployments)
+    return f"Success {rate}. Ended by a fault: {faults}. Missed deadlines: {missed} in {steps} steps."
+
+
+def _row(deployment: Deployment) -> list[str]:
+    report = deployment.report
+    latency = report["latency_ms"]
+    time = "" if latency["p50"] is None else f"p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    numbers = (str(report[name]) for name in ("steps", "missed_deadlines", "holds"))
+    about = (str(report.get(name, "")) for name in ("policy", "robot", "camera"))
+    return [deployment.folder.name, *about, deployment.ended, *numbers, time]
+
+
+def _section(deployment: Deployment) -> list[str]:
+    parts = [f"<h2>{escape(deployment.folder.name)}: {escape(deployment.ended)}</h2>"]
+    if (film := deployment.folder / FILM_FILE).exists():
+        parts.append(image(film.read_bytes(), f"film of {deployment.folder.name}"))
+    if events := deployment.report["events"]:
+        parts.append("<pre>" + escape("\n".join(events)) + "</pre>")
+    return parts
