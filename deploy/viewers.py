@@ -1,6 +1,7 @@
 """What a person watches a trial with: a video file, or Rerun, in a window or in the browser."""
 
 from contextlib import ExitStack
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -97,15 +98,16 @@ class Video:
 
     def _write(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
         if self._writer is None:
-            self._open(picture.shape[1], picture.shape[0])
+            self._writer = self._opened(picture.shape[1], picture.shape[0])
         self._writer.write(picture[..., ::-1])
 
-    def _open(self, width: int, height: int) -> None:
+    def _opened(self, width: int, height: int) -> Any:
         temporary = self._files.enter_context(atomic_path(self._path))
         code = self._cv2.VideoWriter.fourcc(*VIDEO_CODECS[self._path.suffix])
-        self._writer = self._cv2.VideoWriter(str(temporary), code, contract.CONTROL_HZ, (width, height))
-        if not self._writer.isOpened():
+        writer = self._cv2.VideoWriter(str(temporary), code, contract.CONTROL_HZ, (width, height))
+        if not writer.isOpened():
             raise UserError(f"This OpenCV cannot write {self._path.suffix} films: try another ending.")
+        return writer
 
 
 class Rerun:
@@ -114,7 +116,7 @@ class Rerun:
     def __init__(self, browser: bool, file: Path | None = None):
         """A window, or the viewer in a `browser`; with `file` (.rrd) neither. UserError without Rerun."""
         try:
-            import rerun
+            rerun = import_module("rerun")
         except ImportError as error:
             raise UserError(f"Rerun is not installed ({error}): pip install 'ddgrasp[view]'.") from error
         self._rr: Any = rerun
