@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from flax import struct
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 from ml_collections import config_dict
 from mujoco import mjx
-from mujoco_playground._src import mjx_env
+from mujoco_playground import MjxEnv, State
 
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
@@ -67,7 +68,7 @@ class Episode:
     """None unless configured."""
 
 
-class GraspEnv(mjx_env.MjxEnv):
+class GraspEnv(MjxEnv):
     """Grasp the object and hold it 40 cm up. Observation (40,), action (8,), 10 Hz."""
 
     def __init__(self, config: WorldConfig):
@@ -77,7 +78,7 @@ class GraspEnv(mjx_env.MjxEnv):
         self.physics = make_physics(config.backend, config.sim_dt_s, self.table.layout)
         self._mj_model = scene.build_model(config.sim_dt_s, self.table.layout)
 
-    def reset(self, rng: randomize.Key, exploring: randomize.Share = 1.0) -> mjx_env.State:
+    def reset(self, rng: randomize.Key, exploring: randomize.Share = 1.0) -> State:
         """A new episode: object, pose, dynamics and joints drawn from `rng`.
 
         `exploring` () is a factor on the shares of episodes that start above the object or with it in hand.
@@ -119,13 +120,13 @@ class GraspEnv(mjx_env.MjxEnv):
         names = ("success", "saturated", "return", "length", "contacts_dropped")
         metrics |= {name: jnp.zeros(()) for name in names}
         info = {"episode": episode, "rng": k_next, "truncation": jnp.zeros(())}
-        return mjx_env.State(state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
+        return State(state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
 
     def object_drawn(self, rng: randomize.Key) -> Int[jax.Array, ""]:
         """() index of the object that `reset(rng)` takes."""
         return jax.random.randint(jax.random.split(rng, 6)[0], (), 0, len(self.table.names))
 
-    def step(self, state: mjx_env.State, action: Float[jax.Array, "8"]) -> mjx_env.State:
+    def step(self, state: State, action: Float[jax.Array, "8"]) -> State:
         """One control step with `action` (8,)."""
         old: physics.PhysicsState = state.data
         episode: Episode = state.info["episode"]
@@ -227,7 +228,7 @@ class GraspEnv(mjx_env.MjxEnv):
         return contract.ACTION_SIZE
 
     @property
-    def mj_model(self) -> "mjx_env.mujoco.MjModel":
+    def mj_model(self) -> mujoco.MjModel:
         """The scene, with the cube in the slots."""
         return self._mj_model
 
@@ -249,7 +250,7 @@ class AutoReset:
         self.env = env
         self.mesh = mesh or devices.make_mesh()
 
-    def reset(self, rng: jax.Array) -> mjx_env.State:
+    def reset(self, rng: jax.Array) -> State:
         """Batch of new episodes from keys (B, 2), at staggered times so that they do not end together."""
         state = devices.each(self.mesh, self.env.reset)(rng)
         episode = state.info["episode"]
@@ -257,14 +258,14 @@ class AutoReset:
         info = state.info | {"episode": replace(episode, steps=stagger.astype(jnp.int32))}
         return self.refresh(replace(state, info=info))
 
-    def refresh(self, state: mjx_env.State, exploring: randomize.Share = 1.0) -> mjx_env.State:
+    def refresh(self, state: State, exploring: randomize.Share = 1.0) -> State:
         """Draw the batch's next episodes, `exploring` as in `GraspEnv.reset`."""
         keys = state.info["rng"]
         fresh = devices.each(self.mesh, self.env.reset)(keys, jnp.full(len(keys), exploring, jnp.float32))
         waiting = (fresh.data, fresh.obs, fresh.info["episode"])
         return replace(state, info=state.info | {"next": waiting, "rng": fresh.info["rng"]})
 
-    def step(self, state: mjx_env.State, action: Float[AnyArray, "b 8"]) -> mjx_env.State:
+    def step(self, state: State, action: Float[AnyArray, "b 8"]) -> State:
         """One control step of the batch with `action` (B, 8)."""
         waiting = state.info["next"]
         bare = {k: v for k, v in state.info.items() if k != "next"}
