@@ -3,16 +3,19 @@
 import base64
 import json
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
+from app.commands import parse
 from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from evaluation.report import figures
+from evaluation.report.comparison import differences
 from evaluation.report.stage import write_report
 from evaluation.report.summary import build_report, print_summary, summary_rows
 
@@ -134,3 +137,20 @@ def test_film_strips_have_a_row_per_panel():
     )
     with pytest.raises(ValueError, match="picture panel of shape"):
         figures.draw_panels({"bad": np.zeros(3)})
+
+
+def test_two_runs_side_by_side_show_what_differs_alone(run_dir, tmp_path_factory, capsys):
+    other = tmp_path_factory.mktemp("other")
+    config = replace(CONFIG, seed=7, teacher=replace(CONFIG.teacher, num_envs=64))
+    for name, metrics in METRICS.items():
+        changed = metrics | ({"frames": 301} if name == "record" else {})
+        artifacts.finish(other / name, name, config, seconds=10, metrics=changed, origin="trained")
+    settings, results = differences([build_report(run_dir), build_report(other)])
+    assert settings == [("seed", "0", "7"), ("teacher.num_envs", str(CONFIG.teacher.num_envs), "64")]
+    assert results == [("seed", "0", "7"), ("record.frames", "300", "301")]
+    parse("report", [str(run_dir), str(other)]).run()
+    assert "record.frames" in capsys.readouterr().out
+    page = (run_dir / "comparison.html").read_text()
+    assert "teacher.num_envs" in page and "student_rig" not in page
+    same, nothing = differences([build_report(run_dir)] * 2)
+    assert same == nothing == []

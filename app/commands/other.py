@@ -59,13 +59,18 @@ class WeightsList:
 
 @dataclass(frozen=True)
 class Report:
-    """Write the report of a run, or of a folder of deployments, anew, and print what it says."""
+    """Write the report of a run, or of a folder of deployments, anew; of several runs, what differs."""
 
     out: tyro.conf.Positional[Path]
     """Directory of a run; or one deployment's, or the folder of all (runs/deployments)."""
+    others: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Runs to set beside it."""
 
     def run(self) -> None:
         """Writes the files and prints their places and the table."""
+        if self.others:
+            _compare((self.out, *self.others))
+            return
         from evaluation.report import deployments
 
         if found := deployments.find(self.out):
@@ -77,6 +82,25 @@ class Report:
         report = write_report(self.out)
         print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
         print_summary(report)
+
+
+def _compare(runs: tuple[Path, ...]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from evaluation.report import comparison
+    from evaluation.report.summary import build_report
+
+    reports = [build_report(run) for run in runs]
+    print(f"{comparison.write(runs, reports)}\n")
+    console = Console()
+    for title, rows in zip(
+        ("configured otherwise", "measured"), comparison.differences(reports), strict=True
+    ):
+        shown = Table(title, *(str(run) for run in runs), box=None)
+        for row in rows:
+            shown.add_row(*row)
+        console.print(shown)
 
 
 @dataclass(frozen=True)

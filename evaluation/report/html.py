@@ -72,7 +72,7 @@ def _stage_section(name: str, report: Mapping[str, Any], directory: Path) -> lis
     if name == "deploy" and "student_rig" in report:
         metrics["student_rig"] = report["student_rig"]
     tables = {key: value for key, value in metrics.items() if _is_records(value)}
-    scalars = _flatten({key: value for key, value in metrics.items() if key not in tables})
+    scalars = flatten({key: value for key, value in metrics.items() if key not in tables})
     parts = [table((), scalars)] if scalars else []
     for title, records in tables.items():
         columns = list(dict.fromkeys(key for record in records for key in record))
@@ -118,13 +118,16 @@ def _is_records(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(item, Mapping) for item in value)
 
 
-def _flatten(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """(dotted name, text) of every number and text in nested objects; a success rate is one line."""
+def flatten(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """(dotted name, text) of every number and text in nested objects; a success rate is one line, and lists
+    of objects, which are tables, are left out."""
     lines = []
     for key, item in value.items():
         name = f"{prefix}{key}"
+        if _is_records(item):
+            continue
         if isinstance(item, Mapping) and not _is_success(item):
-            lines.extend(_flatten(item, f"{name}."))
+            lines.extend(flatten(item, f"{name}."))
         else:
             lines.append((name, _text(item)))
     return lines

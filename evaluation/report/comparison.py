@@ -1,0 +1,50 @@
+"""Two runs or more side by side: what was configured otherwise, and what came of it."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ddgrasp.files import atomic_write_text
+from evaluation.report.html import flatten, page, table
+
+COMPARISON_HTML = "comparison.html"
+_NO_RESULT = {"stages", "config", "machine", "versions", "created", "contract_version"}
+"""Parts of a report that measure nothing."""
+Rows = list[tuple[str, ...]]
+
+
+def differences(reports: Sequence[Mapping[str, Any]]) -> tuple[Rows, Rows]:
+    """(configuration, results): (dotted name, value in each of `reports`) where they are not all the same.
+
+    Tables in a report, such as one of trials per object, are left out.
+    """
+    settings = [dict(flatten(report["config"])) for report in reports]
+    return _where_different(settings), _where_different([_results(report) for report in reports])
+
+
+def write(runs: Sequence[Path], reports: Sequence[Mapping[str, Any]]) -> Path:
+    """Writes the page into the first of `runs`; returns its path."""
+    header = ("", *(str(run) for run in runs))
+    settings, results = differences(reports)
+    body = [
+        f"<h1>{' and '.join(run.name for run in runs)}</h1>",
+        "<h2>Configured otherwise</h2>",
+        table(header, settings) if settings else "<p>Nothing.</p>",
+        "<h2>Measured</h2><p class=note>Success: rate of n trials, Wilson 95 % interval.</p>",
+        table(header, results),
+    ]
+    path = runs[0] / COMPARISON_HTML
+    atomic_write_text(path, page("Runs side by side: DiffuDepGrasp-JAX", body))
+    return path
+
+
+def _results(report: Mapping[str, Any]) -> dict[str, str]:
+    measured = {key: value for key, value in report.items() if key not in _NO_RESULT}
+    seconds = {f"{name}.seconds": stage["seconds"] for name, stage in report["stages"].items()}
+    return dict(flatten(measured | seconds))
+
+
+def _where_different(columns: Sequence[Mapping[str, str]]) -> Rows:
+    names = dict.fromkeys(name for column in columns for name in column)
+    rows = ((name, *(column.get(name, "") for column in columns)) for name in names)
+    return [row for row in rows if len(set(row[1:])) > 1]
