@@ -163,6 +163,15 @@ class Filmed(Protocol):
 
 
 @runtime_checkable
+class Simulated(Protocol):
+    """A camera before a simulation, which knows what one without errors would see."""
+
+    def clean_mm(self) -> UInt16[np.ndarray, "H W"]:
+        """(H, W) uint16 millimetres of the moment, 0 = nothing in range."""
+        ...
+
+
+@runtime_checkable
 class Judge(Protocol):
     """A camera before a rig, which knows where the object is."""
 

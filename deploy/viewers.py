@@ -1,18 +1,19 @@
 """What a person watches a trial with: a video file, or Rerun, in a window or in the browser."""
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from ddgrasp import contract
 from ddgrasp.depth import to_millimetres
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path
-from deploy.interfaces import Depth, Filmed
+from deploy.interfaces import Depth, Filmed, Simulated
 from deploy.loop import Step
 from rig.film import colored
 
@@ -47,16 +48,21 @@ class Viewer(Protocol):
         ...
 
 
-class Video:
-    """Colour beside the depth that the policy sees, a picture for every control step."""
+Noise = Callable[[UInt16[np.ndarray, "H W"]], UInt16[np.ndarray, "H W"]]
+"""Clean depth -> depth with a camera's errors, millimetres."""
 
-    def __init__(self, path: Path):
+
+class Video:
+    """Colour beside the depth that the policy sees, a picture for every control step; with `noise` also what
+    that makes of clean depth, before cameras that know it."""
+
+    def __init__(self, path: Path, noise: Noise | None = None):
         """UserError for another ending than .mp4 or .webm, or if OpenCV has no such encoder."""
         import cv2
 
         if path.suffix not in VIDEO_CODECS:
             raise UserError(f"--out {path}: a film ends with {' or '.join(VIDEO_CODECS)}.")
-        self._files, self._path, self._cv2 = ExitStack(), path, cv2
+        self._files, self._path, self._cv2, self._noise = ExitStack(), path, cv2, noise
         self._writer: Any = None
         self._title, self._last = "", np.zeros((0, 0, 3), np.uint8)
 
@@ -68,7 +74,10 @@ class Video:
         """See `Viewer`."""
         if step.frame is None:
             return
-        panels = [self._panel(camera.picture()), self._panel(depth_picture(step.frame.depth), exact=True)]
+        panels = [self._panel("colour", camera.picture(), exact=False)]
+        panels.append(self._panel("camera's depth", depth_picture(step.frame.depth)))
+        if self._noise is not None and isinstance(camera, Simulated):
+            panels.append(self._panel("generator's depth", depth_picture(self._noise(camera.clean_mm()))))
         self._last = np.concatenate(panels, axis=1)
         text = f"{self._title}   step {step.index}   hand {1e3 * step.state.width_m:.0f} mm"
         self._write(self._labelled(text))
@@ -84,16 +93,23 @@ class Video:
             self._writer.release()
         self._files.close()
 
-    def _panel(self, picture: UInt8[np.ndarray, "H W 3"], exact: bool = False) -> UInt8[np.ndarray, "h w 3"]:
+    def _panel(
+        self, caption: str, picture: UInt8[np.ndarray, "H W 3"], exact: bool = True
+    ) -> UInt8[np.ndarray, "h w 3"]:
         height, width = picture.shape[:2]
         size = PANEL_PX, 2 * round(PANEL_PX * height / width / 2)
         how = self._cv2.INTER_NEAREST if exact else self._cv2.INTER_CUBIC
-        return self._cv2.resize(picture, size, interpolation=how)
+        panel = self._cv2.resize(picture, size, interpolation=how)
+        self._say(panel, caption, (255, 255, 255), size[1] - 10)
+        return panel
+
+    def _say(self, picture: UInt8[np.ndarray, "h w 3"], text: str, rgb: tuple[int, ...], y: int) -> None:
+        font = self._cv2.FONT_HERSHEY_SIMPLEX
+        self._cv2.putText(picture, text, (8, y), font, 0.5, rgb, 1, self._cv2.LINE_AA)
 
     def _labelled(self, text: str) -> UInt8[np.ndarray, "h w 3"]:
         bar = np.full((_LINE_PX, self._last.shape[1], 3), 255, np.uint8)
-        font = self._cv2.FONT_HERSHEY_SIMPLEX
-        self._cv2.putText(bar, text, (8, _LINE_PX - 10), font, 0.5, (0, 0, 0), 1, self._cv2.LINE_AA)
+        self._say(bar, text, (0, 0, 0), _LINE_PX - 10)
         return np.concatenate([bar, self._last])
 
     def _write(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:

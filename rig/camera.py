@@ -48,8 +48,15 @@ class RigCamera:
             return render_depth(self.model, data, camera, far_m=FAR_M)
 
         if self._ideal:
-            return to_millimetres(draw_depth(self.stereo.camera(T_world_cam)))
+            return self.clean_mm(data, T_world_cam)
         return self.stereo.sense(draw, T_world_cam, rng, rig_materials(self.model, object_name), draw_depth)
+
+    def clean_mm(
+        self, data: mujoco.MjData, T_world_cam: Float[np.ndarray, "4 4"]
+    ) -> UInt16[np.ndarray, "H W"]:
+        """(H, W) uint16 millimetres as a camera without errors would report them."""
+        camera = self.stereo.camera(T_world_cam)
+        return to_millimetres(render_depth(self.model, data, camera, far_m=FAR_M))
 
     def rgb(self, data: mujoco.MjData, T_world_cam: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour, aligned to depth."""

@@ -54,6 +54,25 @@ def test_a_film_has_colour_beside_depth_and_stays_at_the_verdict(tmp_path, name)
     np.testing.assert_allclose(below[:, PANEL_PX + 50 : -50].mean((0, 1)), INVALID_RGB, atol=12)
 
 
+class _Simulated(_RedCamera):
+    def clean_mm(self) -> np.ndarray:
+        return np.full((HEIGHT, WIDTH), 500, np.uint16)
+
+
+@pytest.mark.parametrize(("camera", "panels"), [(_RedCamera(), 2), (_Simulated(), 3)])
+def test_a_generator_s_depth_is_shown_where_clean_depth_is_known(tmp_path, camera, panels):
+    video = Video(
+        tmp_path / "film.mp4", noise=lambda clean_mm: np.where(clean_mm == 500, 0, 1).astype("uint16")
+    )
+    video.begin("apple")
+    video.look(_step(0, 700), camera)
+    video.close()
+    frame = _frames(tmp_path / "film.mp4")[0]
+    assert frame.shape[1] == panels * PANEL_PX
+    last = frame[100:300, -PANEL_PX + 200 : -50].mean((0, 1))
+    assert (np.abs(last - INVALID_RGB).max() < 12) == (panels == 3)
+
+
 def test_a_step_without_a_frame_is_left_out(tmp_path):
     video = Video(tmp_path / "film.mp4")
     video.begin("apple")

@@ -4,7 +4,7 @@ import contextlib
 import os
 import sys
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,7 +13,7 @@ from ddgrasp.errors import UserError
 
 if TYPE_CHECKING:
     from deploy.trials import Bench, Trial
-    from deploy.viewers import Viewer
+    from deploy.viewers import Noise, Viewer
 
 WEB_PORT = 9090
 """Rerun's own, of its web viewer."""
@@ -38,6 +38,8 @@ class Play:
     """Length of a trial."""
     number: Annotated[int, Range(0, 999)] = 0
     """Another number, other places of the objects."""
+    generator: Path | None = None
+    """Folder of a fitted generator (a run's ddg), whose depth a film then shows beside the camera's."""
     viewer: Literal["film", "rerun", "web"] = "film"
     """film (a video file), rerun (a window), or web (in the browser, also of another machine)."""
     out: Path = Path("runs/play.mp4")
@@ -71,7 +73,7 @@ class Play:
         if self.out.suffix == ".rrd":
             return Rerun(browser=False, file=self.out)
         if self.viewer == "film":
-            return Video(self.out)
+            return Video(self.out, self.generator and _noise_of(self.generator))
         if self.viewer == "rerun" and sys.platform == "linux" and not _has_display():
             raise UserError("--viewer rerun: there is no display here: choose web, or film.")
         viewer = Rerun(browser=self.viewer == "web")
@@ -95,6 +97,29 @@ def _watched(bench: "Bench", trial: "Trial", viewer: "Viewer") -> bool:
     viewer.end(verdict)
     print(f"{trial.object_name:<12} {verdict}", flush=True)
     return result.success
+
+
+def _noise_of(generator: Path) -> "Noise":
+    """The generator's depth of one frame after the other of an episode."""
+    from itertools import count
+
+    import jax
+    import numpy as np
+
+    from ddg_jax.sample import Generator
+    from student_jax.depth_source import GeneratorSource
+
+    loaded = Generator.load(generator)
+    one = replace(loaded.config, sampling=replace(loaded.config.sampling, batch_size=1))
+    source = GeneratorSource(replace(loaded, config=one), jax.random.key(0))
+    if source.needs_rgb:
+        raise UserError(f"--generator {generator} looks at colour: a film can show one with another prior.")
+    frames = count()
+
+    def noisy(clean_mm: np.ndarray) -> np.ndarray:
+        return source.frames(clean_mm[None], None, np.zeros(1, int), np.array([next(frames)]))[0]
+
+    return noisy
 
 
 def _has_display() -> bool:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt8, UInt16
 
 from deploy.devices.options import Setup
 from deploy.devices.rig_robot import SimRobot
@@ -65,3 +65,7 @@ class StereoCamera:
     def picture(self) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour picture of the scene as it stands, from the same place (for people)."""
         return self._camera.rgb(self._world.data, self._T_world_cam)
+
+    def clean_mm(self) -> UInt16[np.ndarray, "H W"]:
+        """See Simulated."""
+        return self._camera.clean_mm(self._world.data, self._T_world_cam)
