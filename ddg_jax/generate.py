@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Key, UInt8, UInt16
 
 from ddg_jax.sample import Generated, Generator, batch_size, condition, grafted, predict
+from ddg_jax.window import mixed
 from ddgrasp import depth
 from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
@@ -59,14 +60,15 @@ def noisy_episodes(
     starts = np.concatenate([[0], np.cumsum(lengths)]).astype(int)
     size = batch_size(generator.config)
     used = begin = starts[first] // size * size
-    waiting: deque[tuple[int, Clip]] = deque()
+    waiting: deque[tuple[int, np.ndarray]] = deque()
     made: deque[np.ndarray] = deque()
 
     def stream() -> Iterator[tuple[np.ndarray, int, int]]:
         for i in range(int(np.searchsorted(starts, begin, side="right")) - 1, len(lengths)):
             clip = read(i)
-            waiting.append((i, clip))
-            c = condition(generator, depth.to_metres(clip.depth_mm), clip.rgb, one_episode=True)
+            clean_m = mixed(depth.to_metres(clip.depth_mm), generator.config.graft.window_px)
+            waiting.append((i, clean_m))
+            c = condition(generator, clean_m, clip.rgb, one_episode=True)
             yield from ((c[t], clip.number, t) for t in range(max(0, begin - starts[i]), lengths[i]))
 
     frames = stream()
@@ -74,11 +76,11 @@ def noisy_episodes(
         c, number, frame = (np.stack(values) for values in zip(*batch, strict=True))
         made.extend(predict(key, generator, c, episode=number, frame=frame))
         while waiting and len(made) >= starts[waiting[0][0] + 1] - used:
-            i, clip = waiting.popleft()
+            i, clean_m = waiting.popleft()
             x = np.stack([made.popleft() for _ in range(starts[i + 1] - used)])
             used = starts[i + 1]
             if i >= first:
-                yield made_mm(grafted(generator.config, depth.to_metres(clip.depth_mm), x), grafting)
+                yield made_mm(grafted(generator.config, clean_m, x), grafting)
 
 
 def made_mm(made: Generated, grafting: bool) -> UInt16[np.ndarray, "B H W"]:

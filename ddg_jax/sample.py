@@ -18,6 +18,7 @@ from ddg_jax.graft import graft
 from ddg_jax.prior import Prior, make_prior
 from ddg_jax.representation import channels, correlations, decode
 from ddg_jax.train import config_schedule, init_params, predict_noise
+from ddg_jax.window import mixed
 from ddgrasp import artifacts
 from ddgrasp.arrays import AnyArray
 from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
@@ -206,6 +207,8 @@ def generate(
 
     Raises UserError for depth of another type, rank or aspect ratio.
     """
+    _check_depth(depth_m, generator.config)
+    depth_m = mixed(depth_m, generator.config.graft.window_px)
     c = condition(generator, depth_m, rgb, one_episode=np.ndim(episode) == 0)
     x = predict(key, generator, c, episode=episode, frame=frame, steps=steps)
     return grafted(generator.config, depth_m, x)

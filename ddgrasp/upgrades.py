@@ -8,9 +8,9 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 3
+VERSION = 4
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
-that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing."""
+that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: simulated depth of sharp edges."""
 
 VERSION_FIELD = "manifest_version"
 
@@ -109,6 +109,9 @@ _ADDED_AFTER_2 = {
 }
 """Fields that version 2 lacked, with what it did."""
 
+_ADDED_AFTER_3 = {"ddg.graft.window_px": 0.0}
+"""Fields that version 3 lacked, with what it did."""
+
 _CLONE_ROUNDS = 8
 """What stands in a configuration that does not clone: version 2 wrote 0."""
 
@@ -130,6 +133,8 @@ def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
         _add(made, _ADDED_AFTER_2)
         if "teacher" in made:
             _name_start(made["teacher"])
+    if version < 4:
+        _add(made, _ADDED_AFTER_3)
     return made
 
 
@@ -137,6 +142,8 @@ def downgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     """The JSON of a configuration of this version with the fields of an earlier one: what its hashes were
     over. Values of fields that it lacked are lost."""
     made = copy.deepcopy(dict(config))
+    if version < 4:
+        _drop(made, _ADDED_AFTER_3)
     if version < 3:
         _drop(made, _ADDED_AFTER_2)
         teacher = made["teacher"]

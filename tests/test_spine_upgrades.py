@@ -152,5 +152,5 @@ def test_a_manifest_of_a_later_version_is_refused_by_its_number(tmp_path):
     artifacts.finish(tmp_path / "export", "export", CONFIG, seconds=1.0, metrics={})
     path = tmp_path / "export" / artifacts.MANIFEST
     path.write_text(json.dumps(read_json(path) | {"manifest_version": 99}))
-    with pytest.raises(UserError, match="is of version 99, this code reads up to 3"):
+    with pytest.raises(UserError, match=f"is of version 99, this code reads up to {upgrades.VERSION}"):
         artifacts.read_manifest(tmp_path / "export")

@@ -77,6 +77,9 @@ class GraftConfig(Section, name="ddg.graft"):
     deviation_threshold: Annotated[float, Range(0, 100)] = 0.0005
     """Smallest deviation of inverse depth, 1/m, that is an artefact and grafted: 1/32 px of disparity, here a
     D455's; 0.0016 for a D435 at 640x480 (deviation only). 1 grafts holes alone."""
+    window_px: Annotated[float, Range(0, 20)] = 0.0
+    """Standard deviation of the window over which the camera's matching mixes surfaces, pixels of simulated
+    depth, which is blurred by it before anything else (ddg_jax/window.py); 0 leaves its edges sharp."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,61 @@
+"""The camera's matching window on simulated depth: ramps in inverse depth, on both ways to noise alike."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from ddg_jax.generate import Clip, noisy_episodes
+from ddg_jax.prior import make_prior
+from ddg_jax.sample import Generator, generate
+from ddg_jax.train import init_params
+from ddg_jax.window import mixed
+from ddgrasp.config import DDGConfig, DDGDepthConfig, GraftConfig, SamplingConfig, UNetConfig
+from ddgrasp.depth import to_metres, to_millimetres
+
+CONFIG = DDGConfig(
+    depth=DDGDepthConfig(height_px=16, width_px=24),
+    unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
+    sampling=SamplingConfig(steps=2, batch_size=4),
+    graft=GraftConfig(noise_threshold=-10.0),
+)
+
+
+def test_without_a_window_depth_keeps_its_bits():
+    depth_m = np.random.default_rng(0).uniform(0.4, 2.0, (2, 8, 8)).astype(np.float32)
+    np.testing.assert_array_equal(mixed(depth_m, 0.0), depth_m)
+
+
+def test_a_surface_stays_and_an_edge_becomes_a_ramp_of_inverse_depth():
+    depth_m = np.full((1, 9, 40), 1.0, np.float32)
+    np.testing.assert_allclose(mixed(depth_m, 1.5), depth_m, rtol=1e-6)
+    depth_m[..., 20:] = 0.5
+    inverse = 1.0 / mixed(depth_m, 1.5)[0, 4]
+    assert inverse[19] + inverse[20] == pytest.approx(3.0, abs=1e-4), "symmetric about the edge's 1.5 per m"
+    assert (np.diff(inverse) > -1e-6).all() and inverse[19] - 1.0 == pytest.approx(0.37, abs=0.02)
+    np.testing.assert_allclose(inverse[[0, -1]], [1.0, 2.0], rtol=1e-5)
+
+
+def test_holes_stay_and_do_not_leak():
+    depth_m = np.full((1, 11, 11), 0.8, np.float32)
+    depth_m[0, 3:6, 3:6] = 0.0
+    out = mixed(depth_m, 2.0)
+    np.testing.assert_array_equal(out == 0, depth_m == 0)
+    np.testing.assert_allclose(out[depth_m > 0], 0.8, rtol=1e-5)
+
+
+@pytest.mark.parametrize("by", ["frames", "episodes"])
+def test_a_generator_with_a_window_is_one_without_on_mixed_depth(by):
+    config = replace(CONFIG, graft=replace(CONFIG.graft, window_px=1.2))
+    generators = [Generator(c, init_params(c, jax.random.key(0)), make_prior(c)) for c in (config, CONFIG)]
+    rng = np.random.default_rng(1)
+    clean_mm = np.full((3, 16, 24), 900, np.uint16)
+    clean_mm[:, 4:9, 6:15] = rng.integers(500, 700, (3, 1, 1))
+    inputs = (to_metres(clean_mm), mixed(to_metres(clean_mm), 1.2))
+    made = [generate(jax.random.key(2), g, d).depth_m for g, d in zip(generators, inputs, strict=True)]
+    np.testing.assert_array_equal(*made)
+    assert np.abs(made[0] - generate(jax.random.key(2), generators[1], inputs[0]).depth_m).max() > 0.05
+    if by == "episodes":
+        (episode,) = noisy_episodes(jax.random.key(2), generators[0], [3], lambda i: Clip(0, clean_mm))
+        np.testing.assert_allclose(episode.astype(int), to_millimetres(made[0]).astype(int), atol=1)
