@@ -10,7 +10,8 @@ from typing import Any
 
 VERSION = 4
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
-that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: simulated depth of sharp edges."""
+that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
+generator knows no window."""
 
 VERSION_FIELD = "manifest_version"
 
