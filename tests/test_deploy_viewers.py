@@ -11,7 +11,7 @@ from ddgrasp.errors import UserError
 from deploy.interfaces import Frame, RobotState
 from deploy.loop import Step
 from deploy.viewers import FAR_MM, NEAR_MM, PANEL_PX, VERDICT_S, Rerun, Video, depth_picture
-from export.pretrained import pretrained_policy
+from export.pretrained import STUDENT, pretrained_policy
 from rig.film import INVALID_RGB
 
 HEIGHT, WIDTH = 90, 160
@@ -113,6 +113,15 @@ def test_the_command_plays_the_pretrained_student_into_a_film(tmp_path, capsys):
     parse("play", ["--objects", "cube", "--camera", "ideal", "--seconds", "1", "--out", str(film)]).run()
     assert "0 of 1 lifted and held" in capsys.readouterr().out
     assert len(_frames(film)) == 10 + round(VERDICT_S * contract.CONTROL_HZ)
+
+
+def test_the_pretrained_generator_s_depth_stands_beside_the_camera_s(tmp_path):
+    film, generator = tmp_path / "play.mp4", STUDENT.parent / "ddg"
+    options = ["--objects", "cube", "--seconds", "0.5", "--generator", str(generator), "--out", str(film)]
+    parse("play", options).run()
+    learned = _frames(film)[0, 100:300, -PANEL_PX:].astype(int)
+    lost = (np.abs(learned - INVALID_RGB).max(-1) < 60).mean()
+    assert 0.01 < lost < 0.3
 
 
 def test_an_unknown_object_is_refused_and_leaves_nothing(tmp_path):
