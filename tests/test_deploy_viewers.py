@@ -124,6 +124,12 @@ def test_the_pretrained_generator_s_depth_stands_beside_the_camera_s(tmp_path):
     assert 0.01 < lost < 0.3
 
 
+@pytest.mark.parametrize("options", [("--rig", "fr3"), ("--viewer", "web"), ("--out", "a.rrd")])
+def test_a_generator_that_could_not_be_shown_is_refused(options):
+    with pytest.raises(UserError, match="films of rig development alone"):
+        parse("play", ["--generator", "pretrained/ddg", *options]).run()
+
+
 def test_an_unknown_object_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(UserError, match="appel"):
         parse("play", ["--objects", "appel", "--out", str(tmp_path / "play.mp4")]).run()

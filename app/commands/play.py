@@ -54,9 +54,11 @@ class Play:
             self.rig, self.objects, self.trials, number=self.number, camera=self.camera, seconds=self.seconds
         )
         trials = series.plan()
+        self._check_generator()
         viewer = self._viewer()
         policy = self.policy or _pretrained()
         config = series.configured(config_of(policy, None), policy)
+        viewer = self._viewer()
         bench = series.make(config)(config, policy)
         try:
             lifted = sum(_watched(bench, trial, viewer) for trial in trials)
@@ -66,6 +68,12 @@ class Play:
         finally:
             bench.close()
             viewer.close()
+
+    def _check_generator(self) -> None:
+        if self.generator and (self.rig == "fr3" or self.viewer != "film" or self.out.suffix == ".rrd"):
+            raise UserError(
+                "--generator is shown in films of rig development alone: drop it, or --rig, --viewer, .rrd."
+            )
 
     def _viewer(self) -> "Viewer":
         from deploy.viewers import Rerun, Video
