@@ -58,7 +58,6 @@ class Play:
         viewer = self._viewer()
         policy = self.policy or _pretrained()
         config = series.configured(config_of(policy, None), policy)
-        viewer = self._viewer()
         bench = series.make(config)(config, policy)
         try:
             lifted = sum(_watched(bench, trial, viewer) for trial in trials)
