@@ -10,11 +10,17 @@ import argparse
 import os
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 if sys.platform.startswith("linux"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(".cache/jax").absolute()))
+# Playground's step at 256 environments hangs without it on two cores and JAX 0.10 (docs/physics.md).
+if metadata.version("jax") < "0.12":
+    os.environ["XLA_FLAGS"] = (
+        f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_enable_concurrency_optimized_scheduler=false"
+    )
 
 from benchmarks import physics_speed, render_speed
 from benchmarks.compare import as_json, print_table
