@@ -45,6 +45,8 @@ class PolicyMetadata:
     camera: dict[str, Any]
     """fx, fy, cx, cy (pixels), position, look_at (metres, robot base frame): what training assumed."""
     student_manifest_hash: str
+    closing_steps: int = 0
+    """Control steps that a closing of the gripper lasts at least, once begun; files of before have none."""
 
     def to_json(self) -> str:
         """The value of the metadata property."""
@@ -92,6 +94,7 @@ def describe(
             "look_at": contract.CAMERA_LOOK_AT_M,
         },
         student_manifest_hash=student_manifest_hash,
+        closing_steps=student.head.closing_steps,
     )
 
 
@@ -128,8 +131,11 @@ def validate(properties: Mapping[str, str], source: str = "The ONNX file") -> Po
             f"{source} was exported for contract version {raw.get('contract_version')!r}, this code has "
             f"{contract.CONTRACT_VERSION}: export it again."
         )
-    names = [field.name for field in dataclasses.fields(PolicyMetadata)]
-    missing = [name for name in names if name not in raw]
+    fields = dataclasses.fields(PolicyMetadata)
+    names = [field.name for field in fields if field.name in raw]
+    missing = [
+        field.name for field in fields if field.name not in raw and field.default is dataclasses.MISSING
+    ]
     if missing:
         raise UserError(f"{source} has metadata without {missing[0]!r}: {REMEDY}.")
     values = {name: _tuples(raw[name]) for name in names}
@@ -196,6 +202,9 @@ def _check_values(metadata: PolicyMetadata, source: str) -> None:
         value = getattr(metadata, name)
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise UserError(f"{source}: {name} is {value!r}, expected a positive integer: {REMEDY}.")
+    closing = metadata.closing_steps
+    if not isinstance(closing, int) or isinstance(closing, bool) or closing < 0:
+        raise UserError(f"{source}: closing_steps is {closing!r}, expected 0 or more: {REMEDY}.")
     if metadata.execute_steps > metadata.chunk:
         raise UserError(
             f"{source}: execute_steps is {metadata.execute_steps}, more than the chunk of {metadata.chunk}."

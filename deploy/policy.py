@@ -11,6 +11,7 @@ from jaxtyping import Float, Float32
 from ddgrasp import artifacts, contract
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.errors import UserError
+from ddgrasp.gripper import ClosingLatch
 from deploy.interfaces import Depth
 
 POLICY_FILE = "policy.onnx"
@@ -66,12 +67,14 @@ class OnnxPolicy:
                 f"choose 1 to {self.info.chunk}."
             )
         self.execute_steps = steps
+        self._latch = ClosingLatch(self.info.closing_steps)
         self._noise_kind = noise
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
         """Start of an episode: forget all frames, draw noise from `seed`."""
         self._rng = np.random.default_rng(seed)
+        self._latch.reset()
         self.forget()
 
     def forget(self) -> None:
@@ -121,7 +124,7 @@ class OnnxPolicy:
             self._frames.append(depth)
         if not self._actions:
             self._actions.extend(self._infer(state)[: self.execute_steps])
-        return self._actions.popleft()
+        return self._latch(self._actions.popleft())
 
     def warm_up(self) -> None:
         """Run the network once, so that the first period does not pay for memory."""

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt16
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.depth import to_metres
+from ddgrasp.gripper import ClosingLatch
 from demos.rollout import Scene
 from demos.spool import Spool
 from student_jax.depth_source import DepthSource
@@ -65,6 +66,7 @@ class StudentActor:
         self._config, self._corrupt, self._rng, self._teacher_share = config, corrupt, rng, teacher_share
         self._noise_scale = float(noise == "normal")
         self._chunk = np.zeros(0)
+        self._latch = ClosingLatch(config.head.closing_steps)
         self._stack: deque[np.ndarray] = deque(maxlen=contract.DEPTH_FRAMES)
         self.seen = Spool(keep)
         """What the student saw, (B, H, W) uint16 millimetres a step."""
@@ -84,7 +86,7 @@ class StudentActor:
             )
         action = self._chunk[:, position]
         taught = self._rng.random(len(action)) < self._teacher_share
-        return np.where(taught[:, None], scene.expert, action)
+        return self._latch(np.where(taught[:, None], scene.expert, action))
 
 
 @partial(jax.jit, static_argnums=(0, 1))

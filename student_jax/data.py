@@ -133,7 +133,7 @@ def aux_targets(
     """What perception is to report of the teacher's observations (N, 40); `held_logit` is 0 or 1."""
     quat = observation[:, OBSERVATION.grasp_quat]
     yaw = 2.0 * np.arctan2(quat[:, 2], quat[:, 1]) * YAW_MULTIPLE
-    position = position_from_world(observation[:, OBSERVATION.object_pos])
+    position = position_from_world(observation[:, OBSERVATION.grasp_pos])
     return Aux(
         position.astype(np.float32),
         np.stack([np.cos(yaw), np.sin(yaw)], axis=1).astype(np.float32),

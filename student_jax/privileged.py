@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
+from ddgrasp.gripper import ClosingLatch
 from ddgrasp.layout import ACTION, OBSERVATION
 from demos.rollout import Scene
 from student_jax import train
@@ -47,7 +48,7 @@ def noisy_seen(
         bias: (B, 5) standard normal: position and yaw errors in units of their size.
     """
     truth = aux_targets(observation, held)
-    way = observation[:, OBSERVATION.grip_pos] - observation[:, OBSERVATION.object_pos]
+    way = observation[:, OBSERVATION.grip_pos] - observation[:, OBSERVATION.grasp_pos]
     distance = np.linalg.norm(way, axis=1, keepdims=True)
     size_m = np.minimum(NEAR_ERROR_M + ERROR_PER_DISTANCE * distance, FAR_ERROR_M)
     wrong = rng.random(len(held)) < HELD_WRONG
@@ -81,6 +82,7 @@ class PoseActor:
         self._head, self._config, self._profile = head, config, profile
         self._rng, self._share = rng, 1.0 if head is None else teacher_share
         self._bias = rng.standard_normal((count, 5))
+        self._latch = ClosingLatch(config.head.closing_steps)
 
     def __call__(self, scene: Scene) -> Float[np.ndarray, "B 8"]:
         """(B, 8) actions for the scene."""
@@ -94,4 +96,4 @@ class PoseActor:
         pushed = rng.random((len(action), 1)) < NOISE_SHARE
         push = ACTION_NOISE * rng.standard_normal(action.shape) * pushed
         push[:, ACTION.gripper] = 0.0
-        return np.clip(action + push, -1.0, 1.0)
+        return self._latch(np.clip(action + push, -1.0, 1.0))

@@ -23,7 +23,7 @@ def describe(depth_dtype: str = "uint16_mm", chunk: int = 4, execute_steps: int 
     """Metadata of a policy for PROFILE."""
     described = metadata.describe(
         StudentConfig(
-            head=HeadConfig(chunk=chunk, execute_steps=execute_steps),
+            head=HeadConfig(chunk=chunk, execute_steps=execute_steps, closing_steps=0),
         ),
         ExportConfig(depth_dtype=depth_dtype),
         PROFILE,

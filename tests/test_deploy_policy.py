@@ -49,6 +49,24 @@ def test_chunk_is_played_for_execute_steps_and_frames_keep_coming(tmp_path):
     np.testing.assert_allclose(rows, [1 + 0, 1 + 1, 1 + 2, 4 + 0, 4 + 1], rtol=1e-6)
 
 
+def test_a_closing_lasts_as_long_as_the_file_says(tmp_path):
+    # The gripper's command is 1 - 0.01 * newest frame: below 100 mm it closes.
+    gain, bias = np.zeros((3, 4, 8)), np.zeros((4, 8))
+    gain[2, :, 7], bias[:, 7] = -0.01, 1.0
+
+    def commands(policy: OnnxPolicy, *frames_mm: int) -> list[bool]:
+        return [bool(policy.act(depth_mm(mm), STATE)[7] > 0) for mm in frames_mm]
+
+    path = write_policy(tmp_path / "p.onnx", describe(closing_steps=3), depth_gain=gain, bias=bias)
+    policy = OnnxPolicy(path)
+    assert commands(policy, 200, 50, 200, 200, 200) == [False, True, True, True, False]
+    assert commands(policy, 50) == [True]
+    policy.reset(0)
+    assert commands(policy, 200) == [False]
+    path = write_policy(tmp_path / "q.onnx", depth_gain=gain, bias=bias)
+    assert commands(OnnxPolicy(path), 50, 200) == [True, False]
+
+
 def test_execute_steps_can_be_overridden_within_the_chunk(tmp_path):
     path = write_policy(tmp_path / "p.onnx")
     assert OnnxPolicy(path).execute_steps == 1

@@ -31,6 +31,12 @@ def test_what_is_written_is_read_back():
     assert read.to_json() == GOOD.to_json()
 
 
+def test_a_file_of_before_does_not_latch_a_closing():
+    described = json.loads(GOOD.to_json())
+    assert described.pop("closing_steps") == 8
+    assert metadata.validate({contract.ONNX_METADATA_KEY: json.dumps(described)}).closing_steps == 0
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -40,6 +46,7 @@ def test_what_is_written_is_read_back():
         ({"execute_steps": 5, "chunk": 4}, "execute_steps is 5, more than the chunk of 4"),
         ({"control_hz": 30.0}, "control_hz is 30.0, this code expects 10.0"),
         ({"joint_names": ["a"]}, "joint_names"),
+        ({"closing_steps": -1}, "closing_steps is -1, expected 0 or more"),
     ],
 )
 def test_contradictions_are_one_line_errors(changes, message):

@@ -16,7 +16,7 @@ from evaluation.report.summary import trial_run
 
 SIZE = re.compile(
     r"_px$|_percent$|_size$|width|heads|channels|keypoints|features$|stride|space_to_depth|hidden|blocks$"
-    r"|pattern|dots|subpixel|chunk|execute_steps|^seed$|^score\."
+    r"|pattern|dots|subpixel|chunk|execute_steps|closing_steps|^seed$|^score\."
 )
 """Names of whole numbers that are sizes of networks, pictures or the camera's parts, not counts of work."""
 

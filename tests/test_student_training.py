@@ -18,14 +18,17 @@ from ddgrasp.config import (
     StudentTrainingConfig,
 )
 from ddgrasp.errors import UserError
+from ddgrasp.layout import OBSERVATION, closes
 from ddgrasp.progress import Progress
+from demos.rollout import Scene
 from student_jax import train
+from student_jax.act import StudentActor, keep_clean
 from student_jax.augment import disparity_noise
 from student_jax.dagger import CHECKPOINTS, Trainer
 from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gripper
 from student_jax.frames_io import useful_steps
 from student_jax.policy import Aux, init_params, position_to_world
-from student_jax.privileged import noisy_seen
+from student_jax.privileged import PoseActor, noisy_seen
 
 PROFILE = contract.D455.scaled(0.25)
 CONFIG = StudentConfig(
@@ -43,7 +46,7 @@ def columns_of(lengths=(3, 2)):
     for n in lengths:
         numbers = np.array([next(count) for _ in range(n)], np.float32)
         observation = np.zeros((n, 40), np.float32)
-        observation[:, 25] = 0.4 + numbers / 50
+        observation[:, OBSERVATION.grasp_pos.start] = 0.4 + numbers / 50
         observation[:, 36] = np.cos(0.1)  # quaternion of a hand turned by 0.2 rad, fingers down
         observation[:, 37] = np.sin(0.1)
         columns.append(
@@ -77,7 +80,7 @@ def test_chunks_repeat_an_episodes_last_label():
     )
 
 
-def test_privileged_targets_come_from_the_observation():
+def test_privileged_targets_are_the_grasp_s():
     frames = frames_of()
     aux = aux_targets(frames.observation, frames.held)
     np.testing.assert_allclose(position_to_world(aux.position)[:, 0], 0.4 + np.arange(5) / 50, atol=1e-5)
@@ -193,12 +196,13 @@ def test_the_head_learns_actions_from_poses():
 
     def samples(count):
         observation = np.zeros((count, 40), np.float32)
-        observation[:, 25:27] = [0.5, 0.0] + rng.uniform(-0.15, 0.15, (count, 2))
-        observation[:, 18:21] = observation[:, 25:28]  # hand at the object: errors are small
-        observation[:, 36] = 1.0
+        grasp = observation[:, OBSERVATION.grasp_pos]
+        grasp[:, :2] = [0.5, 0.0] + rng.uniform(-0.15, 0.15, (count, 2))
+        observation[:, OBSERVATION.grip_pos] = grasp  # hand at the object: errors are small
+        observation[:, OBSERVATION.grasp_quat.start + 1] = 1.0
         seen = noisy_seen(observation, np.zeros(count, bool), np.zeros((count, 5)), rng, CONFIG)
         label = np.zeros((count, CONFIG.head.chunk, 8), np.float32)
-        label[:, :, 0] = observation[:, 26:27] * 5
+        label[:, :, 0] = grasp[:, 1:2] * 5
         return seen, np.zeros((count, 8), np.float32), label
 
     for _ in range(300):
@@ -215,6 +219,24 @@ def test_pose_errors_shrink_near_the_object():
     error = np.asarray(position_to_world(seen.aux.position))
     np.testing.assert_allclose(error, [[0.002] * 3, [0.010] * 3], atol=1e-6)
     assert np.abs(seen.aux.held_logit).tolist() == [6.0, 6.0]
+
+
+def test_neither_actor_takes_a_closing_back():
+    """The teacher's labels close once and open again; what is executed goes on closing for eight steps."""
+    depth = np.full((2, PROFILE.height_px, PROFILE.width_px), 700, np.uint16)
+    state, observation = np.zeros((2, 8), np.float32), np.zeros((2, 40), np.float32)
+    params, rng = init_params(jax.random.key(0), CONFIG, PROFILE), np.random.default_rng(0)
+    for actor in (
+        PoseActor(None, CONFIG, PROFILE, rng, 2, teacher_share=1.0),
+        StudentActor(params, CONFIG, PROFILE, keep_clean, rng, teacher_share=1.0),
+    ):
+        closing = []
+        for step in range(10):
+            expert = np.full((2, 8), -0.5)
+            expert[0, 7] = 0.5 if step == 0 else -0.5
+            scene = Scene(depth, state, expert, observation, np.zeros(2, bool), step)
+            closing.append(closes(actor(scene)))
+        np.testing.assert_array_equal(np.array(closing), [[True, False]] * 8 + [[False, False]] * 2)
 
 
 def test_executing_more_than_a_chunk_is_refused():

@@ -118,11 +118,14 @@ class HeadConfig(Section, name="student.head"):
     features_to_head: bool = False
     """Give the encoder's vector to the action head."""
     aux_to_head: bool = True
-    """Give the predicted object position, grasp yaw and held probability to the action head."""
+    """Give the predicted grasp position, grasp yaw and held probability to the action head."""
     chunk: Annotated[int, Range(1, 1000)] = 2
     """Actions predicted at once."""
     execute_steps: Annotated[int, Range(1, 1000)] = 1
     """Actions of a chunk that are executed before the policy looks again."""
+    closing_steps: Annotated[int, Range(0, 100)] = 8
+    """Control steps that a closing of the gripper lasts at least, once begun (ddgrasp/gripper.py): the hand's
+    from open to shut. 0 for none."""
     state_features: Width = 64
     """Width of the joint-state stream."""
     width: Width = 256

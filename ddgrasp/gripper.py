@@ -1,0 +1,41 @@
+"""A closing that is not taken back half-way: what a policy without memory needs before a slow hand.
+
+The fingers of a Franka Hand take 0.8 s from open to shut. The state that a student sees is their distance,
+which does not say whether they are closing or opening, so a student that closes a little early opens again,
+and so on: fingers that never shut. The teacher sees their speed. NumPy alone: the robot side uses it too.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from ddgrasp.layout import ACTION, closes
+
+CLOSE = 1.0
+"""The gripper's command while a closing goes on."""
+
+
+class ClosingLatch:
+    """Lets a closing last, once begun; call it with every action that is about to be executed.
+
+    Args:
+      steps: control steps that a closing lasts at least; 0 lets every action pass as it is.
+    """
+
+    def __init__(self, steps: int):
+        self._steps = steps
+        self.reset()
+
+    def reset(self) -> None:
+        """Start of an episode: the hand is open."""
+        self._since: np.ndarray | None = None
+
+    def __call__(self, action: Float[np.ndarray, "*batch 8"]) -> Float[np.ndarray, "*batch 8"]:
+        """`action` (..., 8), closing where a closing began less than `steps` calls ago."""
+        since = np.zeros(action.shape[:-1], int) if self._since is None else self._since
+        closing = closes(action) | ((0 < since) & (since < self._steps))
+        self._since = np.where(closing, since + 1, 0)
+        latched = np.array(action)
+        latched[..., ACTION.gripper] = np.where(
+            (closing & ~closes(action))[..., None], CLOSE, latched[..., ACTION.gripper]
+        )
+        return latched
