@@ -1,6 +1,7 @@
 """An exported policy: three raw depth frames and eight joint values in, one action out."""
 
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -69,6 +70,8 @@ class OnnxPolicy:
         self.execute_steps = steps
         self._latch = ClosingLatch(self.info.closing_steps)
         self._noise_kind = noise
+        self.watch: Callable[[Depth, np.ndarray], None] | None = None
+        """Is told the frames (3, H, W) and the state (8,) of every call of `act`."""
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
@@ -122,6 +125,8 @@ class OnnxPolicy:
         self._frames.append(depth)
         while len(self._frames) < contract.DEPTH_FRAMES:
             self._frames.append(depth)
+        if self.watch is not None:
+            self.watch(np.stack(self._frames), state)
         if not self._actions:
             self._actions.extend(self._infer(state)[: self.execute_steps])
         return self._latch(self._actions.popleft())

@@ -77,6 +77,10 @@ Watch = Callable[[Step, Filmed], None]
 """Is called after every step, with the camera of the trial for colour pictures."""
 
 
+WatchPolicy = Callable[[Depth, np.ndarray, np.ndarray], None]
+"""Is told the frames (3, H, W) and the state (8,) that a policy is given, and what is true then (40,)."""
+
+
 class Bench(Protocol):
     """Somewhere to try a policy."""
 
@@ -134,6 +138,10 @@ class Rig:
             raise KeyboardInterrupt
         robot.catch_up()
         return result(trial, bool(self._world.success()), report), filming.film()
+
+    def watch_policy(self, watch: WatchPolicy) -> None:
+        """From now on `watch` is told of everything that the policy is given."""
+        self._policy.watch = lambda depth, state: watch(depth, state, self._world.observation())
 
     def close(self) -> None:
         """Nothing to let go of."""

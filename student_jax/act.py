@@ -17,7 +17,7 @@ from ddgrasp.gripper import ClosingLatch
 from demos.rollout import Scene
 from demos.spool import Spool
 from student_jax.depth_source import DepthSource
-from student_jax.policy import sample_actions
+from student_jax.policy import Aux, StudentPolicy, sample_actions
 
 Corrupt = Callable[[Scene], UInt16[np.ndarray, "B H W"]]
 """The scene of B environments -> depth as the student sees it."""
@@ -92,3 +92,21 @@ class StudentActor:
 @partial(jax.jit, static_argnums=(0, 1))
 def _act(config, profile, params, depth_mm, state, noise):
     return sample_actions(params, to_metres(depth_mm), state, noise, config, profile)
+
+
+def perceive(
+    config: StudentConfig,
+    profile: contract.CameraProfile,
+    params: Any,
+    depth_mm: UInt16[np.ndarray, "B 3 H W"],
+    state: Float[np.ndarray, "B 8"],
+) -> Aux:
+    """What the network reports of the frames that a policy is given: where to grasp, and whether it holds."""
+    return jax.tree.map(np.asarray, _perceive(config, profile, params, depth_mm, state))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _perceive(config, profile, params, depth_mm, state):
+    policy = StudentPolicy(config, profile)
+    seen: Any = policy.apply({"params": params}, to_metres(depth_mm), state, method="encode")
+    return seen.aux

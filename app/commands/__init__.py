@@ -23,7 +23,7 @@ from app.commands.parsing import HELP_ALL, parsed
 from app.commands.play import Play
 from app.commands.rig import RigFr3
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
-from app.commands.student import Deploy, Export, StudentEval, StudentTrain, config_of
+from app.commands.student import Deploy, Export, StudentEval, StudentPerception, StudentTrain, config_of
 from app.commands.study import StudyTable2
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
 from app.commands.trials import DeployTrials
@@ -70,6 +70,7 @@ COMMANDS: dict[str, type] = {
     "ddg thresholds": DDGThresholds,
     "student train": StudentTrain,
     "student eval": StudentEval,
+    "student perception": StudentPerception,
     "export": Export,
     "deploy": Deploy,
     "deploy trials": DeployTrials,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -10,7 +10,7 @@ from app.commands.base import DEFAULT_PRESET, OneStage, load_config
 from app.commands.checks import check_objects
 from ddgrasp import artifacts
 from ddgrasp.config import Camera, Config, Robot
-from ddgrasp.config.checks import Count, Seed
+from ddgrasp.config.checks import Count, Range, Seed
 from ddgrasp.presets import get_preset
 
 
@@ -52,6 +52,35 @@ class StudentEval:
         for name, counts in result.items():
             success = counts["success"]
             print(f"{name:<14} {wilson.describe(wilson.success(success['successes'], success['n']))}")
+
+
+@dataclass(frozen=True)
+class StudentPerception:
+    """Measure what a student perceives on the development rig beside the truth; the run's report shows it."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run, with the stages student and export."""
+    camera: Literal["stereo", "ideal"] = "stereo"
+    """stereo (the rig's own) or ideal (without errors)."""
+    objects: tuple[str, ...] = ("all",)
+    """Names, or all."""
+    trials: Count = 6
+    """How many with every object."""
+    number: Annotated[int, Range(0, 999)] = 0
+    """Which development seed."""
+
+    def run(self) -> None:
+        """Runs the trials and prints a row for each part of them."""
+        from ddgrasp.progress import Progress
+        from evaluation import perception, perception_table
+        from evaluation.rig_trials import Series
+
+        config = load_config(self.run_dir, "export")
+        series = Series("development", self.objects, self.trials, number=self.number, camera=self.camera)
+        progress = Progress(name="student perception")
+        rows, _ = perception.measure(config, self.run_dir, series, progress)
+        print(perception_table.describe(rows))
+        print(perception_table.save(self.run_dir / "student", self.camera, rows))
 
 
 @dataclass(frozen=True)

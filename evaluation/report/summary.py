@@ -12,7 +12,7 @@ from typing import Any
 from ddgrasp import artifacts, contract, cores
 from ddgrasp.errors import UserError
 from ddgrasp.stages import ON_REQUEST, STAGES
-from evaluation import backends, teacher_trials, wilson
+from evaluation import backends, perception_table, teacher_trials, wilson
 
 REPORT = "report.json"
 _TOP_LEVEL = "student_"
@@ -26,7 +26,8 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`. A success rate is {rate, n,
     successes, low, high}.
     `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows; `teacher.backends`, if `ddgrasp
-    teacher compare` was, is `evaluation.backends.table`.
+    teacher compare` was, is `evaluation.backends.table`; `student.perception`, if `ddgrasp student
+    perception` was, is `evaluation.perception.tabulate`.
     """
     finished = {
         stage.name: artifacts.read_manifest(run_dir / stage.name)
@@ -65,6 +66,8 @@ def build_report(run_dir: Path) -> dict[str, Any]:
         trained_on = finished["teacher"].config["world"]["backend"]
         if rows := backends.table(run_dir / "teacher", trained_on):
             report["teacher"]["backends"] = rows
+    if "student" in finished and (rows := perception_table.load(run_dir / "student")):
+        report["student"]["perception"] = rows
     report["config"] = latest.config
     return report
 

@@ -1,0 +1,156 @@
+"""What a student perceives on the development rig beside the truth, while its exported file acts.
+
+Nobody looks at this on a robot: the truth is the rig's. It says whether a lost grasp is perception's.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt16
+
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.layout import OBSERVATION
+from ddgrasp.progress import Progress
+from deploy.policy import POLICY_FILE
+from deploy.trials import Rig
+from evaluation.rig_trials import Series
+
+if TYPE_CHECKING:
+    from student_jax.policy import Aux
+
+FAR_M, NEAR_M = 0.15, 0.08
+"""Distance of hand and grasp beyond which the hand is far, and within which it is near."""
+MOVED_M = 0.005
+"""An object that is this far from where it lay has been touched."""
+CARRIED_M = 0.03
+"""An object that is this high above where it lay is in the hand."""
+
+
+@dataclass
+class Seen:
+    """What one trial's policy was given and what was true then, a row a control step."""
+
+    object_name: str
+    success: bool = False
+    depth: list[UInt16[np.ndarray, "3 H W"]] = field(default_factory=list)
+    state: list[Float[np.ndarray, "8"]] = field(default_factory=list)
+    observation: list[Float[np.ndarray, "40"]] = field(default_factory=list)
+
+
+def measure(
+    config: Config, run_dir: Path, series: Series, progress: Progress
+) -> tuple[list[dict[str, Any]], list[Seen]]:
+    """(rows of the table, see `tabulate`; the trials), with the policy in `run_dir`/export acting.
+
+    Raises UserError where the run has no exported policy, or `series` is of another rig.
+    """
+    from learning.params import load_params
+    from student_jax.act import perceive
+    from student_jax.policy import PARAMS_FILE
+
+    if series.rig != "development":
+        raise UserError(f"--rig is {series.rig!r}: perception is measured where the truth is known, on rig "
+                        "development.")  # fmt: skip
+    policy = run_dir / "export" / POLICY_FILE
+    config = series.configured(config, policy)
+    rig = Rig(config, policy, ideal=series.camera == "ideal")
+    params = load_params(run_dir / "student" / PARAMS_FILE)
+    trials, parts = [], []
+    plan = series.plan()
+    with progress.task("perception", len(plan)) as task:
+        for trial in plan:
+            seen = Seen(trial.object_name)
+            rig.watch_policy(partial(_keep, seen))
+            result, _ = rig.run(trial)
+            seen.success = result.success
+            trials.append(seen)
+            frames = np.stack(seen.depth), np.stack(seen.state)
+            parts.append(errors(seen, perceive(config.student, config.world.profile, params, *frames)))
+            task.advance(success=sum(t.success for t in trials) / len(trials))
+    return tabulate(parts, [t.success for t in trials]), trials
+
+
+def _keep(seen: Seen, depth: np.ndarray, state: np.ndarray, observation: np.ndarray) -> None:
+    seen.depth.append(depth)
+    seen.state.append(state)
+    seen.observation.append(observation)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What perception was off by in the T steps of a trial, and where the hand was."""
+
+    away_m: Float[np.ndarray, "T 3"]
+    """Perceived minus true position of the grasp, in the robot's frame."""
+    yaw_rad: Float[np.ndarray, " T"]
+    """The grasp's, without sign."""
+    held: Float[np.ndarray, " T"]
+    """Perceived probability that the object is in the hand."""
+    distance_m: Float[np.ndarray, " T"]
+    """From the hand to the grasp."""
+    touched: Bool[np.ndarray, " T"]
+    carried: Bool[np.ndarray, " T"]
+
+
+def errors(seen: Seen, aux: "Aux") -> Errors:
+    """What `aux` is off by."""
+    from student_jax.data import YAW_MULTIPLE, aux_targets
+    from student_jax.policy import position_to_world
+
+    observation = np.stack(seen.observation)
+    lay, at = observation[0, OBSERVATION.object_pos], observation[:, OBSERVATION.object_pos]
+    truth = aux_targets(observation, np.zeros(len(at), bool))
+    away = np.asarray(position_to_world(aux.position)) - observation[:, OBSERVATION.grasp_pos]
+    turn = np.arctan2(aux.yaw[:, 1], aux.yaw[:, 0]) - np.arctan2(truth.yaw[:, 1], truth.yaw[:, 0])
+    to_grasp = observation[:, OBSERVATION.grip_pos] - observation[:, OBSERVATION.grasp_pos]
+    return Errors(
+        away_m=away,
+        yaw_rad=np.abs(np.angle(np.exp(1j * turn))) / YAW_MULTIPLE,
+        held=1 / (1 + np.exp(-aux.held_logit)),
+        distance_m=np.linalg.norm(to_grasp, axis=1),
+        touched=np.maximum.accumulate(np.linalg.norm(at - lay, axis=1) > MOVED_M),
+        carried=at[:, 2] - lay[2] > CARRIED_M,
+    )
+
+
+def tabulate(parts: Sequence[Errors], success: Sequence[bool]) -> list[dict[str, Any]]:
+    """A row for each part of a trial, of all trials, of those that succeeded and of those that did not.
+
+    Position (mm): medians without sign, in the plane and in height, and means with it, x away from the base,
+    y to its left, z up. Yaw (degrees): median. Held: share of steps told wrongly.
+    """
+    rows = []
+    for outcome, chosen in (("all", (True, False)), ("success", (True,)), ("failure", (False,))):
+        of = [part for part, well in zip(parts, success, strict=True) if well in chosen]
+        for name, steps in (
+            ("far", lambda p: ~p.touched & (p.distance_m > FAR_M)),
+            ("near", lambda p: ~p.touched & (p.distance_m < NEAR_M)),
+            ("carried", lambda p: p.carried),
+        ):
+            where = [steps(part) for part in of]
+            if sum(int(w.sum()) for w in where):
+                rows.append({"trials": outcome, "hand": name} | _row(of, where, name == "carried"))
+    return rows
+
+
+def _row(parts: Sequence[Errors], where: Sequence[np.ndarray], carried: bool) -> dict[str, Any]:
+    def of(name: str) -> np.ndarray:
+        return np.concatenate([getattr(part, name)[w] for part, w in zip(parts, where, strict=True)])
+
+    away = 1e3 * of("away_m")
+    x, y, z = (round(float(value), 1) for value in away.mean(axis=0))
+    return {
+        "steps": len(away),
+        "horizontal_mm": round(float(np.median(np.linalg.norm(away[:, :2], axis=1))), 1),
+        "height_mm": round(float(np.median(np.abs(away[:, 2]))), 1),
+        "mean_x_mm": x,
+        "mean_y_mm": y,
+        "mean_z_mm": z,
+        "yaw_deg": round(float(np.degrees(np.median(of("yaw_rad")))), 1),
+        "held_wrong": round(float(np.mean((of("held") > 0.5) != carried)), 3),
+    }

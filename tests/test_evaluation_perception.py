@@ -1,0 +1,69 @@
+"""What perception is off by, from positions and angles set by hand; and what is kept of it."""
+
+import numpy as np
+import pytest
+
+from ddgrasp import artifacts
+from ddgrasp.layout import OBSERVATION
+from ddgrasp.presets import PRESETS
+from evaluation import perception, perception_table
+from student_jax.data import YAW_MULTIPLE, aux_targets
+from student_jax.policy import Aux, position_from_world
+
+LAY = np.array([0.5, 0.0, 0.03])
+
+
+def _seen(hand_m: list, lifted_m: list) -> perception.Seen:
+    """A trial in which the hand is so far above the grasp, and the object so far above where it lay."""
+    seen = perception.Seen("cube")
+    for hand, lifted in zip(hand_m, lifted_m, strict=True):
+        observation = np.zeros(40)
+        at = LAY + [0, 0, lifted]
+        observation[OBSERVATION.object_pos] = at
+        observation[OBSERVATION.grasp_pos] = at + [0, 0, 0.01]
+        observation[OBSERVATION.grip_pos] = at + [0, 0, 0.01 + hand]
+        observation[OBSERVATION.grasp_quat] = [0, np.cos(0.1), np.sin(0.1), 0]
+        seen.observation.append(observation)
+    return seen
+
+
+def _reported(seen: perception.Seen, away_m, turn_rad: float, held: list) -> Aux:
+    truth = aux_targets(np.stack(seen.observation), np.zeros(len(held), bool))
+    at = np.stack([row[OBSERVATION.grasp_pos] for row in seen.observation])
+    yaw = np.arctan2(truth.yaw[:, 1], truth.yaw[:, 0]) + YAW_MULTIPLE * turn_rad
+    logit = np.where(held, 3.0, -3.0)
+    return Aux(position_from_world(at + away_m), np.stack([np.cos(yaw), np.sin(yaw)], 1), logit)
+
+
+def test_every_part_of_a_trial_has_its_errors():
+    seen = _seen([0.3, 0.2, 0.05, 0.0, 0.0], [0, 0, 0, 0.01, 0.1])
+    reported = _reported(seen, np.array([0.003, -0.004, 0.002]), -0.2, [False, False, True, True, False])
+    rows = perception.tabulate([perception.errors(seen, reported)], [True])
+    assert [(row["trials"], row["hand"], row["steps"]) for row in rows] == [
+        (outcome, hand, steps)
+        for outcome in ("all", "success")
+        for hand, steps in (("far", 2), ("near", 1), ("carried", 1))
+    ]  # step four has touched the object and not lifted it: in none
+    for row in rows:
+        assert row["horizontal_mm"] == pytest.approx(5.0, abs=0.1)
+        assert row["height_mm"] == pytest.approx(2.0, abs=0.1)
+        means = [row[f"mean_{axis}_mm"] for axis in "xyz"]
+        assert means == pytest.approx([3.0, -4.0, 2.0], abs=0.1)
+        assert row["yaw_deg"] == pytest.approx(np.degrees(0.2), abs=0.1)
+    assert [row["held_wrong"] for row in rows[:3]] == [0.0, 1.0, 1.0]
+    text = perception_table.describe(rows).splitlines()
+    assert len(text) == 7 and "horizontal_mm" in text[0]
+
+
+def test_rows_stay_until_the_student_is_made_anew(tmp_path):
+    directory = tmp_path / "student"
+    artifacts.finish(directory, "student", PRESETS["debug"], seconds=1.0, metrics={})
+    perception_table.save(directory, "stereo", [{"steps": 1}])
+    perception_table.save(directory, "ideal", [{"steps": 2}])
+    perception_table.save(directory, "stereo", [{"steps": 3}])
+    assert perception_table.load(directory) == [
+        {"camera": "ideal", "steps": 2},
+        {"camera": "stereo", "steps": 3},
+    ]
+    artifacts.finish(directory, "student", PRESETS["debug"], seconds=2.0, metrics={"other": 1})
+    assert perception_table.load(directory) == []
