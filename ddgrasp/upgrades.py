@@ -113,7 +113,7 @@ _ADDED_AFTER_2 = {
 _ADDED_AFTER_3 = {"ddg.graft.window_px": 0.0}
 """Fields that version 3 lacked, with what it did."""
 
-_ADDED_AFTER_4 = {"student.head.closing_steps": 0}
+_ADDED_AFTER_4 = {"student.head.closing_steps": 0, "student.training.unseen_share": 0.0}
 """Fields that version 4 lacked, with what it did."""
 
 _CLONE_ROUNDS = 8

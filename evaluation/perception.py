@@ -3,7 +3,7 @@
 Nobody looks at this on a robot: the truth is the rig's. It says whether a lost grasp is perception's.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -42,10 +42,8 @@ class Seen:
     observation: list[Float[np.ndarray, "40"]] = field(default_factory=list)
 
 
-def measure(
-    config: Config, run_dir: Path, series: Series, progress: Progress
-) -> tuple[list[dict[str, Any]], list[Seen]]:
-    """(rows of the table, see `tabulate`; the trials), with the policy in `run_dir`/export acting.
+def measure(config: Config, run_dir: Path, series: Series, progress: Progress) -> list[dict[str, Any]]:
+    """Rows of `tabulate`, with the policy in `run_dir`/export acting.
 
     Raises UserError where the run has no exported policy, or `series` is of another rig.
     """
@@ -72,7 +70,7 @@ def measure(
             frames = np.stack(seen.depth), np.stack(seen.state)
             parts.append(errors(seen, perceive(config.student, config.world.profile, params, *frames)))
             task.advance(success=sum(t.success for t in trials) / len(trials))
-    return tabulate(parts, [t.success for t in trials]), trials
+    return tabulate(parts, [t.success for t in trials], [t.object_name for t in trials])
 
 
 def _keep(seen: Seen, depth: np.ndarray, state: np.ndarray, observation: np.ndarray) -> None:
@@ -118,24 +116,32 @@ def errors(seen: Seen, aux: "Aux") -> Errors:
     )
 
 
-def tabulate(parts: Sequence[Errors], success: Sequence[bool]) -> list[dict[str, Any]]:
-    """A row for each part of a trial, of all trials, of those that succeeded and of those that did not.
+def tabulate(parts: Sequence[Errors], success: Sequence[bool], names: Sequence[str]) -> list[dict[str, Any]]:
+    """A row for each part of a trial: of all trials, of those that succeeded, of those that did not, and for
+    each object of the steps with the hand near. `success` and `names` are the trials' outcomes and objects.
 
     Position (mm): medians without sign, in the plane and in height, and means with it, x away from the base,
     y to its left, z up. Yaw (degrees): median. Held: share of steps told wrongly.
     """
+    groups = {"all": list(parts)}
+    for title, wanted in (("success", True), ("failure", False)):
+        groups[title] = [part for part, well in zip(parts, success, strict=True) if well == wanted]
+    for name in dict.fromkeys(names):
+        groups[name] = [part for part, of in zip(parts, names, strict=True) if of == name]
     rows = []
-    for outcome, chosen in (("all", (True, False)), ("success", (True,)), ("failure", (False,))):
-        of = [part for part, well in zip(parts, success, strict=True) if well in chosen]
-        for name, steps in (
-            ("far", lambda p: ~p.touched & (p.distance_m > FAR_M)),
-            ("near", lambda p: ~p.touched & (p.distance_m < NEAR_M)),
-            ("carried", lambda p: p.carried),
-        ):
-            where = [steps(part) for part in of]
-            if sum(int(w.sum()) for w in where):
-                rows.append({"trials": outcome, "hand": name} | _row(of, where, name == "carried"))
+    for title, chosen in groups.items():
+        for hand, steps in _PHASES.items():
+            where = [steps(part) for part in chosen]
+            if any(w.any() for w in where) and (hand == "near" or title not in names):
+                rows.append({"trials": title, "hand": hand} | _row(chosen, where, hand == "carried"))
     return rows
+
+
+_PHASES: dict[str, Callable[[Errors], np.ndarray]] = {
+    "far": lambda part: ~part.touched & (part.distance_m > FAR_M),
+    "near": lambda part: ~part.touched & (part.distance_m < NEAR_M),
+    "carried": lambda part: part.carried,
+}
 
 
 def _row(parts: Sequence[Errors], where: Sequence[np.ndarray], carried: bool) -> dict[str, Any]:

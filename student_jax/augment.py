@@ -6,10 +6,12 @@ of what it had lifted, and on ideal depth never. So training ripples them.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Key
+import numpy as np
+from jaxtyping import Bool, Float, Key
 
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
+from mjx_envs.camera import nominal_camera
 
 CORRELATION_PX = 2
 """Neighbouring pixels share their matching window; the rig's residuals correlate by 0.65 at one pixel."""
@@ -17,6 +19,16 @@ SPURIOUS_SHARE = 0.002
 SPURIOUS_PX = 8.0
 """Largest disparity error of a wrong match, and the share of 2x2 cells that have one."""
 _MIN_DISPARITY_PX = 0.5
+UNSEEN_RADIUS_M = 0.07
+"""What lies within this of the grasp, seen from above, is the object: the hand's width, nearly."""
+UNSEEN_ABOVE_M = (0.008, 0.015)
+"""And higher than this above the table (a far table ripples by a few millimetres), and lower than twice the
+grasp's height and this."""
+TABLE_M = 0.03
+"""What seems no further than this from the table, beside the object, is the table: the camera does not stand
+exactly where it should, and its height here is read off what is seen."""
+LYING_M = 0.08
+"""A grasp that is lower than this lies on the table."""
 
 
 def disparity_noise(
@@ -49,3 +61,52 @@ def disparity_noise(
     fb = profile.fx_px * profile.baseline_m
     disparity = fb / jnp.maximum(depth_m, 1e-3) + field[:, :, :height, :width]
     return jnp.where(depth_m > 0, fb / jnp.maximum(disparity, _MIN_DISPARITY_PX), 0.0)
+
+
+def unseen_objects(
+    key: Key[jax.Array, ""],
+    depth_m: Float[jax.Array, "B F H W"],
+    grasp_m: Float[jax.Array, "B 3"],
+    profile: CameraProfile,
+    config: StudentConfig,
+) -> Float[jax.Array, "B F H W"]:
+    """Depth in which a share of the objects that lie on the table is a hole in every frame.
+
+    A stereo camera finds nothing on what is dark or thin (the rig's tyre, a starfruit): the hole is all there
+    is to see of it. Parts of a hand that is about to grasp go too.
+
+    Args:
+        depth_m: (B, F, H, W) planar metres, 0 = invalid.
+        grasp_m: (B, 3) where to grasp, world frame.
+    """
+    chosen = jax.random.bernoulli(key, config.training.unseen_share, depth_m.shape[:1])
+    chosen &= grasp_m[:, 2] < LYING_M
+    hole = _grown(_of_object(depth_m, grasp_m, profile)) & chosen[:, None, None, None]
+    return jnp.where(hole, 0.0, depth_m)
+
+
+def _of_object(
+    depth_m: Float[jax.Array, "B F H W"], grasp_m: Float[jax.Array, "B 3"], profile: CameraProfile
+) -> Bool[jax.Array, "B F H W"]:
+    camera = nominal_camera(profile)
+    x = (np.arange(profile.width_px) + 0.5 - profile.cx_px) / profile.fx_px
+    y = (np.arange(profile.height_px) + 0.5 - profile.cy_px) / profile.fy_px
+    ray = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(y), len(x)))], axis=-1)
+    ray = np.asarray(ray @ camera.T_world_cam[:3, :3].T, np.float32)
+    start = np.asarray(camera.T_world_cam[:3, 3], np.float32)
+    grasp = grasp_m[:, None, None, None, :]
+    away = [start[i] + depth_m * ray[..., i] - grasp[..., i] for i in range(2)]
+    height = start[2] + depth_m * ray[..., 2]
+    low, above = UNSEEN_ABOVE_M
+    square = away[0] ** 2 + away[1] ** 2
+    around = (square > UNSEEN_RADIUS_M**2) & (square < (2 * UNSEEN_RADIUS_M) ** 2)
+    table = around & (depth_m > 0) & (jnp.abs(height) < TABLE_M)
+    count = jnp.maximum(table.sum((2, 3), keepdims=True), 1)
+    height = height - jnp.where(table, height, 0.0).sum((2, 3), keepdims=True) / count
+    within = (depth_m > 0) & (square < UNSEEN_RADIUS_M**2)
+    return within & (height > low) & (height < 2 * grasp[..., 2] + above)
+
+
+def _grown(mask: Bool[jax.Array, "B F H W"]) -> Bool[jax.Array, "B F H W"]:
+    """By a pixel each way: a hole takes the object's edge with it."""
+    return jax.lax.reduce_window(mask, False, jax.lax.bitwise_or, (1, 1, 3, 3), (1, 1, 1, 1), "SAME")

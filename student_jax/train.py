@@ -18,7 +18,7 @@ from ddgrasp.depth import to_metres
 from learning.diffusion import q_sample
 from learning.optimizers import adamw
 from learning.train_state import TrainState, first_state, step_key, updated
-from student_jax.augment import disparity_noise
+from student_jax.augment import disparity_noise, unseen_objects
 from student_jax.data import Frames, aux_targets, random_crops, sharpen_gripper
 from student_jax.encoder import POSITION_SCALE_M
 from student_jax.policy import (
@@ -27,6 +27,7 @@ from student_jax.policy import (
     Seen,
     StudentPolicy,
     noise_schedule,
+    position_to_world,
     sample_from_seen,
 )
 
@@ -141,6 +142,9 @@ def train_step(
     depth_m = to_metres(batch.depth_mm)
     if config.training.disparity_noise_px:
         depth_m = disparity_noise(k_noise, depth_m, profile, config)
+    if config.training.unseen_share:
+        grasp_m = position_to_world(batch.aux.position)
+        depth_m = unseen_objects(jax.random.fold_in(k_noise, 1), depth_m, grasp_m, profile, config)
 
     def loss_fn(params):
         params = params | frozen

@@ -38,12 +38,12 @@ def _reported(seen: perception.Seen, away_m, turn_rad: float, held: list) -> Aux
 def test_every_part_of_a_trial_has_its_errors():
     seen = _seen([0.3, 0.2, 0.05, 0.0, 0.0], [0, 0, 0, 0.01, 0.1])
     reported = _reported(seen, np.array([0.003, -0.004, 0.002]), -0.2, [False, False, True, True, False])
-    rows = perception.tabulate([perception.errors(seen, reported)], [True])
+    rows = perception.tabulate([perception.errors(seen, reported)], [True], ["cube"])
     assert [(row["trials"], row["hand"], row["steps"]) for row in rows] == [
         (outcome, hand, steps)
         for outcome in ("all", "success")
         for hand, steps in (("far", 2), ("near", 1), ("carried", 1))
-    ]  # step four has touched the object and not lifted it: in none
+    ] + [("cube", "near", 1)]  # step four has touched the object and not lifted it: in none
     for row in rows:
         assert row["horizontal_mm"] == pytest.approx(5.0, abs=0.1)
         assert row["height_mm"] == pytest.approx(2.0, abs=0.1)
@@ -52,7 +52,7 @@ def test_every_part_of_a_trial_has_its_errors():
         assert row["yaw_deg"] == pytest.approx(np.degrees(0.2), abs=0.1)
     assert [row["held_wrong"] for row in rows[:3]] == [0.0, 1.0, 1.0]
     text = perception_table.describe(rows).splitlines()
-    assert len(text) == 7 and "horizontal_mm" in text[0]
+    assert len(text) == 8 and "horizontal_mm" in text[0]
 
 
 def test_rows_stay_until_the_student_is_made_anew(tmp_path):

@@ -21,13 +21,15 @@ from ddgrasp.errors import UserError
 from ddgrasp.layout import OBSERVATION, closes
 from ddgrasp.progress import Progress
 from demos.rollout import Scene
+from mjx_envs.camera import nominal_camera
 from student_jax import train
 from student_jax.act import StudentActor, keep_clean
-from student_jax.augment import disparity_noise
+from student_jax.augment import disparity_noise, unseen_objects
 from student_jax.dagger import CHECKPOINTS, Trainer
 from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gripper
 from student_jax.frames_io import useful_steps
 from student_jax.policy import Aux, init_params, position_to_world
+from student_jax.preprocess import table_depth
 from student_jax.privileged import PoseActor, noisy_seen
 
 PROFILE = contract.D455.scaled(0.25)
@@ -271,3 +273,29 @@ def test_without_disparity_noise_perception_is_told_of_pixels_as_they_come(stren
     plain, noisy = train.encode(*given), train.encode(*given, jax.random.key(1))
     same = [np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (plain, noisy)), strict=True)]
     assert all(same) == exact
+
+
+def test_an_object_that_is_not_seen_is_a_hole_as_large_as_it_is():
+    """A 4 cm block on an empty table, drawn by hand through the nominal camera that stands 5 mm too low."""
+    training = dataclasses.replace(CONFIG.training, unseen_share=1.0)
+    config = dataclasses.replace(CONFIG, training=training)
+    depth = np.array(table_depth(PROFILE, 2.5)) * (1 + 0.005 / contract.CAMERA_POSITION_M[2])
+    empty = depth.copy()
+    at = np.array([0.5, 0.0, 0.02])
+    camera = nominal_camera(PROFILE)
+    x, y, z = camera.T_world_cam[:3, :3].T @ (at - camera.T_world_cam[:3, 3])
+    row, column = int(y / z * PROFILE.fy_px + PROFILE.cy_px), int(x / z * PROFILE.fx_px + PROFILE.cx_px)
+    block = np.zeros(depth.shape, bool)
+    block[row - 3 : row + 4, column - 3 : column + 4] = True
+    depth[block] = z - 0.03
+    stack = jnp.asarray(np.stack([depth, depth, depth])[None].repeat(2, 0), jnp.float32)
+    grasp = jnp.asarray(np.stack([at, [0.5, 0.0, 0.3]]), jnp.float32)  # the other one is carried
+    made = np.asarray(unseen_objects(jax.random.key(0), stack, grasp, PROFILE, config))
+    hole = made[0, 0] == 0
+    grown = np.zeros_like(block)
+    grown[row - 4 : row + 5, column - 4 : column + 5] = True  # a pixel of its edge each way
+    assert hole[block].all() and not hole[~grown].any()
+    np.testing.assert_allclose(made[0, 2][~hole], empty[~hole], rtol=1e-6)
+    np.testing.assert_array_equal(made[1], stack[1])
+    none = dataclasses.replace(config, training=dataclasses.replace(training, unseen_share=0.0))
+    np.testing.assert_array_equal(unseen_objects(jax.random.key(0), stack, grasp, PROFILE, none), stack)

@@ -78,7 +78,7 @@ class StudentPerception:
         config = load_config(self.run_dir, "export")
         series = Series("development", self.objects, self.trials, number=self.number, camera=self.camera)
         progress = Progress(name="student perception")
-        rows, _ = perception.measure(config, self.run_dir, series, progress)
+        rows = perception.measure(config, self.run_dir, series, progress)
         print(perception_table.describe(rows))
         print(perception_table.save(self.run_dir / "student", self.camera, rows))
 

@@ -27,7 +27,8 @@ class Row:
     depth: TreatmentName = RECORDED
     """What its policy sees on the rig."""
     ripple: bool = False
-    """Whether training ripples surfaces by hand (`student.training.disparity_noise_px`)."""
+    """Whether training has the noise made by hand: surfaces that ripple (`student.training.
+    disparity_noise_px`), objects that are not seen (`unseen_share`, as much as the recipe has)."""
     paper_generator: bool = False
     """Whether the generator is the paper's: depth itself, uniform weights."""
 
@@ -129,7 +130,9 @@ def row_config(shared: Config, row: Row) -> Config:
             f"student.training.disparity_noise_px is 0: row {row.title!r} needs its strength, for example "
             "0.25."
         )
-    training = replace(shared.student.training, disparity_noise_px=ripple_px if row.ripple else 0.0)
+    training = shared.student.training
+    if not row.ripple:
+        training = replace(training, disparity_noise_px=0.0, unseen_share=0.0)
     student = replace(shared.student, depth_source=row.source, training=training)
     ddg = paper_generator(shared.ddg) if row.paper_generator else shared.ddg
     return replace(shared, student=student, ddg=ddg)
