@@ -17,7 +17,7 @@ if sys.platform.startswith("linux"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(".cache/jax").absolute()))
 # Playground's step at 256 environments hangs without it on two cores and JAX 0.10 (docs/physics.md).
-if metadata.version("jax") < "0.12":
+if tuple(int(part) for part in metadata.version("jax").split(".")[:2]) < (0, 12):
     os.environ["XLA_FLAGS"] = (
         f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_enable_concurrency_optimized_scheduler=false"
     )

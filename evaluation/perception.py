@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
 from ddgrasp.config import Config
-from ddgrasp.errors import UserError
 from ddgrasp.layout import OBSERVATION
 from ddgrasp.progress import Progress
 from deploy.policy import POLICY_FILE
@@ -35,8 +34,6 @@ CARRIED_M = 0.03
 class Seen:
     """What one trial's policy was given and what was true then, a row a control step."""
 
-    object_name: str
-    success: bool = False
     depth: list[UInt16[np.ndarray, "3 H W"]] = field(default_factory=list)
     state: list[Float[np.ndarray, "8"]] = field(default_factory=list)
     observation: list[Float[np.ndarray, "40"]] = field(default_factory=list)
@@ -45,32 +42,28 @@ class Seen:
 def measure(config: Config, run_dir: Path, series: Series, progress: Progress) -> list[dict[str, Any]]:
     """Rows of `tabulate`, with the policy in `run_dir`/export acting.
 
-    Raises UserError where the run has no exported policy, or `series` is of another rig.
+    Raises UserError where the run has no exported policy.
     """
     from learning.params import load_params
     from student_jax.act import perceive
     from student_jax.policy import PARAMS_FILE
 
-    if series.rig != "development":
-        raise UserError(f"--rig is {series.rig!r}: perception is measured where the truth is known, on rig "
-                        "development.")  # fmt: skip
     policy = run_dir / "export" / POLICY_FILE
     config = series.configured(config, policy)
     rig = Rig(config, policy, ideal=series.camera == "ideal")
     params = load_params(run_dir / "student" / PARAMS_FILE)
-    trials, parts = [], []
+    outcomes, parts = [], []
     plan = series.plan()
     with progress.task("perception", len(plan)) as task:
         for trial in plan:
-            seen = Seen(trial.object_name)
+            seen = Seen()
             rig.watch_policy(partial(_keep, seen))
             result, _ = rig.run(trial)
-            seen.success = result.success
-            trials.append(seen)
+            outcomes.append(result.success)
             frames = np.stack(seen.depth), np.stack(seen.state)
             parts.append(errors(seen, perceive(config.student, config.world.profile, params, *frames)))
-            task.advance(success=sum(t.success for t in trials) / len(trials))
-    return tabulate(parts, [t.success for t in trials], [t.object_name for t in trials])
+            task.advance(success=sum(outcomes) / len(outcomes))
+    return tabulate(parts, outcomes, [trial.object_name for trial in plan])
 
 
 def _keep(seen: Seen, depth: np.ndarray, state: np.ndarray, observation: np.ndarray) -> None:

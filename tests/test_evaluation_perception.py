@@ -15,7 +15,7 @@ LAY = np.array([0.5, 0.0, 0.03])
 
 def _seen(hand_m: list, lifted_m: list) -> perception.Seen:
     """A trial in which the hand is so far above the grasp, and the object so far above where it lay."""
-    seen = perception.Seen("cube")
+    seen = perception.Seen()
     for hand, lifted in zip(hand_m, lifted_m, strict=True):
         observation = np.zeros(40)
         at = LAY + [0, 0, lifted]
