@@ -119,7 +119,8 @@ def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
     (judged.parent / "begun").mkdir()
     parse("report", [str(judged.parent)]).run()
     said = capsys.readouterr().out
-    missed = sum(json.loads((path / "report.json").read_text())["missed_deadlines"] for path in (judged, other))
+    reports = [json.loads((path / "report.json").read_text()) for path in (judged, other)]
+    missed = sum(report["missed_deadlines"] for report in reports)
     assert "Success 100.0 % of 1" in said and f"Missed deadlines: {missed} in 10 steps." in said
     text = (judged.parent / "report.html").read_text()
     assert text.count("data:image/png;base64,") == 2
