@@ -8,13 +8,13 @@ settings, observation and reward are Playground's own.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import jax
 from mujoco.mjx._src import scan
-from mujoco_playground._src import mjx_env
-from mujoco_playground._src.manipulation.franka_emika_panda import panda, pick
+from mujoco_playground import MjxEnv, State, manipulation
 
 from ddgrasp import contract
 from mjx_envs import scene
@@ -28,12 +28,13 @@ _JOINT_DAMPING = (40, 40, 40, 40, 2, 2, 2)
 _CONTACT = 'condim="3" solimp="0.99 0.995 0.01" solref="0.01 1" friction="1 0.005 0.0001"'
 
 
-def make_env() -> pick.PandaPickCube:
+def make_env() -> MjxEnv:
     """PandaPickCube at its default configuration (50 Hz control, four substeps of 5 ms) on MJX-JAX."""
-    scenes = mjx_env.ROOT_PATH / "manipulation" / "franka_emika_panda" / "xmls"
+    pick = manipulation.panda_pick
+    scenes = Path(pick.__file__).parent / "xmls"
     assets = {path.name: path.read_bytes() for path in scenes.glob("*.xml")}
     assets["mjx_panda.xml"] = _robot_xml().encode()
-    with mock.patch.object(panda, "get_assets", lambda: assets):
+    with mock.patch.object(pick.panda, "get_assets", lambda: assets):
         return pick.PandaPickCube(config_overrides={"impl": "jax"})
 
 
@@ -43,16 +44,16 @@ class WithBarriers:
     Faster than without XLA's fusion emitters, which only a flag of older versions turns off.
     """
 
-    def __init__(self, env: pick.PandaPickCube):
+    def __init__(self, env: MjxEnv):
         self._env = env
         self.action_size = env.action_size
 
-    def reset(self, rng: jax.Array) -> mjx_env.State:
+    def reset(self, rng: jax.Array) -> State:
         """As the environment's."""
         with _barriers():
             return self._env.reset(rng)
 
-    def step(self, state: mjx_env.State, action: jax.Array) -> mjx_env.State:
+    def step(self, state: State, action: jax.Array) -> State:
         """As the environment's."""
         with _barriers():
             return self._env.step(state, action)

@@ -1,0 +1,133 @@
+"""The grasping task behind Gymnasium's API: its own checks, and many environments against single ones."""
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs pip install -e '.[gym]'")
+from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E402
+from gymnasium.vector import AutoresetMode  # noqa: E402
+
+from ddgrasp.config import WorldConfig  # noqa: E402
+from ddgrasp.errors import UserError  # noqa: E402
+from ppo import policy  # noqa: E402
+
+ROOT = Path(__file__).parents[1]
+ID = "mjx_envs.gym:ddgrasp/Pick-v0"
+WORLD = WorldConfig(objects=("cube", "apple"), camera_scale=0.125)
+"""That of docs/environment.md, so that all of this file shares what is compiled."""
+
+
+def make_vec(mode: str = "vector_entry_point", **options):
+    return gymnasium.make_vec(ID, num_envs=2, vectorization_mode=mode, world=WORLD, **options)
+
+
+def assert_like(one, other) -> None:
+    """Like `data_equivalence`, for what a batch of one and a batch of two compute; names what differs."""
+    assert type(one) is type(other)
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for name in one:
+            assert_like(one[name], other[name])
+    elif isinstance(one, np.ndarray) and one.dtype != object:
+        np.testing.assert_allclose(one, other, atol=2e-3)
+        assert one.dtype == other.dtype
+    else:
+        assert data_equivalence(one, other)
+
+
+@pytest.mark.parametrize("observation", ["state", "depth"])
+def test_gymnasiums_own_check_has_nothing_to_say(observation):
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        check_env(gymnasium.make(ID, world=WORLD, observation=observation).unwrapped)
+    assert [str(w.message) for w in said if "WARN" in str(w.message)] == []
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_an_environment_of_many_does_what_a_single_one_does(mode):
+    """The pretrained teacher grasps in both, through an episode's end and into the next."""
+    ours = make_vec(autoreset_mode=mode)
+    singles = make_vec("sync", vector_kwargs={"autoreset_mode": mode})
+    assert (ours.observation_space, ours.action_space) == (singles.observation_space, singles.action_space)
+    assert ours.metadata["autoreset_mode"] is mode
+    teacher = policy.load(ROOT / "pretrained")
+    seen, info = ours.reset(seed=5)
+    for mine, theirs in zip((seen, info), singles.reset(seed=5), strict=True):
+        assert_like(mine, theirs)
+    ended = []
+    for _ in range(62):
+        action = teacher(seen).astype(np.float32)
+        seen, reward, terminated, truncated, info = made = ours.step(action)
+        for mine, theirs in zip(made, singles.step(action), strict=True):
+            assert_like(mine, theirs)
+        assert seen in ours.observation_space and not terminated.any()
+        ended.append(truncated.all())
+    assert np.flatnonzero(ended).tolist() == [59]
+
+
+def test_success_is_what_the_teachers_episodes_end_with():
+    env, teacher = make_vec(), policy.load(ROOT / "pretrained")
+    seen, info = env.reset(seed=5)
+    for step in range(60):
+        assert not info["success"].any(), step
+        seen, *_, truncated, info = env.step(teacher(seen).astype(np.float32))
+    assert truncated.all() and info["success"].all()
+
+
+def test_an_object_knocked_off_the_table_ends_the_episode():
+    """Thrown away by the physics' state itself: nothing an arm does is as sure."""
+    env = gymnasium.make(ID, world=WORLD).unwrapped
+    env.reset(seed=0)
+    state = env._scenes.state
+    away = state.data.replace(qpos=state.data.qpos.at[:, 9].set(1.5))
+    env._scenes = env._scenes.replace(state=state.replace(data=away))
+    *_, terminated, truncated, info = env.step(np.zeros(8, np.float32))
+    assert (terminated, truncated, info["success"]) == (True, False, False)
+
+
+def test_without_autoreset_chosen_environments_begin_anew():
+    env = make_vec(autoreset_mode="Disabled")
+    before, _ = env.reset(seed=[3, None])
+    again, _ = env.reset(seed=[3, 4], options={"reset_mask": np.array([True, False])})
+    np.testing.assert_array_equal(again, before)
+    other, _ = env.reset(options={"reset_mask": np.array([False, True])})
+    np.testing.assert_array_equal(other[0], before[0])
+    assert not np.array_equal(other[1], before[1])
+    env.unwrapped._over[:] = True
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset_mask"):
+        env.step(np.zeros((2, 8), np.float32))
+
+
+def test_the_depth_picture_is_the_window_of_the_cameras():
+    env = make_vec(observation="depth")
+    seen, _ = env.reset(seed=0)
+    simulator, scenes = env.unwrapped._simulator, env.unwrapped._scenes
+    profile = WORLD.profile
+    row, column = profile.crop_origin_px
+    window = np.s_[:, row : row + profile.crop_height_px, column : column + profile.crop_width_px]
+    whole = np.asarray(simulator._viewer.depth_mm(simulator._geoms(scenes), scenes.T_world_cam))[window]
+    near = np.abs(1000 * seen["depth"] - whole) < 1
+    assert seen["depth"].dtype == np.float32 and near.mean() > 0.999
+    width = seen["state"][:, 7]
+    np.testing.assert_allclose(width, 0.08, atol=1e-3)  # the gripper is open
+    assert not np.array_equal(scenes.T_world_cam[0], scenes.T_world_cam[1])  # each has its own camera
+
+
+def test_wrong_options_are_refused():
+    with pytest.raises(UserError, match="observation 'dept'.*Did you mean 'depth'"):
+        gymnasium.make(ID, observation="dept")
+    with pytest.raises(UserError, match="num_envs is 0"):
+        gymnasium.make_vec(ID, num_envs=0)
+    with pytest.raises(UserError, match="3 seeds"):
+        make_vec().reset(seed=[1, 2, 3])
+
+
+def test_the_documented_code_runs(capsys):
+    page = (ROOT / "docs" / "environment.md").read_text().split("## Gymnasium")[1].split("\n## ")[0]
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, {})
+    assert capsys.readouterr().out.splitlines()[0] == "(40,) {'success': False, 'object': 'apple'}"
