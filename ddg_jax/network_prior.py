@@ -118,7 +118,8 @@ def metric_depth(
     1 / d = a relative + b by least squares over the valid pixels (Ranftl et al. 2020, eq. 4), d <= `far_m`.
 
     Args:
-      relative, depth_m: of one shape; depth 0 = invalid. UserError if fewer than two pixels are valid.
+      relative: relative inverse depth.
+      depth_m: measured depth of the same shape, 0 = invalid. UserError if fewer than two pixels are valid.
     """
     valid = depth_m > 0
     if np.count_nonzero(valid) < 2:

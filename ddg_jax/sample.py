@@ -49,8 +49,9 @@ class Generator:
         """The generator in a finished `ddg` stage directory; UserError if there is none.
 
         Args:
-          sampler, steps: instead of those it was made with. Sampler progressive with any number of steps to
-            which the stage distilled on its way.
+          sampler: instead of the one it was made with.
+          steps: the same for network evaluations per map; for sampler progressive a number to which the stage
+            distilled on its way.
         """
         directory = Path(directory)
         manifest = artifacts.read_manifest(directory)

@@ -57,7 +57,7 @@ class SelfAttention(nn.Module):
 class UNet(nn.Module):
     """Maps x_k and the prior c to the clean map; `ddg_jax/train.py` turns it into the noise.
 
-    Args:
+    Attributes:
       widths: channels per level; every level halves the one before in height and width.
       blocks: residual blocks per level, in the encoder and again in the decoder.
       heads: attention heads in the middle (0: no attention).

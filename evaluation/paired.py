@@ -13,7 +13,8 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
     P. Laake, "The McNemar test for binary matched-pairs data", BMC Medical Research Methodology 13:91 (2013).
 
     Args:
-      only_first, only_second: b and c, trials in which only the one or only the other succeeded.
+      only_first: b, trials in which only the one succeeded.
+      only_second: c, trials in which only the other did.
 
     Raises ValueError for negative counts.
     """

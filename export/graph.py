@@ -35,7 +35,9 @@ def build_model(
 
     Args:
         params: tree of `student_jax.policy.init_params`.
-        student, export, profile: the configuration `params` belong to.
+        student: the configuration `params` belong to.
+        export: that of the file.
+        profile: the camera's.
         metadata: what the file shall say about itself (`ddgrasp.policy_metadata.describe`).
 
     Raises:

@@ -40,7 +40,8 @@ def run_steps(
     steps that are quicker to repeat or whose draws depend on those before.
 
     Args:
-      curve, first_point: curves are named `curve` + scalar, their points `first_point` + steps done.
+      curve: curves are named `curve` + scalar.
+      first_point: their points are `first_point` + steps done.
       log_every: steps between two points; the last step has one.
       shown: scalars beside the bar.
 

@@ -46,7 +46,8 @@ def grasp_pose(
     """((3,), (4,)) top-down grasp: pads close along the object's local y axis.
 
     Args:
-      object_pos, object_quat: object pose in the world.
+      object_pos: the object's position in the world.
+      object_quat: its orientation there.
       symmetry: equivalent yaws per turn; 0 = any, then the hand keeps yaw 0.
       branch: from `yaw_branch`.
       offset_m: (3,) from the object's origin to the grasp, object frame.

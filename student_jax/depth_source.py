@@ -68,7 +68,8 @@ class DepthSource(Protocol):
         Args:
           depth_mm: (B, H, W) uint16, clean.
           rgb: (B, H, W, 3) uint8, where `needs_rgb`.
-          episode, frame: (B,) their numbers.
+          episode: (B,) number of each frame's episode.
+          frame: (B,) its number within that.
         """
         ...
 

@@ -1,4 +1,7 @@
-"""The whole flow at its smallest: killed in every stage, resumed, reported. No quality is claimed."""
+"""The whole flow at its smallest: killed in every stage, resumed, reported. No quality is claimed.
+
+The commands, and the code at the end, are those of docs/tutorials/.
+"""
 
 import json
 import signal
@@ -7,11 +10,13 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from app import pipeline
 from ddgrasp import artifacts
 from ddgrasp.presets import PRESETS
+from tutorial_support import code, moved, small
 
 ROOT = Path(__file__).parents[1]
 TIMEOUT_S = 600.0
@@ -19,8 +24,14 @@ KILL_AFTER_S = 1.0
 
 
 def _start(out: Path) -> subprocess.Popen:
-    command = [sys.executable, "-m", "app.cli", "run", "--preset", "debug", "--out", str(out), "--resume"]
+    run, _ = small("reproduce.md")
+    command = [sys.executable, "-m", "app.cli", *moved(run, {"runs/small": out}), "--resume"]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _given(command: list[str]) -> subprocess.CompletedProcess:
+    args = [sys.executable, "-m", "app.cli", *command]
+    return subprocess.run(args, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
 
 
 def _manifests(out: Path) -> dict[str, bytes]:
@@ -112,15 +123,9 @@ def test_table_2_of_two_rows_from_the_run_s_own_parts(finished, tmp_path):
     out.mkdir()
     (out / "shared").symlink_to(finished[0], target_is_directory=True)
     before = _manifests(finished[0])
-    chosen = ("--rows", "sim_gt", "inpaint", "--objects", "cube", "--trials", "2", "--workers", "1")
-    chosen += ("--student.dagger.rounds", "0")
-    command = [sys.executable, "-m", "app.cli", "study", "table2", "--preset", "debug", "--out", str(out)]
-
-    def run() -> subprocess.CompletedProcess:
-        args = [*command, *chosen, "--resume"]
-        return subprocess.run(args, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
-
-    made = run()
+    _, command = small("reproduce.md")
+    command = moved(command, {"runs/small-table2": out})
+    made = _given(command)
     assert made.returncode == 0, made.stderr[-3000:]
     assert "Inpaint" in made.stdout and "Table II" in made.stdout
     assert _manifests(finished[0]) == before
@@ -137,4 +142,42 @@ def test_table_2_of_two_rows_from_the_run_s_own_parts(finished, tmp_path):
         assert (out / name).stat().st_size > 0
     trials = (out / "trials").rglob("trials.jsonl")
     kept = {path: path.read_text() for path in trials}
-    assert run().returncode == 0 and all(path.read_text() == text for path, text in kept.items())
+    assert _given(command).returncode == 0
+    assert all(path.read_text() == text for path, text in kept.items())
+
+
+def test_the_tutorial_s_generator_is_drawn(finished, tmp_path):
+    """The run's own one: fitting on a folder is `tests/test_ddg_stage.py`'s."""
+    _, sample = small("your_camera.md")
+    places = {
+        "runs/small": finished[0],
+        "runs/small-room": tmp_path,
+        "runs/small-room/ddg": finished[0] / "ddg",
+    }
+    done = _given(moved(sample, places))
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert (tmp_path / "samples.png").stat().st_size > 0
+
+
+def test_the_tutorial_s_code_takes_another_simulator_s_depth(finished):
+    names: dict = {}
+    for block in code("your_simulator.md"):
+        exec(block.replace("pretrained/ddg", str(finished[0] / "ddg")), names)
+    clean_m, reported_m, one_m = names["clean_m"], names["reported_m"], names["one_m"]
+    assert reported_m.shape == clean_m.shape and one_m.shape == clean_m[0].shape
+    np.testing.assert_array_equal(names["noisy"](clean_m, episode=0), reported_m)
+    for noisy_m in (reported_m, np.asarray(one_m)):
+        assert np.isfinite(noisy_m).all() and (noisy_m >= 0).all()
+
+
+def test_the_tutorial_s_policy_answers_on_a_rig_and_in_a_loop_of_ones_own(finished, tmp_path):
+    out = finished[0]
+    (command,) = small("your_robot.md")
+    done = _given(moved(command, {"runs/small": out, "runs/small-deployments": tmp_path}))
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert [path.name for path in tmp_path.rglob("report.json")] == ["report.json"]
+    (block,) = code("your_robot.md")
+    names: dict = {}
+    exec(block.replace("runs/demo", str(out)), names)
+    assert names["action"].shape == (8,) and (abs(names["action"]) <= 1).all()
+    assert (abs(names["target_rad"] - names["joints_rad"]) <= 0.1 + 1e-6).all()

@@ -25,7 +25,8 @@ def fid(x: Features, y: Others) -> float:
     where covariances are singular. Rounding may leave the distance of equal sets slightly below 0.
 
     Args:
-      x, y: (n, d) and (m, d), two rows or more each.
+      x: (n, d), two rows or more.
+      y: (m, d), two rows or more.
     """
     _check(x, y)
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)

@@ -168,7 +168,7 @@ HIT: dict[str, Hit] = {
     "box": hit_box,
     "cylinder": hit_cylinder,
 }
-"""t (inf for a miss) = HIT[type](xp, origin, direction, size)."""
+"""`t = HIT[type](xp, origin, direction, size)`, inf for a miss."""
 
 NORMAL: dict[str, Normal] = {
     "plane": normal_plane,
@@ -177,4 +177,4 @@ NORMAL: dict[str, Normal] = {
     "box": normal_box,
     "cylinder": normal_cylinder,
 }
-"""Unit normal = NORMAL[type](xp, point on the surface, size)."""
+"""Unit normal: `NORMAL[type](xp, point on the surface, size)`."""

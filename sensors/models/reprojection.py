@@ -32,7 +32,8 @@ def from_beside(
     Args:
         depth_m: (H, W) planar metres, 0 = nothing there.
         rgb: (H, W, 3) in [0, 1].
-        profile, T_world_cam: the camera that took it.
+        profile: the camera that took it.
+        T_world_cam: its pose.
     """
     inverse = 1.0 / np.where(depth_m > 0, depth_m, NOTHING_M).astype(np.float32)
     normal_w = (_normals(inverse, profile) @ T_world_cam[:3, :3].T).astype(np.float32)

@@ -1,0 +1,67 @@
+"""Every command that a page shows is one that the command line takes."""
+
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from app.commands import COMMANDS, parse
+from ddgrasp.errors import UserError
+
+ROOT = Path(__file__).parents[1]
+FILES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "pretrained" / "README.md")
+PAGES = sorted(str(page.relative_to(ROOT)) for page in (*FILES, *(ROOT / "docs").rglob("*.md")))
+_INCOMPLETE = ("required", "Missing value", "expected 1 argument", "not enough")
+"""What the parser says of a command in running text that names only the options it is about."""
+
+
+def shown(page: str) -> tuple[list[str], list[str]]:
+    """(commands in fenced blocks, commands in running text) of a page, without `ddgrasp`."""
+    text = (ROOT / page).read_text()
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    fenced = [match[1] for line in lines if (match := re.search(r"(?:^|\s|/)ddgrasp (.*)", line))]
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    return fenced, re.findall(r"`(?:\.venv/bin/)?ddgrasp ([^`]*)`", prose)
+
+
+def named(words: list[str]) -> str:
+    """The command that `words` begin with; empty if none does."""
+    names = (" ".join(words[:length]) for length in (2, 1) if length <= len(words))
+    return next((name for name in names if name in COMMANDS), "")
+
+
+@cache
+def refusal(command: str) -> str:
+    """Why the command line does not take `command`; empty if it does."""
+    words = [word for word in shlex.split(command, comments=True) if word != "..."]
+    if words in (["--help"], ["--version"], *([name.split()[0]] for name in COMMANDS)):
+        return ""  # the last ones are groups: `ddgrasp teacher` lists its commands
+    if not (name := named(words)):
+        return f"unknown command {command!r}"
+    try:
+        parse(name, words[len(name.split()) :])
+    except UserError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_on_a_page_can_be_given(page: str):
+    fenced, prose = shown(page)
+    wrong = {command: why for command in fenced if (why := refusal(command))}
+    for command in prose:
+        only_named = "--" not in command and named(command.split())
+        why = "" if only_named else refusal(command)
+        if why and not any(words in why for words in _INCOMPLETE):
+            wrong[command] = why
+    assert wrong == {}
+
+
+def test_a_command_that_does_not_exist_is_found():
+    assert "unknown command" in refusal("ddg paint")
+    assert "--bogus" in refusal("run --bogus 3")
+    assert "Unknown preset" in refusal("run --preset huge")
+    assert refusal("run --preset debug --out runs/x  # a comment") == ""
