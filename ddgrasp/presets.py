@@ -32,7 +32,7 @@ from ddgrasp.config import (
 from ddgrasp.errors import unknown_name
 
 _DEBUG_DDG = DDGConfig(
-    depth=DDGDepthConfig(height_px=90, width_px=160),
+    depth=DDGDepthConfig(height_px=45, width_px=80),
     unet=UNetConfig(widths=(16, 24), blocks=(0, 1), attention_heads=2),
     training=DDGTrainingConfig(steps=20, batch_size=4, checkpoint_every=10),
     sampling=SamplingConfig(steps=2, batch_size=4),
@@ -45,7 +45,7 @@ _PAPER_DDG = DDGConfig(
 
 DEBUG = Config(
     preset="debug",
-    world=WorldConfig(episode_steps=45),
+    world=WorldConfig(episode_steps=45, camera_scale=0.125),
     teacher=TeacherConfig(
         start="pretrained/teacher",
         total_steps=160,
@@ -62,12 +62,13 @@ DEBUG = Config(
     record=RecordConfig(trajectories=2, frames=12),
     ddg=_DEBUG_DDG,
     student=StudentConfig(
+        picture=PictureConfig(height_px=56, width_px=72),
         encoder=EncoderConfig(width=8, keypoints=8),
         hand_view=HandViewConfig(size_px=16, pitch_m=0.008, width=8, blocks=1),
         head=HeadConfig(width=32, blocks=1, train_steps=4, batch_size=16),
         poses=PosesConfig(rounds=1, episodes=4, steps=10),
         training=StudentTrainingConfig(steps=4, batch_size=4),
-        dagger=DaggerConfig(rounds=1, episodes=2, steps=2),
+        dagger=DaggerConfig(rounds=1, episodes=2, steps=4),
     ),
     export=ExportConfig(parity_batches=4, latency_runs=20),
     deploy=DeployConfig(realtime_trials=1),

@@ -79,14 +79,13 @@ def noisy_store(directory: Path) -> EpisodeStore:
 def job(run: Path, out: Path, *extra: str, devices: int = 1) -> subprocess.Popen:
     command = [sys.executable, "-m", "app.cli", "ddg", "generate", "--out", str(out), "--seed", "3"]
     command += ["--model", str(run / "ddg"), "--demos", str(run / "demos"), *extra]
-    flags = f"--xla_force_host_platform_device_count={devices}"
     return subprocess.Popen(
         command,
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        env={**os.environ, "JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu"},
     )
 
 
@@ -195,7 +194,7 @@ c = np.random.default_rng(0).normal(size=(37, 16, 24)).astype(np.float32)
 x = sample.predict(jax.random.key(0), generator, c, episode=np.arange(37) // 4)
 np.save({str(tmp_path / "x.npy")!r}, x)
 """
-    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=8"}
+    environment = {**os.environ, "JAX_NUM_CPU_DEVICES": "8"}
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, check=True)
     c = np.random.default_rng(0).normal(size=(37, 16, 24)).astype(np.float32)
     x = sample.predict(jax.random.key(0), sample.Generator.load(run / "ddg"), c, episode=np.arange(37) // 4)

@@ -29,7 +29,7 @@ ABSOLUTE_WARMSTART = 0.05
 def _start(*command: str, devices: int = 1) -> subprocess.Popen:
     """`command` on so many CPU devices."""
     env = os.environ | {
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "JAX_NUM_CPU_DEVICES": str(devices),
         "JAX_PLATFORMS": "cpu",
         "PYTHONPATH": str(ROOT),
     }
