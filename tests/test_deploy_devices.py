@@ -190,7 +190,8 @@ def test_wrong_combination_gets_one_line(options, message):
 
 def test_every_pair_is_refused_or_can_be_made(recording):
     preset = get_preset("debug")
-    info = describe(depth_height=180, depth_width=320)
+    shape = (preset.world.profile.height_px, preset.world.profile.width_px)
+    info = describe(depth_height=shape[0], depth_width=shape[1])
     made, refused = {}, set()
     for robot in registry.ROBOTS:
         for camera in registry.CAMERAS:
@@ -215,7 +216,7 @@ def test_every_pair_is_refused_or_can_be_made(recording):
     }
     robot, camera = made["sim", "stereo"]
     camera.start()
-    assert camera.read().depth.shape == (180, 320) and robot.read_state().q_rad.shape == (7,)
+    assert camera.read().depth.shape == shape and robot.read_state().q_rad.shape == (7,)
     metres = Setup(preset, SessionOptions(camera="realsense"), describe("float32_m"), SimClock())
     with pytest.raises(UserError, match="the policy takes float32_m: export it"):
         registry.make_devices(metres)

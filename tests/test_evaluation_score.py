@@ -173,7 +173,7 @@ def test_a_real_cameras_recordings_are_fitted_and_scored(tmp_path, capsys):
     command += ["--fit-frames", "10", "--score-frames", "16", "--ddg.training.steps", "3"]
     assert cli.main([*command, "--resume"]) == 0
     fitted = artifacts.read_manifest(tmp_path / "out" / "score_real" / "ddg").config["ddg"]
-    assert (fitted["depth"]["height_px"], fitted["training"]["steps"]) == (120, 3)
+    assert (fitted["depth"]["height_px"], fitted["training"]["steps"]) == (60, 3)
     result = json.loads((tmp_path / "out" / "score_real" / "score.json").read_text())
     table = result["tables"]["depthfeat-v1"]
     assert "Nobody modelled that room" in result["setting"]

