@@ -1,4 +1,4 @@
-"""PPO from nothing improves a policy: a small problem, from 1 of 64 to nearly always in 160,000 steps."""
+"""PPO from nothing improves a policy: a small problem, from 1 of 64 to nearly always in some 80,000 steps."""
 
 from dataclasses import replace
 
@@ -34,10 +34,13 @@ def test_ppo_from_nothing_learns_to_lift_and_hold():
         return evaluate(env.env, policy_of(state), TRIALS, seed=1)["success"]["successes"]
 
     before = successes()
-    for _ in range(learner.iterations(TEACHER)):
+    after, metrics = 0, {}
+    for iteration in range(1, learner.iterations(TEACHER) + 1):
         state, metrics, _ = iterate(state)
+        if iteration % 10 == 0 and (after := successes()) > 0.95 * TRIALS:
+            break  # the bound is of its steps; most of the test's time is physics
     assert before < 0.2 * TRIALS
-    assert successes() > 0.6 * TRIALS
+    assert after > 0.6 * TRIALS
     shown = {name: float(value) for name, value in metrics.items()}
     assert shown["episode/length"] == WORLD.episode_steps and shown["episode/return"] > 20.0
     assert 0.5 < shown["value/explained_variance"] <= 1.0
