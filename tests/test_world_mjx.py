@@ -38,7 +38,8 @@ def _cpu_seconds(run: Callable[[], object]) -> float:
     return min(times)
 
 
-AS_USERS = {"xla_cpu_use_fusion_emitters": True} if "fusion_emitters" in os.environ["XLA_FLAGS"] else {}
+_OLD_EMITTERS = "fusion_emitters" in os.environ.get("XLA_FLAGS", "")
+AS_USERS = {"xla_cpu_use_fusion_emitters": True} if _OLD_EMITTERS else {}
 """Options of a compilation that undo what conftest.py sets for speed."""
 
 
