@@ -22,7 +22,7 @@ from deploy.trials import Filming, Trial, TrialResult, Watch, result
 from rig.camera import camera_pose
 from rig.film import Film
 from rig.fr3 import scene
-from rig.fr3.channel import Channel
+from rig.fr3.channel import Channel, ChannelLost
 from rig.fr3.process import Fr3Rig, check_ports
 
 Shapes = Literal["mesh", "primitive"]
@@ -67,23 +67,36 @@ class Fr3Runner:
             policy_path, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None
         )
         self._config = replace(config, deploy=replace(config.deploy, clock="robot"))
-        self._rig: Fr3Rig | None = None
+        self.rig: Fr3Rig | None = None
+        """The one that runs."""
         self._name = ""
 
     def run(self, trial: Trial, watch: Watch | None = None) -> tuple[TrialResult, Film]:
         """Puts the object down where the trial says, runs the policy, and judges by where the object is.
 
-        A connection that is lost says that this machine was too busy to keep it, and nothing of the policy:
-        the trial is run again on a fresh rig. Raises UserError if it is lost `ATTEMPTS` times.
+        A connection that is lost, or a rig that has gone, says something of this machine and nothing of the
+        policy: the trial is run again on a fresh rig. Raises UserError if it is lost `ATTEMPTS` times.
         """
+        lost = ""
         for _ in range(ATTEMPTS):
-            report, success, film = self._attempt(trial, watch)
-            if not report.fault.startswith(LOST):
-                return result(trial, success, report), film
+            try:
+                report, success, film = self._attempt(trial, watch)
+                lost = report.fault
+                if not lost.startswith(LOST) and self._is_up():
+                    return result(trial, success, report), film
+            except (ChannelLost, UserError) as error:
+                if self._is_up():
+                    raise
+                lost = str(error)
             self.close()
         raise UserError(
-            f"{report.fault} ({ATTEMPTS} times): use fewer --workers, or end what else runs here."
+            f"{lost or 'the FR3 rig has gone'} ({ATTEMPTS} times): use fewer --workers, or end what else runs "
+            "here."
         )
+
+    def _is_up(self) -> bool:
+        """Whether nothing is to be said against the rig: a fault is the arm's or the policy's then."""
+        return self.rig is None or self.rig.running()
 
     def _attempt(self, trial: Trial, watch: Watch | None) -> tuple[LoopReport, bool, Film]:
         config = self._config
@@ -99,7 +112,7 @@ class Fr3Runner:
         settings = replace(config.deploy, franka=franka)
         clock = RobotClock()
         robot = _PlacingRobot(franka, clock, rig.channel, {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad})
-        clock.follow(robot.time_s)
+        clock.follow(robot)
         info = self._policy.info
         profile = contract.D455.scaled(info.depth_width / contract.D455.width_px)
         pose = camera_pose(config, rng)
@@ -115,18 +128,18 @@ class Fr3Runner:
 
     def close(self) -> None:
         """Ends the rig."""
-        if self._rig is not None:
-            self._rig.close()
-        self._rig = None
+        if self.rig is not None:
+            self.rig.close()
+        self.rig = None
 
     def _rig_with(self, name: str) -> Fr3Rig:
         """A rig with that object on its table."""
-        if self._rig is not None and self._name == name and self._rig.running():
-            return self._rig
+        if self.rig is not None and self._name == name and self.rig.running():
+            return self.rig
         self.close()
         thing = scene.meshed(name) if self._bench.shapes == "mesh" else scene.primitive(name)
-        self._rig, self._name = Fr3Rig(free_host(), thing, seed=self._config.seed), name
-        return self._rig.__enter__()
+        self.rig, self._name = Fr3Rig(free_host(), thing, seed=self._config.seed), name
+        return self.rig.__enter__()
 
     def _sense(self, profile: contract.CameraProfile, clock: RobotClock, rng: np.random.Generator):
         if self._bench.sight == "ideal":

@@ -127,7 +127,7 @@ def keep_time_of(robot: Robot, clock: Clock, options: SessionOptions) -> None:
         return
     if not isinstance(robot, TimedRobot):
         raise UserError(f"robot {options.robot!r} has no clock of its own: set deploy.clock machine.")
-    clock.follow(robot.time_s)
+    clock.follow(robot)
 
 
 def _new_folder(out: Path) -> Path:

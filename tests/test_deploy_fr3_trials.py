@@ -19,7 +19,7 @@ from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from deploy.clock import SimClock
 from deploy.devices import fr3_camera
-from deploy.fr3_trials import free_host
+from deploy.fr3_trials import Fr3Runner, free_host
 from deploy.trials import TrialResult
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import rig_trials
@@ -155,3 +155,25 @@ def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):
     assert again == table and (out / rig_trials.TRIALS_FILE).read_text().splitlines() == lines
     with pytest.raises(UserError, match="trials of another policy or configuration"):
         rig_trials.run(config, policy, replace(series, number=1), out, 0, Progress(quiet=True))
+
+
+def test_a_trial_whose_rig_is_killed_is_run_again(tmp_path, open_gl):
+    policy = write_policy(
+        tmp_path / "policy.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.0, -1.0)
+    )
+    series = Series(objects=("cube",), trials=1, shapes="primitive", camera="ideal", seconds=0.5)
+    runner = series.make(get_preset("debug"))(series.configured(get_preset("debug"), policy), policy)
+    assert isinstance(runner, Fr3Runner)
+    killed = []
+
+    def kill_once(step, camera):
+        if step.index == 2 and not killed:
+            assert runner.rig is not None
+            killed.append(runner.rig.pid)
+            runner.rig.kill()
+
+    try:
+        result, _ = runner.run(series.plan()[0], kill_once)
+    finally:
+        runner.close()
+    assert len(killed) == 1 and (result.steps, result.events, result.success) == (5, [], False)
