@@ -19,7 +19,8 @@ from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from deploy.clock import SimClock
 from deploy.devices import fr3_camera
-from deploy.fr3_trials import Fr3Runner, free_host
+from deploy.fr3_lab import free_host
+from deploy.fr3_trials import Fr3Runner
 from deploy.trials import TrialResult
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import rig_trials
@@ -28,7 +29,7 @@ from mjx_envs.camera import nominal_camera
 from mjx_envs.scene import HOME_RAD
 from rig import seeds
 from rig.fr3 import scene
-from rig.fr3.picture import ScenePicture
+from rig.fr3.picture import of_scene
 from rig.fr3.process import Fr3Rig
 
 PROFILE = contract.D455.scaled(0.25)
@@ -43,7 +44,7 @@ def picture():
     sim.add_robot(initial_q=list(HOME_RAD), initial_hand_width=0.08)
     scene.furnish(sim.scene, scene.meshed("wheel"), 3)
     try:
-        made = ScenePicture(ET.tostring(sim.scene, encoding="unicode"))
+        made = of_scene(ET.tostring(sim.scene, encoding="unicode"))
         made.pose(made.model.qpos0)
         made.rgb(fr3_camera.pinhole(PROFILE, T_WORLD_CAM))
     except Exception as error:  # the back ends raise whatever their loaders do
@@ -168,9 +169,9 @@ def test_a_trial_whose_rig_is_killed_is_run_again(tmp_path, open_gl):
 
     def kill_once(step, camera):
         if step.index == 2 and not killed:
-            assert runner.rig is not None
-            killed.append(runner.rig.pid)
-            runner.rig.kill()
+            assert runner.lab.rig is not None
+            killed.append(runner.lab.rig.pid)
+            runner.lab.rig.kill()
 
     try:
         result, _ = runner.run(series.plan()[0], kill_once)

@@ -24,7 +24,7 @@ from app.commands.play import Play
 from app.commands.rig import RigFr3
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentPerception, StudentTrain, config_of
-from app.commands.study import StudyTable2
+from app.commands.study import StudyCauses, StudyTable2
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
 from app.commands.trials import DeployTrials
 from ddgrasp.config import Config
@@ -77,6 +77,7 @@ COMMANDS: dict[str, type] = {
     "calibrate": Calibrate,
     "calibrate board": CalibrateBoard,
     "study table2": StudyTable2,
+    "study causes": StudyCauses,
     "rig fr3": RigFr3,
     "weights convert": WeightsConvert,
     "weights list": WeightsList,
