@@ -52,7 +52,7 @@ class Fr3Bench:
 
 
 @dataclass(frozen=True)
-class _Draw:
+class PlacedDraw:
     """What chance decides about a trial."""
 
     place: dict[str, float]
@@ -91,7 +91,7 @@ class Fr3Runner:
 
     def _attempt(self, trial: Trial, watch: Watch | None) -> tuple[LoopReport, bool, Film]:
         """Raises RobotError if the connection is lost; any other fault is in the report."""
-        config, draw = self._config, self._draw(trial)
+        config, draw = self._config, self.draw(trial)
         rig = self.lab.with_object(trial.object_name, config.seed)
         self._policy.reset(draw.policy_seed)
         settings = lab_config(config.deploy, rig.host, self._bench.contact)
@@ -112,14 +112,15 @@ class Fr3Runner:
             raise RobotError(report.fault)
         return report, camera.success() and not report.fault, filming.film()
 
-    def _draw(self, trial: Trial) -> _Draw:
+    def draw(self, trial: Trial) -> PlacedDraw:
+        """What chance decides about `trial`."""
         if self._bench.paired:
             return _as_in_development(self._config, trial)
         rng = np.random.default_rng([self._config.seed, _STREAM, trial.index])
         (x_m, y_m), yaw_rad = scene.start_pose(rng)
         policy_seed = int(rng.integers(2**31))
         place = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad}
-        return _Draw(place, policy_seed, camera_pose(self._config, rng), rng)
+        return PlacedDraw(place, policy_seed, camera_pose(self._config, rng), rng)
 
     def _sense(self, profile: contract.CameraProfile, clock: RobotClock, rng: np.random.Generator):
         if self._bench.sight == "ideal":
@@ -128,7 +129,7 @@ class Fr3Runner:
         return fr3_camera.stereo(self._config.record.stereo, profile, clock, rng, stream)
 
 
-def _as_in_development(config: Config, trial: Trial) -> _Draw:
+def _as_in_development(config: Config, trial: Trial) -> PlacedDraw:
     """Where the development rig's trial of the same number has everything."""
     from rig.world import make_world
 
@@ -138,4 +139,4 @@ def _as_in_development(config: Config, trial: Trial) -> _Draw:
     x_m, y_m, _ = (float(m) for m in world.data.qpos[QPOS.object_pos])
     yaw_rad = float(yaw_of(world.data.qpos[QPOS.object_quat]))
     place = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad}
-    return _Draw(place, draw.policy_seed, draw.T_world_cam, draw.rng)
+    return PlacedDraw(place, draw.policy_seed, draw.T_world_cam, draw.rng)

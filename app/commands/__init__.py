@@ -17,7 +17,7 @@ from app.commands.base import DEFAULT_PRESET, Command, FromPreset
 from app.commands.calibrate import Calibrate, CalibrateBoard
 from app.commands.checks import check_config_values, check_devices, check_memory, check_options
 from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
-from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
+from app.commands.depth import DemosCollect, Record, RecordFr3, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
 from app.commands.parsing import HELP_ALL, parsed
 from app.commands.play import Play
@@ -59,6 +59,7 @@ COMMANDS: dict[str, type] = {
     "record": Record,
     "record import": RecordImport,
     "record realsense": RecordRealsense,
+    "record fr3": RecordFr3,
     "ddg fit": DDGFit,
     "ddg sample": DDGSample,
     "ddg score": DDGScore,
