@@ -21,7 +21,7 @@ from app.commands.depth import DemosCollect, Record, RecordFr3, RecordImport, Re
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
 from app.commands.parsing import HELP_ALL, parsed
 from app.commands.play import Play
-from app.commands.rig import RigFr3
+from app.commands.rig import RigFr3, RigPictures
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentPerception, StudentTrain, config_of
 from app.commands.study import StudyCauses, StudyTable2
@@ -80,6 +80,7 @@ COMMANDS: dict[str, type] = {
     "study table2": StudyTable2,
     "study causes": StudyCauses,
     "rig fr3": RigFr3,
+    "rig pictures": RigPictures,
     "weights convert": WeightsConvert,
     "weights list": WeightsList,
     "report": Report,
