@@ -173,6 +173,7 @@ def describe(report: LoopReport) -> str:
     return "\n".join([
         *rows,
         f"{report.steps} steps, {report.timings.missed_deadlines} missed deadlines, {report.holds} holds",
+        f"{report.clock_s:.1f} s on the loop's clock took {report.machine_s:.1f} s of this machine's time",
         f"safety filter: {safety}",
         *([f"ended by: {report.fault}"] if report.fault else []),
     ])  # fmt: skip
