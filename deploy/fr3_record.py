@@ -107,7 +107,7 @@ class _Draw:
 
     clutter_seed: int
     place: dict[str, float]
-    """Of the object: x_m, y_m, yaw_rad."""
+    """Where the object is put: x_m, y_m, yaw_rad."""
     T_world_cam: Float[np.ndarray, "4 4"]
     rng: np.random.Generator
     """Draws the way and the camera's noise."""

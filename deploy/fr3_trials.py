@@ -56,7 +56,7 @@ class PlacedDraw:
     """What chance decides about a trial."""
 
     place: dict[str, float]
-    """Of the object: x_m, y_m, yaw_rad."""
+    """Where the object is put: x_m, y_m, yaw_rad."""
     policy_seed: int
     T_world_cam: Float[np.ndarray, "4 4"]
     rng: np.random.Generator
