@@ -14,7 +14,9 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from ddgrasp.progress import Progress
-from deploy.fr3_trials import Fr3Bench, Shapes, Sight
+from deploy.changes import Change
+from deploy.fr3_lab import Shapes
+from deploy.fr3_trials import Fr3Bench, Sight
 from deploy.recorded import RecordedBench
 from deploy.stage import STAGE
 from deploy.trial_log import TrialLog
@@ -90,7 +92,8 @@ class Series:
         treatment = make_treatment(self.depth, config)
         if self.rig == "fr3":
             return Fr3Bench(self.shapes, self.camera, self.contact, treatment)
-        return partial(Rig, ideal=self.camera == "ideal", treatment=treatment)
+        change = Change(sight="ideal" if self.camera == "ideal" else "stereo")
+        return partial(Rig, change=change, treatment=treatment)
 
     def _known(self) -> tuple[str, ...]:
         if self.rig == "development" or self.shapes == "primitive":
@@ -109,12 +112,28 @@ def run(
     Leaves trials.jsonl, table.json and films in `out`: each object's first success, its first `failures`;
     with `record` a folder in `EPISODES` for every trial, as a deployment leaves it.
     """
-    config, trials = series.configured(config, policy), series.plan()
-    out.mkdir(parents=True, exist_ok=True)
-    log = TrialLog(out / TRIALS_FILE, _header(config, policy, series))
-    make = series.make(config)
+    config = series.configured(config, policy)
+    header, make = _header(config, policy, series), series.make(config)
     if record:
         make = RecordedBench(make, out / EPISODES, {"robot": f"rig {series.rig}", "camera": series.camera})
+    results = run_missing(config, policy, series.plan(), make, header, out, workers, progress, failures)
+    table = tabulate(results)
+    atomic_write_text(out / TABLE_FILE, json.dumps({"series": asdict(series), **table}, indent=1) + "\n")
+    return table
+
+
+def run_missing(
+    config: Config, policy: Path, trials: Sequence[Trial], make: Callable[[Config, Path], Bench],
+    header: dict[str, Any], out: Path, workers: int, progress: Progress, failures: float = math.inf,
+) -> list[TrialResult]:  # fmt: skip
+    """Results of `trials` in their order; those that `out` has are not run again. Films as in `run`.
+
+    Args:
+      make: what makes a bench in every worker.
+      header: what the trials belong to. UserError if `out` has trials of something else.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    log = TrialLog(out / TRIALS_FILE, header)
     todo = [trial for trial in trials if (trial.index, False) not in log.results]
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(trials) - len(todo))
@@ -125,9 +144,7 @@ def run(
             if film.steps and shown < (1 if result.success else failures):
                 _keep(out, result, film)
             task.advance(success=sum(r.success for r in log.results.values()) / len(log.results))
-    table = tabulate([log.results[trial.index, False] for trial in trials])
-    atomic_write_text(out / TABLE_FILE, json.dumps({"series": asdict(series), **table}, indent=1) + "\n")
-    return table
+    return [log.results[trial.index, False] for trial in trials]
 
 
 def _keep(out: Path, result: TrialResult, film: Film) -> None:
@@ -177,8 +194,12 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     """What the trials belong to; how many of which objects may grow."""
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
+    return made_with(config, policy) | bench
+
+
+def made_with(config: Config, policy: Path) -> dict[str, str]:
+    """Policy and configuration in the header of a log of trials."""
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),
-        **bench,
     }

@@ -17,6 +17,7 @@ from mjx_envs.camera import Camera as Pinhole
 if TYPE_CHECKING:
     from rig.fr3.channel import Channel
     from rig.fr3.picture import ScenePicture
+    from sensors.models.active_stereo import ActiveStereo
 
 Pose = Float[np.ndarray, "4 4"]
 RIG_SCALE = 0.25
@@ -48,17 +49,22 @@ def stereo(
 
     `profile` is the policy's picture.
     """
-    from sensors.models.active_stereo import ActiveStereo
     from sensors.models.materials import rig_materials
 
-    windows = stream.fx_px / contract.D455.scaled(RIG_SCALE).fx_px
-    camera, driver = ActiveStereo(config, stream, windows), RealSenseCamera(clock, profile, stream=stream)
+    camera, driver = stream_stereo(config, stream), RealSenseCamera(clock, profile, stream=stream)
 
     def sense(picture: "ScenePicture", T_world_cam: Pose, name: str) -> Depth:
         materials = rig_materials(picture.model, name)
         return driver.convert(camera.sense(picture.buffers, T_world_cam, rng, materials, picture.depth_m))
 
     return sense
+
+
+def stream_stereo(config: StereoConfig, stream: contract.CameraProfile) -> "ActiveStereo":
+    """The matcher for pictures of `stream`: its windows cover as much of a surface as at `RIG_SCALE`."""
+    from sensors.models.active_stereo import ActiveStereo
+
+    return ActiveStereo(config, stream, stream.fx_px / contract.D455.scaled(RIG_SCALE).fx_px)
 
 
 def ideal(profile: contract.CameraProfile) -> Sense:
@@ -97,11 +103,11 @@ class Fr3Camera:
     def start(self) -> None:
         """Connect and build the scene. Raises UserError if no rig runs at the host."""
         from rig.fr3.channel import Channel
-        from rig.fr3.picture import ScenePicture
+        from rig.fr3.picture import of_scene
 
         self._channel = Channel(self._host)
         scene = self._channel.ask("scene")
-        self._picture, self._object = ScenePicture(scene["xml"]), scene["object"]
+        self._picture, self._object = of_scene(scene["xml"]), scene["object"]
 
     def read(self) -> Frame:
         """The scene as it is now. Raises CameraError if the rig does not answer."""
