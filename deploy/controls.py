@@ -2,8 +2,8 @@
 
 import queue
 import threading
-from collections.abc import Callable, Sequence
-from typing import Literal, TextIO, get_args
+from collections.abc import Callable, Iterable, Sequence
+from typing import Literal, get_args
 
 from ddgrasp.errors import UserError, unknown_name
 
@@ -77,11 +77,11 @@ class Controls:
         self._asked.put(word)
         return f"next: {word}"
 
-    def listen(self, lines: TextIO, say: Callable[[str], None]) -> None:
+    def listen(self, lines: Iterable[str], say: Callable[[str], None]) -> None:
         """Obeys every line of `lines`, in a thread that goes with the process."""
         threading.Thread(target=self._obey, args=(lines, say), daemon=True).start()
 
-    def _obey(self, lines: TextIO, say: Callable[[str], None]) -> None:
+    def _obey(self, lines: Iterable[str], say: Callable[[str], None]) -> None:
         for text in lines:
             if not text.strip():
                 continue

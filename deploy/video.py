@@ -19,11 +19,11 @@ from rig.film import colored
 VIDEO_CODECS = {".mp4": "mp4v", ".webm": "VP90"}
 """By the file's ending; browsers play WebM, and mp4v only players do."""
 ANIMATION = ".webp"
-"""A moving picture, which pages show like any other: narrower, and half of the control steps."""
+"""A moving picture, which pages show like any other; half as wide as a video."""
 ENDINGS = (*VIDEO_CODECS, ANIMATION)
 PANEL_PX, ANIMATION_PANEL_PX = 640, 320
 """Width of one picture in a video, and in a moving picture."""
-ANIMATION_EVERY, ANIMATION_QUALITY = 2, 50
+ANIMATION_QUALITY = 60
 NEAR_MM, FAR_MM = 350.0, 1100.0
 """Ends of the depth pictures' colour scale."""
 VERDICT_S = 1.0
@@ -81,7 +81,9 @@ class Video:
         """See `Viewer`."""
         return True
 
-    def _panel(self, caption: str, picture: Picture, exact: bool = True) -> Picture:
+    def _panel(
+        self, caption: str, picture: UInt8[np.ndarray, "H W 3"], exact: bool = True
+    ) -> UInt8[np.ndarray, "h w 3"]:
         height, width = picture.shape[:2]
         size = self._width_px, 2 * round(self._width_px * height / width / 2)
         how = self._cv2.INTER_NEAREST if exact else self._cv2.INTER_CUBIC
@@ -136,19 +138,17 @@ class _Animation:
     """Pictures wait for the end."""
 
     def __init__(self, path: Path, width: int, height: int):
-        self._path, self._pictures, self._steps = path, [], 0
+        self._path, self._pictures = path, []
 
     def write(self, picture: Picture) -> None:
-        if self._steps % ANIMATION_EVERY == 0:
-            self._pictures.append(picture[..., ::-1].copy())
-        self._steps += 1
+        self._pictures.append(picture[..., ::-1].copy())
 
     def close(self) -> None:
         import cv2
 
         film: Any = cv2.Animation()
         film.frames = self._pictures
-        film.durations = [round(1e3 * ANIMATION_EVERY * contract.CONTROL_DT_S)] * len(self._pictures)
+        film.durations = [round(1e3 * contract.CONTROL_DT_S)] * len(self._pictures)
         quality = [cv2.IMWRITE_WEBP_QUALITY, ANIMATION_QUALITY]
         with atomic_path(self._path) as temporary:
             if not cv2.imwriteanimation(str(temporary), film, quality):

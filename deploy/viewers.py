@@ -143,7 +143,9 @@ class MujocoWindow:
     def _open(self, model: Any, data: Any) -> None:
         self.close()
         viewer = import_module("mujoco.viewer")
-        self._handle = viewer.launch_passive(model, data, key_callback=self._key, show_left_ui=False)
+        self._handle = viewer.launch_passive(
+            model, data, key_callback=self._key, show_left_ui=False, show_right_ui=False
+        )
         self._model = model
         with self._handle.lock():
             self._handle.cam.lookat[:] = _LOOK_AT_M
