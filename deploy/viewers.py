@@ -2,6 +2,7 @@
 
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -99,11 +100,9 @@ class MujocoWindow:
     """MuJoCo's passive viewer: the scene from wherever the mouse looks, no faster than it happens."""
 
     def __init__(self, key: Callable[[int], None] | None = None):
-        """`key` is told GLFW's code of every key. UserError on macOS, where the window needs mjpython."""
-        if sys.platform == "darwin" and "mjpython" not in sys.executable:
-            raise UserError(
-                "--viewer mujoco: on macOS start it as `mjpython -m app.cli play`, or choose web."
-            )
+        """`key` is told GLFW's code of every key. UserError where no window can be opened."""
+        if sys.platform == "linux" and not _can_open():
+            raise UserError("--viewer mujoco: no window can be opened on this display: choose web, or film.")
         self._key = key
         self._handle: Any = None
         self._model: Any = None
@@ -143,9 +142,12 @@ class MujocoWindow:
     def _open(self, model: Any, data: Any) -> None:
         self.close()
         viewer = import_module("mujoco.viewer")
-        self._handle = viewer.launch_passive(
-            model, data, key_callback=self._key, show_left_ui=False, show_right_ui=False
-        )
+        try:
+            self._handle = viewer.launch_passive(
+                model, data, key_callback=self._key, show_left_ui=False, show_right_ui=False
+            )
+        except RuntimeError as error:  # on macOS it wants mjpython
+            raise UserError(f"--viewer mujoco: {error}: choose web.") from error
         self._model = model
         with self._handle.lock():
             self._handle.cam.lookat[:] = _LOOK_AT_M
@@ -155,6 +157,13 @@ class MujocoWindow:
         now_s = time.monotonic()
         time.sleep(max(0.0, self._next_s - now_s))
         self._next_s = max(now_s, self._next_s) + contract.CONTROL_DT_S
+
+
+def _can_open() -> bool:
+    """MuJoCo ends the whole process where GLFW cannot start."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return bool(import_module("glfw").init())
 
 
 _LOOK_AT_M, _FROM = (0.4, 0.0, 0.25), (1.6, 140.0, -20.0)

@@ -1,6 +1,7 @@
 """Watching a policy: films that OpenCV reads back, Rerun's absence, the command at its shortest."""
 
 import os
+import subprocess
 import sys
 import time
 
@@ -173,9 +174,19 @@ def test_mujoco_s_window_shows_the_rig_until_it_is_closed():
     window.look(_step(5, 500), camera)
 
 
+@pytest.mark.skipif(not os.environ.get("DISPLAY"), reason="no display: MuJoCo's window needs one")
 def test_a_camera_without_a_scene_has_no_window():
     with pytest.raises(UserError, match="shows rigs alone"):
         MujocoWindow().look(_step(0, 500), _RedCamera())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="displays with a number are X11's")
+def test_a_display_that_is_not_there_is_named_before_the_policy_is_loaded():
+    command = [sys.executable, "-m", "app.cli", "play", "--viewer", "mujoco"]
+    environment = os.environ | {"DISPLAY": ":9731"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=STUDENT.parents[1])
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines()[-1].endswith("on this display: choose web, or film.")
 
 
 def test_without_a_display_a_window_is_refused_before_anything_runs(monkeypatch, tmp_path):

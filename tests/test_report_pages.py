@@ -104,6 +104,11 @@ def test_trials_open_with_success_and_show_both_kinds_of_film(trials, capsys):
     assert "<td>can</td><td>0.0 % of 2" in page
 
 
+def test_a_film_cut_short_is_named(trials):
+    (trials / "cube-0-success.png").write_bytes(b"PNG")
+    assert "cube-0-success.png cannot be shown" in trials_page.write(trials_page.find(trials)).read_text()
+
+
 def test_a_missed_deadline_is_red(tmp_path):
     page = trials_page.write(trials_page.find(_trials(tmp_path / "late", [("cube", True)], missed=2)))
     assert "<p class=missed>" in page.read_text() and "2 in 3 steps" in page.read_text()

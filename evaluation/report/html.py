@@ -43,7 +43,7 @@ def page(title: str, body: Sequence[str]) -> str:
 
 
 def heading(title: str) -> str:
-    """A section's <h2>, which `contents` links to."""
+    """A section's heading, which `contents` links to."""
     return f'<h2 id="{_anchor(title)}">{escape(title)}</h2>'
 
 
@@ -66,7 +66,7 @@ def judgement(judged: Sequence[Target]) -> list[str]:
 
 
 def image(data: bytes, alt: str, kind: str = "png") -> str:
-    """An <img> with the picture in it."""
+    """An image element with the picture in it."""
     return f'<img alt="{escape(alt)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
 
 
@@ -76,7 +76,7 @@ def film(data: bytes, alt: str, kind: str = "png") -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], last_bold: bool = False) -> str:
-    """A <table> of plain text, which is escaped; too wide a one scrolls by itself."""
+    """A table of plain text, which is escaped; too wide a one scrolls by itself."""
     head = "<tr>" + "".join(f"<th>{escape(title)}</th>" for title in header) + "</tr>" if header else ""
     lines = []
     for index, row in enumerate(rows):

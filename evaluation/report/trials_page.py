@@ -17,7 +17,7 @@ _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
 _SAME = ("rig", "shapes", "split", "number", "seconds")
 """What two series agree on where trial i of an object is the same trial."""
 _QUALITY = 75
-"""Of the films' WebP: a tenth of the PNG files that they are made from."""
+"""The films' WebP takes a sixth of the PNG files that they are made from."""
 
 
 @dataclass(frozen=True)
@@ -110,14 +110,15 @@ def _pair(first: Trials, other: Trials) -> str:
 
 def _films(folder: Path, title: str, outcome: str) -> list[str]:
     strips = sorted(folder.glob(f"*-{outcome}.png"))
-    parts = [f"<h3>{strip.stem}</h3>{film(_webp(strip), strip.stem, 'webp')}" for strip in strips]
+    parts = [f"<h3>{strip.stem}</h3>{_film(strip)}" for strip in strips]
     return [heading(title), *(parts or ["<p>No film.</p>"])]
 
 
-def _webp(strip: Path) -> bytes:
+def _film(strip: Path) -> str:
     import cv2
 
-    ok, data = cv2.imencode(".webp", cv2.imread(str(strip)), [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
-    if not ok:
-        raise RuntimeError(f"OpenCV could not encode {strip} as WebP")
-    return data.tobytes()
+    picture = cv2.imread(str(strip))
+    if picture is None:
+        return f"<p>{strip.name} cannot be shown: it is no whole PNG.</p>"
+    _, data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+    return film(data.tobytes(), strip.stem, "webp")
