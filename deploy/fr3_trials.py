@@ -18,7 +18,7 @@ from deploy.interfaces import RobotError
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
-from deploy.treatment import Treatment, treated
+from deploy.treatment import Replacement, Treatment, treated
 from deploy.trials import Filming, Trial, TrialResult, Watch, drawn, result
 from mjx_envs.kinematics import yaw_of
 from rig.camera import camera_pose
@@ -40,7 +40,7 @@ class Fr3Bench:
     """A D455 in the mode that it is run in, the same matching at the policy's size, or no errors at all."""
     contact: float = 100.0
     """Newtons at the hand, and newton metres at it and at the joints, at which the arm stops itself."""
-    treatment: Treatment | None = None
+    treatment: Treatment | Replacement | None = None
     """What is done to depth before the policy sees it."""
     bare: bool = False
     """Without table, wall and clutter: on the ground, as the development rig."""

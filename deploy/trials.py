@@ -24,7 +24,7 @@ from deploy.interfaces import Depth, Filmed
 from deploy.loop import ControlLoop, LoopReport, Step
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
-from deploy.treatment import Treatment, treated
+from deploy.treatment import Replacement, Treatment, treated
 from rig.film import Film
 
 _STREAM = 0x526967
@@ -74,8 +74,8 @@ def plan(config: Config) -> list[Trial]:
     return simulated + real
 
 
-Watch = Callable[[Step, Filmed], None]
-"""Is called after every step, with the camera of the trial for colour pictures."""
+Watch = Callable[[Step, Filmed], bool | None]
+"""Is called after every step, with the camera of the trial for colour pictures; True ends the trial."""
 
 
 WatchPolicy = Callable[[Depth, np.ndarray, np.ndarray], None]
@@ -124,7 +124,7 @@ class Rig:
         config: Config,
         policy_path: Path,
         change: Change = AS_IT_IS,
-        treatment: Treatment | None = None,
+        treatment: Treatment | Replacement | None = None,
     ):
         """`change` is what is otherwise than in the development rig; `treatment` is what is done to depth
         before the policy sees it."""
@@ -209,12 +209,11 @@ class Filming:
         self._camera, self._every, self._watch = camera, every, watch
         self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
 
-    def look(self, step: Step) -> None:
-        """Takes the picture if it is due; what the loop's `on_step` is called with."""
+    def look(self, step: Step) -> bool | None:
+        """Takes the picture if it is due; what the loop's `on_step` is called with. True ends the trial."""
         if step.index % self._every == 0 and step.frame is not None:
             self._columns.append((step.index, self._camera.picture(), step.frame.depth))
-        if self._watch is not None:
-            self._watch(step, self._camera)
+        return None if self._watch is None else self._watch(step, self._camera)
 
     def film(self) -> Film:
         """The pictures so far."""

@@ -19,6 +19,7 @@ from deploy.fr3_lab import Shapes
 from deploy.fr3_trials import Fr3Bench, Sight
 from deploy.recorded import RecordedBench
 from deploy.stage import STAGE
+from deploy.treatment import Replacement, Treatment
 from deploy.trial_log import TrialLog
 from deploy.trials import Bench, Rig, Trial, TrialResult, run_trials
 from evaluation import wilson
@@ -63,7 +64,7 @@ class Series:
         """The objects. UserError for an unknown one, or a choice that the rig does not have."""
         if self.rig == "development" and (self.camera == "coarse" or self.shapes != "mesh"):
             raise UserError("--camera coarse and --shapes are rig fr3's: drop them, or choose --rig fr3.")
-        known = self._known()
+        known = self.known()
         names = known if self.objects == (EVERYTHING,) else self.objects
         for name in names:
             if name not in known:
@@ -72,12 +73,11 @@ class Series:
 
     def plan(self) -> list[Trial]:
         """Object after object; trial i of an object is the same whichever others are asked for."""
-        known = self._known()
-        return [
-            Trial(known.index(name) * len(seeds.SEEDS[self.split]) + i, name)
-            for name in self.names()
-            for i in range(self.trials)
-        ]
+        return [self.trial(name, i) for name in self.names() for i in range(self.trials)]
+
+    def trial(self, name: str, i: int) -> Trial:
+        """Trial i of the object of that name, one of `known`."""
+        return Trial(self.known().index(name) * len(seeds.SEEDS[self.split]) + i, name)
 
     def configured(self, config: Config, policy: Path) -> Config:
         """`config` with the trials' length, seed and objects. UserError if `policy` is no file."""
@@ -87,15 +87,19 @@ class Series:
         world = replace(config.world, objects=_trained(), episode_steps=steps)
         return replace(config, seed=seeds.seed(self.split, self.number), world=world)
 
-    def make(self, config: Config) -> Callable[[Config, Path], Bench]:
-        """What makes a bench in every worker. UserError where a network's weights are missing."""
-        treatment = make_treatment(self.depth, config)
+    def make(
+        self, config: Config, treatment: Treatment | Replacement | None = None
+    ) -> Callable[[Config, Path], Bench]:
+        """What makes a bench in every worker; `treatment` takes the place of what `depth` names. UserError
+        where a network's weights are missing."""
+        treatment = treatment or make_treatment(self.depth, config)
         if self.rig == "fr3":
             return Fr3Bench(self.shapes, self.camera, self.contact, treatment)
         change = Change(sight="ideal" if self.camera == "ideal" else "stereo")
         return partial(Rig, change=change, treatment=treatment)
 
-    def _known(self) -> tuple[str, ...]:
+    def known(self) -> tuple[str, ...]:
+        """Every object that the rig has."""
         if self.rig == "development" or self.shapes == "primitive":
             return _trained()
         from rig.meshes.objects import MESH_OBJECTS

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt8, UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import StereoConfig
@@ -15,6 +15,8 @@ from deploy.interfaces import CameraError, Clock, Depth, Frame, Robot
 from mjx_envs.camera import Camera as Pinhole
 
 if TYPE_CHECKING:
+    import mujoco
+
     from rig.fr3.channel import Channel
     from rig.fr3.picture import ScenePicture
     from sensors.models.active_stereo import ActiveStereo
@@ -147,6 +149,16 @@ class Fr3Camera:
         """(H, W, 3) uint8 colour of the scene as it was last read, from the same place (for people)."""
         assert self._picture is not None
         return self._picture.rgb(pinhole(self._profile, self._T_world_cam))
+
+    def clean_mm(self) -> UInt16[np.ndarray, "H W"]:
+        """See Simulated; as of the last `read`."""
+        assert self._picture is not None
+        return to_millimetres(self._picture.depth_m(pinhole(self._profile, self._T_world_cam)))
+
+    def scene(self) -> "tuple[mujoco.MjModel, mujoco.MjData]":
+        """See Staged; as of the last `read`."""
+        assert self._picture is not None
+        return self._picture.model, self._picture.data
 
 
 def pinhole(profile: contract.CameraProfile, T_world_cam: Pose) -> Pinhole:

@@ -45,7 +45,7 @@ class ScenePicture:
     def __init__(self, model: mujoco.MjModel):
         """`model` is of a scene that `prepare` has seen."""
         self.model = model
-        self._data = mujoco.MjData(self.model)
+        self.data = mujoco.MjData(self.model)
         self._rgb = np.concatenate(
             [geom_rgb(self.model), np.zeros((1, 3), np.float32)]
         )  # black where none is
@@ -54,8 +54,8 @@ class ScenePicture:
 
     def pose(self, qpos: Float64[np.ndarray, " nq"]) -> None:
         """The scene from now on."""
-        self._data.qpos[:] = qpos
-        mujoco.mj_kinematics(self.model, self._data)
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
 
     def depth_m(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
         """(H, W) planar depth, metres; 0 = nothing there."""
@@ -89,11 +89,11 @@ class ScenePicture:
         own, T = self.model.camera(CAMERA), np.asarray(camera.T_world_cam)
         own.pos, own.fovy = T[:3, 3], math.degrees(2 * math.atan(camera.height_px / 2 / camera.fy_px))
         mujoco.mju_mat2Quat(own.quat, (T[:3, :3] @ _T_OPENCV_OPENGL).ravel())
-        mujoco.mj_camlight(self.model, self._data)
+        mujoco.mj_camlight(self.model, self.data)
         size = (camera.height_px, camera.width_px)
         if size not in self._renderers:
             self._renderers[size] = mujoco.Renderer(self.model, *size)
-        self._renderers[size].update_scene(self._data, CAMERA)
+        self._renderers[size].update_scene(self.data, CAMERA)
         return self._renderers[size]
 
 
