@@ -81,7 +81,7 @@ def test_the_file_draws_what_jax_draws(name, tmp_path):
     generator = made(OPTIONS[name])
     finished(generator, tmp_path)
     measured = exported.export_generator(tmp_path, tmp_path / "generator.onnx")
-    assert measured.mask_share <= exported.MOST_MASK_SHARE and measured.median_m < 1e-4
+    assert measured.share <= exported.MOST_SHARE and measured.median_m < 1e-4
     session = open_session(tmp_path / "generator.onnx")
     info = generator_metadata.read(session.get_modelmeta().custom_metadata_map, "it")
     assert (info.height_px, info.width_px, info.steps) == (27, 48, generator.config.sampling.steps)
@@ -160,7 +160,7 @@ def test_a_prior_by_colour_is_refused():
 
 def test_a_file_that_differs_is_not_written(tmp_path, monkeypatch):
     finished(made(CAMERA), tmp_path)
-    monkeypatch.setattr(exported, "MOST_MASK_SHARE", -1.0)
+    monkeypatch.setattr(exported, "MOST_SHARE", -1.0)
     with pytest.raises(UserError, match="differs from JAX.*nothing was written"):
         exported.export_generator(tmp_path, tmp_path / "generator.onnx")
     assert not (tmp_path / "generator.onnx").exists()

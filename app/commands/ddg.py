@@ -181,7 +181,7 @@ class DDGExport:
             steps=self.steps or 0,
         )
         print(
-            f"{self.out}: {self.out.stat().st_size / 1e6:.1f} MB; against JAX {measured.mask_share:.3%} of "
-            f"the pixels masked otherwise, inverse depth elsewhere within "
+            f"{self.out}: {self.out.stat().st_size / 1e6:.1f} MB; against JAX {measured.share:.3%} of "
+            f"the pixels grafted otherwise, inverse depth elsewhere within "
             f"{measured.inverse_depth_per_m:.1e} 1/m"
         )
