@@ -4,9 +4,9 @@
 
 Geometry is made of the recording's odd frames, recorded depth is the even ones
 (evaluation/depth_score/data.py), as in `ddgrasp ddg score --real`: the generator has to be fitted on the
-frames before. `FID` is over that of clean depth, with a 95 % interval from resampling blocks of frames; features
-depthfeat-v1. `CPU ms` is processor time per frame, all threads together, which other work on the machine
-changes less than frames/s.
+frames before. `FID` is over that of clean depth, with a 95 % interval from resampling blocks of frames;
+features depthfeat-v1. `CPU ms` is processor time per frame, all threads together, which other work on the
+machine changes less than frames/s.
 """
 
 import argparse
