@@ -51,14 +51,14 @@ class GeneratorMetadata:
     deviation_correlation: float
     """The same for the last channel of the start, if C is 2."""
     unit: str
-    """Of depth."""
+    """What depth is measured in."""
     camera: dict[str, Any] = field(default_factory=dict)
     """What it was fitted on: name, width_px, height_px, fx_px, near_m, far_m (of readings), where known."""
     licence: str = ""
     source: str = ""
     """Where the recordings come from, in words."""
     manifest_hash: str = ""
-    """Of the stage that it was exported from."""
+    """Names the stage that it was exported from."""
 
     @property
     def fixed_steps(self) -> bool:

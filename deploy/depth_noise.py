@@ -80,16 +80,15 @@ class DepthGenerator:
         steps = self._checked_steps(steps)
         frames = _frames(depth_m)
         self._check(frames)
-        if noise is None:
-            noise = self._drawn(frames, steps)
+        given = self._drawn(frames, steps) if noise is None else noise
         wanted = (len(frames), self.info.planes(steps), self.info.height_px, self.info.width_px)
-        if tuple(noise.shape) != wanted:
+        if tuple(given.shape) != wanted:
             raise UserError(
-                f"Noise is {tuple(noise.shape)}; {steps} evaluations of {len(frames)} frames take {wanted}: "
+                f"Noise is {tuple(given.shape)}; {steps} evaluations of {len(frames)} frames take {wanted}: "
                 "let the generator's noise() make it."
             )
         run = self._run_numpy if isinstance(depth_m, np.ndarray) else self._run_torch
-        return Reported(*(made.reshape(depth_m.shape) for made in run(frames, noise, steps)))
+        return Reported(*(made.reshape(depth_m.shape) for made in run(frames, given, steps)))
 
     def noise(self, count: int, *, seed: int = 0, device: str = "") -> "EpisodeNoise":
         """Noise of `count` cameras that run side by side, for a call per frame.
@@ -140,26 +139,29 @@ class DepthGenerator:
         return given if self.info.fixed_steps else given | {names.INPUT_STEPS: np.array(steps, np.int64)}
 
     def _run_numpy(self, frames: np.ndarray, noise: Array, steps: int) -> Sequence[np.ndarray]:
-        numbers = (np.ascontiguousarray(_host(values), np.float32) for values in (frames, noise))
-        return [np.asarray(made) for made in self._session.run(list(_OUTPUTS), self._feed(*numbers, steps))]
+        depth, normal = (np.ascontiguousarray(_host(values), np.float32) for values in (frames, noise))
+        made = self._session.run(list(_OUTPUTS), self._feed(depth, normal, steps))
+        return [np.asarray(one) for one in made]
 
     def _run_torch(self, frames: Array, noise: Array, steps: int) -> Sequence[Array]:
         """Inputs and outputs stay where the network runs; tensors elsewhere are copied there and back."""
         torch = importlib.import_module("torch")
         here = torch.device("cpu") if self._kind == "cpu" else torch.device(self._kind, self._device_number)
-        place, binding, kept = (self._kind, self._device_number), self._session.io_binding(), []
+        binding, kept = self._session.io_binding(), []
         for name, value in self._feed(frames, noise, steps).items():
             if name == names.INPUT_STEPS:
                 binding.bind_cpu_input(name, value)
                 continue
             tensor = torch.as_tensor(value).to(device=here, dtype=torch.float32).contiguous()
             kept.append(tensor)  # the binding knows only where it lies
-            binding.bind_input(name, *place, np.float32, tuple(tensor.shape), tensor.data_ptr())
+            where = (tuple(tensor.shape), tensor.data_ptr())
+            binding.bind_input(name, self._kind, self._device_number, np.float32, *where)
         made = []
         for name, kind in _OUTPUTS.items():
             kind_there = torch.bool if kind is np.bool_ else torch.float32
             made.append(torch.empty(tuple(frames.shape), dtype=kind_there, device=here))
-            binding.bind_output(name, *place, kind, tuple(frames.shape), made[-1].data_ptr())
+            where = (tuple(frames.shape), made[-1].data_ptr())
+            binding.bind_output(name, self._kind, self._device_number, kind, *where)
         if here.type != "cpu":
             torch.cuda.current_stream(here).synchronize()  # what writes the inputs has to have ended
         self._session.run_with_iobinding(binding)
@@ -233,7 +235,7 @@ class _Normals:
 
 def _frames(depth: Array) -> Array:
     """(N, H, W) of what came in; UserError for another rank or integers."""
-    shape = tuple(getattr(depth, "shape", ()))
+    shape: tuple[int, ...] = tuple(getattr(depth, "shape", ()))
     if isinstance(depth, np.ndarray):
         floating = depth.dtype.kind == "f"
     else:

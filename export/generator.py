@@ -31,7 +31,7 @@ MOST_SHARE = 2e-3
 MOST_DIFFERENCE_PER_M = 1e-3
 """Largest difference of inverse depth, 1/m, at all others."""
 RANGE_QUANTILES = (0.001, 0.999)
-"""Of valid recorded depth: nearest and farthest depth that the file names."""
+"""Where the nearest and the farthest depth that the file names lie among valid recorded depth."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ def build_model(params: Params, config: DDGConfig, metadata: GeneratorMetadata) 
     c = prior_graph.write_prior(g, inside, config)
     own = g.mul(g.slice(names.INPUT_NOISE, [0], [1], [1]), g.constant(config.prior.noise))
     x = _write_sampler(g, g.add(c, own), params, config)
-    lengths = tuple(prior_graph.write_length(g, depth, axis) for axis in (2, 3))
+    lengths = prior_graph.write_length(g, depth, 2), prior_graph.write_length(g, depth, 3)
     _write_graft(g, prior_graph.write_resized(g, x, lengths), depth, config)
     frames = ["batch", "rows", "columns"]
     inputs = [
@@ -105,7 +105,7 @@ def _write_fresh(g: GraphBuilder, number: str, channels: int) -> str:
     return g.op("Slice", names.INPUT_NOISE, first, g.add(first, per_step), one)
 
 
-def _write_clean(g: GraphBuilder, out: str, x: str, row: Row, config: DDGConfig) -> str:
+def _write_clean(g: GraphBuilder, out: str, x: str, row: Row[str], config: DDGConfig) -> str:
     """`train.predict_clean`: the network's output, or the expected validity and the other channels."""
     if config.training.hole_loss == SQUARED:
         return out

@@ -6,7 +6,7 @@ x_0 is the clean map that the network sees in x. All samplers are linear in thes
 equations (learning/diffusion.py) are evaluated once, on ones and zeros, and a graph needs a row of numbers.
 """
 
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float32
@@ -19,18 +19,21 @@ MOST_STEPS = 50
 """Network evaluations that a file can be asked for."""
 
 
-class Row(NamedTuple):
-    """Columns of the tables, one value a step."""
+Values = TypeVar("Values")
 
-    step: np.ndarray
+
+class Row(NamedTuple, Generic[Values]):
+    """Columns of the tables: arrays of a value a step, or names of a step's values in a graph."""
+
+    step: Values
     """k, the diffusion step."""
-    own: np.ndarray
+    own: Values
     """Log odds of x = 1 against -1 from one unit of a pixel's own x (`train.valid_log_odds`)."""
-    x: np.ndarray
-    x_0: np.ndarray
-    clipped: np.ndarray
-    before: np.ndarray
-    noise: np.ndarray
+    x: Values
+    x_0: Values
+    clipped: Values
+    before: Values
+    noise: Values
 
 
 def is_stochastic(config: DDGConfig) -> bool:
@@ -62,7 +65,7 @@ def sampler_tables(config: DDGConfig) -> Float32[np.ndarray, "counts most column
     return tables
 
 
-def _rows(config: DDGConfig, k: np.ndarray, previous: np.ndarray, before: np.ndarray) -> Row:
+def _rows(config: DDGConfig, k: np.ndarray, previous: np.ndarray, before: np.ndarray) -> Row[np.ndarray]:
     made, sampler = config_schedule(config), config.sampling.sampler
     one, none = np.ones(len(k), np.float32), np.zeros(len(k), np.float32)
     alpha_bar = np.asarray(diffusion.alpha_bar_at(made, k, one))

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from ddgrasp import generator_metadata as names
 from ddgrasp.errors import UserError
 from deploy.depth_noise import DepthGenerator
+from tutorial_support import code
 
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "pretrained" / "ddg" / "generator.onnx"
@@ -175,3 +177,51 @@ def test_tensors_give_what_arrays_give(generator, scene):
     assert generator(torch.from_numpy(scene)).shape == scene.shape
     with pytest.raises(UserError, match=r"Depth is torch.int16 \(2, 180, 320\)"):
         generator(torch.ones(2, 180, 320, dtype=torch.int16))
+
+
+# --- the tutorial ----------------------------------------------------------------------------------
+
+
+def run_blocks(*numbers: int) -> dict:
+    """Names that the tutorial's Python blocks leave, one after the other."""
+    left: dict = {}
+    for number in numbers:
+        exec(code("one_file.md")[number].replace("pretrained/ddg/generator.onnx", str(FILE)), left)
+    return left
+
+
+def test_the_tutorials_numpy_runs():
+    left = run_blocks(0, 1)
+    clean_m, reported_m, mask = left["clean_m"], left["reported_m"], left["reported_m"] == 0
+    assert reported_m.shape == clean_m.shape and 0.03 < mask.mean() < 0.3
+    assert left["first_m"].shape == left["second_m"].shape == clean_m.shape
+
+
+def test_the_tutorials_pytorch_runs():
+    torch = pytest.importorskip("torch")
+    left = run_blocks(0, 2)
+    assert isinstance(left["reported"], torch.Tensor) and left["reported"].shape == left["clean_m"].shape
+
+
+def test_the_tutorials_isaac_lab_takes_its_cameras_tensors(generator, scene):
+    torch = pytest.importorskip("torch")
+    depth = torch.from_numpy(np.where(scene > 0, scene, np.inf))[..., None]
+    camera = SimpleNamespace(data=SimpleNamespace(output={"distance_to_image_plane": depth}))
+    noise = run_blocks(4)["CameraNoise"](str(FILE), "cpu", 2)
+    made = noise(camera)
+    assert made.shape == depth.shape and made.isfinite().all() and not made[:, :10, :20].any()
+    before = noise.noise.next()
+    noise.reset(torch.tensor([1]))
+    after = noise.noise.next()
+    alike = [float(np.corrcoef(before[i, 1].ravel(), after[i, 1].ravel())[0, 1]) for i in range(2)]
+    assert alike[0] > 0.7 and abs(alike[1]) < 0.05
+
+
+def test_the_tutorials_maniskill_runs():
+    """Where ManiSkill is installed and can render."""
+    pytest.importorskip("mani_skill")
+    left = run_blocks(3)
+    (picture,) = left["obs"]["sensor_data"].values()
+    depth = picture["depth"]
+    assert tuple(depth.shape) == (1, 180, 320, 1) and str(depth.dtype) == "torch.float32"
+    assert 0.01 < float((depth == 0).float().mean()) < 0.9
