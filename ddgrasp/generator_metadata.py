@@ -18,7 +18,7 @@ INPUT_NOISE = "noise"
 """(B, P, h, w) float32, standard normal, at the generator's size: a plane for the prior, C for the start, and
 for a stochastic sampler C more for every evaluation but the last."""
 INPUT_STEPS = "steps"
-"""int64 scalar, network evaluations; need not be given. A distilled generator has no such input."""
+"""int64 scalar, network evaluations. A distilled generator has no such input."""
 OUTPUT_DEPTH = "reported"
 """(B, H, W) float32 metres, 0 = hole: simulated depth with the camera's artefacts grafted."""
 OUTPUT_PREDICTED = "predicted"
@@ -41,7 +41,7 @@ class GeneratorMetadata:
     """C, planes of noise for one evaluation."""
     sampler: str
     steps: int
-    """Network evaluations unless asked for others."""
+    """Network evaluations that it was fitted for."""
     most_steps: int
     """Evaluations that can be asked for; `steps` for a distilled generator."""
     stochastic: bool

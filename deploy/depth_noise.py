@@ -267,7 +267,6 @@ def _open(path: Path, kind: str, number: int, threads: int) -> ort.InferenceSess
         raise UserError("device is cuda, which this onnxruntime does not have: install onnxruntime-gpu.")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    options.log_severity_level = 3  # it warns that `steps` may be given, which is meant
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         return ort.InferenceSession(str(path), options, providers=providers)

@@ -153,20 +153,10 @@ class GraphBuilder:
         metadata: dict[str, str],
         *,
         name: str = "policy",
-        defaults: Mapping[str, AnyArray] | None = None,
     ) -> onnx.ModelProto:
-        """The finished model, checked by onnx.checker with full shape inference.
-
-        Args:
-          inputs: what the caller gives.
-          outputs: what it gets.
-          metadata: the file's properties.
-          name: the graph's.
-          defaults: values of inputs that need not be given.
-        """
-        initial = [numpy_helper.from_array(np.asarray(v), k) for k, v in (defaults or {}).items()]
+        """The finished model, checked by onnx.checker with full shape inference."""
         graph = helper.make_graph(
-            self.nodes, name, list(inputs), list(outputs), initializer=[*initial, *self.constants.values()]
+            self.nodes, name, list(inputs), list(outputs), initializer=list(self.constants.values())
         )
         model = helper.make_model(
             graph,

@@ -197,7 +197,7 @@ def run(
         generator_metadata.INPUT_NOISE: noise,
         generator_metadata.INPUT_STEPS: np.array(steps, np.int64),
     }
-    taken = {one.name for one in (*session.get_inputs(), *session.get_overridable_initializers())}
+    taken = {one.name for one in session.get_inputs()}
     names = [
         generator_metadata.OUTPUT_DEPTH,
         generator_metadata.OUTPUT_PREDICTED,

@@ -6,7 +6,6 @@ sampler is a Loop, so that the number of network evaluations is an input.
 
 import math
 
-import numpy as np
 import onnx
 from onnx import TensorProto
 
@@ -50,19 +49,15 @@ def build_model(params: Params, config: DDGConfig, metadata: GeneratorMetadata) 
         tensor(names.INPUT_DEPTH, frames),
         tensor(names.INPUT_NOISE, ["batch", "planes", *size]),
     ]
-    defaults = {}
     if config.sampling.sampler != PROGRESSIVE:
         inputs.append(tensor(names.INPUT_STEPS, [], TensorProto.INT64))
-        defaults[names.INPUT_STEPS] = np.array(config.sampling.steps, np.int64)
     outputs = [
         tensor(names.OUTPUT_DEPTH, frames),
         tensor(names.OUTPUT_PREDICTED, frames),
         tensor(names.OUTPUT_MASK, frames, TensorProto.BOOL),
     ]
     assert channels == metadata.channels
-    return g.model(
-        inputs, outputs, {names.METADATA_KEY: metadata.to_json()}, name="generator", defaults=defaults
-    )
+    return g.model(inputs, outputs, {names.METADATA_KEY: metadata.to_json()}, name="generator")
 
 
 # --- the sampler -----------------------------------------------------------------------------------

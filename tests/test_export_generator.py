@@ -85,8 +85,8 @@ def test_the_file_draws_what_jax_draws(name, tmp_path):
     session = open_session(tmp_path / "generator.onnx")
     info = generator_metadata.read(session.get_modelmeta().custom_metadata_map, "it")
     assert (info.height_px, info.width_px, info.steps) == (27, 48, generator.config.sampling.steps)
-    assert {one.name for one in session.get_inputs()} == {"depth", "noise"}
-    assert len(session.get_overridable_initializers()) == (0 if info.fixed_steps else 1)
+    inputs = {one.name for one in session.get_inputs()}
+    assert inputs == {"depth", "noise"} | (set() if info.fixed_steps else {"steps"})
 
 
 def test_any_size_of_that_shape_and_number_of_evaluations():
@@ -102,8 +102,6 @@ def test_any_size_of_that_shape_and_number_of_evaluations():
     drawn = (predicted > 0) & (wanted.predicted_m > 0)
     np.testing.assert_allclose(predicted[drawn], wanted.predicted_m[drawn], atol=1e-3)
     np.testing.assert_array_equal(reported[~mask], depth_m[~mask])
-    default = session.run(["reported"], {"depth": depth_m, "noise": noise[:, : metadata.planes(3)]})[0]
-    assert np.array_equal(default, exported.run(session, depth_m, noise[:, : metadata.planes(3)], 3)[0])
 
 
 # --- filters ---------------------------------------------------------------------------------------
