@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from app.extras import distribution
+
 ROOT = Path(__file__).parents[1]
 ORDER = (
     "ddgrasp", "mjx_envs", "learning", "ppo", "demos", "sensors", "rig", "foundation", "ddg_jax",
@@ -233,23 +235,12 @@ def _under(name: str, prefixes) -> bool:
     return any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes)
 
 
-OTHERWISE_NAMED = {
-    "cv2": "opencv-python-headless",
-    "franky": "franky-control",
-    "mujoco_playground": "playground",
-    "orbax": "orbax-checkpoint",
-    "rerun": "rerun-sdk",
-    "sklearn": "scikit-learn",
-}
-"""Import name -> name on the package index, where they differ by more than a hyphen."""
-
-
 def test_what_is_imported_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     groups = [project["dependencies"], *project["optional-dependencies"].values()]
     declared = {re.split(r"[\[<>=;! ]", line)[0] for group in groups for line in group}
     wanted = {
-        OTHERWISE_NAMED.get(name, name.replace("_", "-")): file
+        distribution(name): file
         for folder in (*ORDER, "benchmarks")
         for file in sorted((ROOT / folder).rglob("*.py"))
         for name in _foreign(file)

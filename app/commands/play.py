@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
+from ddgrasp.shipped import PRETRAINED
 
 if TYPE_CHECKING:
     from deploy.trials import Bench, Trial
@@ -134,6 +135,6 @@ def _has_display() -> bool:
 
 
 def _pretrained() -> Path:
-    from export.pretrained import pretrained_policy
+    from deploy.policy import POLICY_FILE
 
-    return pretrained_policy()
+    return PRETRAINED / "student" / POLICY_FILE
