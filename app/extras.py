@@ -30,7 +30,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
 }
 """Command -> the extras without which it never works; all others need TRAIN. What an option needs besides is
 told when its module is imported."""
-_TELLS = {"sim": "mujoco", "realsense": "cv2", "franka": "scipy", "fr3": "trimesh", TRAIN: "jax"}
+TELLS = {"sim": "mujoco", "realsense": "cv2", "franka": "scipy", "fr3": "trimesh", TRAIN: "jax"}
 """Extra -> a module that it brings, and that commands which need it import."""
 _REQUIREMENT = re.compile(r"""(?P<name>[\w.-]+)[^;]*;.*\bextra == ['"](?P<extra>[\w-]+)['"]""")
 
@@ -51,7 +51,7 @@ def bringing(module: str) -> list[str]:
 def check(command: str) -> None:
     """UserError if the extras that `command` needs are not installed."""
     needed = NEEDS.get(command, (TRAIN,))
-    if any(find_spec(_TELLS[extra]) is None for extra in needed):
+    if any(find_spec(TELLS[extra]) is None for extra in needed):
         more = _install(",".join(needed))
         raise UserError(f"`ddgrasp {command}` needs more than is installed: {more}.")
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from app.extras import distribution
+from app.commands import COMMANDS
+from app.extras import NEEDS, TELLS, distribution
 
 ROOT = Path(__file__).parents[1]
 ORDER = (
@@ -262,6 +263,14 @@ def test_an_extra_has_all_that_its_modules_import(extras):
     there = {*PROJECT["dependencies"], *(line for extra in extras for line in optional[extra])}
     lacking = foreign.keys() - _names(there) - sys.stdlib_module_names
     assert {name: foreign[name] for name in lacking} == {}
+
+
+def test_what_tells_that_an_extra_is_there_comes_with_it_and_not_without():
+    base, optional = _names(PROJECT["dependencies"]), PROJECT["optional-dependencies"]
+    for extra, module in TELLS.items():
+        assert distribution(module) in _names(optional[extra]) - base
+    assert set(NEEDS) <= set(COMMANDS)
+    assert {extra for extras in NEEDS.values() for extra in extras} <= set(TELLS)
 
 
 def test_what_is_imported_is_declared():
