@@ -14,6 +14,7 @@ OTHERWISE_NAMED = {
     "orbax": "orbax-checkpoint",
     "rerun": "rerun-sdk",
     "sklearn": "scikit-learn",
+    "warp": "warp-lang",
 }
 """Import name -> name on the package index, where they differ by more than a hyphen."""
 TRAIN = "train"

@@ -7,7 +7,7 @@ generator to what the robot just saw.
 import json
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from ddgrasp.depth import to_millimetres
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from deploy.interfaces import Camera, Filmed, Judge
-from deploy.loop import LoopReport, Step
+from deploy.loop import Step
 from rig.film import Film, contact_sheet
 
 STEPS_FILE, REPORT_FILE, FILM_FILE = "steps.jsonl", "report.json", "film.png"
@@ -31,7 +31,9 @@ FILM_COLUMNS = 12
 class DeploymentRecord:
     """Collects what the loop did; the disk is a thread's, so that a step does not wait for it."""
 
-    def __init__(self, camera: Camera, profile: contract.CameraProfile, sensor: str, film_every: int):
+    def __init__(
+        self, camera: Camera | Filmed, profile: contract.CameraProfile, sensor: str, film_every: int
+    ):
         """`profile` is the policy's picture; `film_every` as in `DeployConfig`."""
         self._camera, self._picture_every, self._film_every = camera, film_every, film_every
         self._meta = {
@@ -76,11 +78,13 @@ class DeploymentRecord:
         self._queue.put((rgb, depth_mm))
         self._keep(step.index, rgb, depth_mm)
 
-    def finish(self, folder: Path, report: LoopReport, success: bool | None, about: dict[str, Any]) -> None:
-        """Writes everything but the frames into `folder`."""
+    def finish(
+        self, folder: Path, report: Mapping[str, Any], success: bool | None, about: Mapping[str, Any]
+    ) -> None:
+        """Writes everything but the frames into `folder`; `report` is a LoopReport as plain values."""
         folder.mkdir(parents=True, exist_ok=True)
         atomic_write_text(folder / STEPS_FILE, "".join(json.dumps(row) + "\n" for row in self._rows))
-        values = {**about, "success": success, "frames": self.frames, **report.as_dict()}
+        values = {**about, "success": success, "frames": self.frames, **report}
         if self._trouble:
             values["frames_lost"] = self._trouble
         atomic_write_text(folder / REPORT_FILE, json.dumps(values, indent=1, allow_nan=False) + "\n")
@@ -88,7 +92,7 @@ class DeploymentRecord:
             steps, rgb, depth_mm = zip(*self._film, strict=True)
             film = Film(steps, np.stack(rgb), np.stack(depth_mm))
             outcome = {True: "success", False: "failure", None: "not judged"}[success]
-            atomic_write_bytes(folder / FILM_FILE, contact_sheet(film, f"{outcome} {report.fault}"))
+            atomic_write_bytes(folder / FILM_FILE, contact_sheet(film, f"{outcome} {report['fault']}"))
 
     def _keep(self, index: int, rgb: np.ndarray, depth_mm: np.ndarray) -> None:
         """One of at most twice `FILM_COLUMNS` pictures, every second one dropped when there are more."""

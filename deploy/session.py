@@ -74,8 +74,10 @@ def _run(
     unattended = options.yes or report.interrupted or bool(report.fault)
     success = None if options.dry_run else verdict(camera, _unasked if unattended else ask_success)
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
+    if name := options.object_name or (config.world.objects[0] if options.robot == "sim" else ""):
+        about["object"] = name
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
-    kept.finish(folder, report, success, about)
+    kept.finish(folder, report.as_dict(), success, about)
     say(f"report: {folder / REPORT_FILE}")
     if isinstance(driven, DryRun):
         path = folder / "dry-run.png"

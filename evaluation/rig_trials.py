@@ -15,6 +15,7 @@ from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from ddgrasp.progress import Progress
 from deploy.fr3_trials import Fr3Bench, Shapes, Sight
+from deploy.recorded import RecordedBench
 from deploy.stage import STAGE
 from deploy.trial_log import TrialLog
 from deploy.trials import Bench, Rig, Trial, TrialResult, run_trials
@@ -24,7 +25,7 @@ from rig import seeds
 from rig.film import Film, contact_sheet
 
 RigName = Literal["development", "fr3"]
-TRIALS_FILE, TABLE_FILE = "trials.jsonl", "table.json"
+TRIALS_FILE, TABLE_FILE, EPISODES = "trials.jsonl", "table.json", "episodes"
 EVERYTHING = "all"
 
 
@@ -101,19 +102,23 @@ class Series:
 
 def run(
     config: Config, policy: Path, series: Series, out: Path, workers: int, progress: Progress,
-    failures: float = math.inf,
+    failures: float = math.inf, record: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """The table of `series`; trials that `out` has already are not run again.
 
-    Leaves trials.jsonl, table.json and films in `out`: each object's first success, its first `failures`.
+    Leaves trials.jsonl, table.json and films in `out`: each object's first success, its first `failures`;
+    with `record` a folder in `EPISODES` for every trial, as a deployment leaves it.
     """
     config, trials = series.configured(config, policy), series.plan()
     out.mkdir(parents=True, exist_ok=True)
     log = TrialLog(out / TRIALS_FILE, _header(config, policy, series))
+    make = series.make(config)
+    if record:
+        make = RecordedBench(make, out / EPISODES, {"robot": f"rig {series.rig}", "camera": series.camera})
     todo = [trial for trial in trials if (trial.index, False) not in log.results]
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(trials) - len(todo))
-        for result, film in run_trials(config, policy, todo, workers, series.make(config)):
+        for result, film in run_trials(config, policy, todo, workers, make):
             alike = [(r.object_name, r.success) for r in log.results.values()]
             shown = alike.count((result.object_name, result.success))
             log.append(result)

@@ -87,13 +87,11 @@ def body_poses(qpos: Float[AnyArray, "*batch joints"], xp: ModuleType = np) -> d
     Args:
       qpos: (..., 9 or 16) arm 7, fingers 2 and, if given, the object's pose 7.
     """
-    batch = qpos.shape[:-1]
-    zero = xp.zeros(batch + (3,)), xp.broadcast_to(xp.asarray([1.0, 0.0, 0.0, 0.0]), batch + (4,))
-    positions, quats = _arm_chain(zero, xp.moveaxis(qpos[..., QPOS.arm], -1, 0), xp)
-    poses = {"link0": zero}
+    base = _base(qpos.shape[:-1], xp)
+    positions, quats = _arm_chain(base, xp.moveaxis(qpos[..., QPOS.arm], -1, 0), xp)
+    poses = {"link0": base}
     poses |= {link.name: (positions[i], quats[i]) for i, link in enumerate(scene.ARM_LINKS)}
-    hand_pos, hand_quat = _child(positions[-1], quats[-1], scene.HAND_POS_M, scene.HAND_QUAT, xp)
-    poses["hand"] = hand_pos, hand_quat
+    poses["hand"] = hand_pos, hand_quat = _hand(positions[-1], quats[-1], xp)
     fingers = zip(_FINGER_TURNS.items(), range(QPOS.fingers.start, QPOS.fingers.stop), strict=True)
     for (name, turn), index in fingers:
         pos, quat = _child(hand_pos, hand_quat, scene.FINGER_POS_M, turn, xp)
@@ -141,9 +139,17 @@ def grip_pose(
     Args:
       q_arm: (..., 7) joint positions, rad.
     """
-    qpos = xp.concatenate([q_arm, xp.zeros(q_arm.shape[:-1] + (2,))], axis=-1)
-    pos, quat = body_poses(qpos, xp)["hand"]
+    positions, quats = _arm_chain(_base(q_arm.shape[:-1], xp), xp.moveaxis(q_arm, -1, 0), xp)
+    pos, quat = _hand(positions[-1], quats[-1], xp)
     return pos + rotate(quat, xp.asarray(scene.GRIP_POS_M), xp), quat
+
+
+def _base(batch, xp):
+    return xp.zeros(batch + (3,)), xp.broadcast_to(xp.asarray([1.0, 0.0, 0.0, 0.0]), batch + (4,))
+
+
+def _hand(pos, quat, xp):
+    return _child(pos, quat, scene.HAND_POS_M, scene.HAND_QUAT, xp)
 
 
 def _child(pos, quat, local_pos, local_quat, xp):

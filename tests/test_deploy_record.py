@@ -69,6 +69,7 @@ def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
     assert rows[1]["action"][0] == pytest.approx(0.2) and rows[1]["q_target_rad"][0] > rows[1]["q_rad"][0]
     kept = json.loads((folder / "report.json").read_text())
     assert kept["calibration"] is None, "the simulated robot has no camera to calibrate"
+    assert kept["object"] == get_preset("debug").world.objects[0]
     assert (kept["steps"], kept["frames"], kept["success"], kept["robot"]) == (5, 5, None, "sim")
     assert (folder / "film.png").stat().st_size > 1000
 

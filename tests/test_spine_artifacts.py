@@ -13,7 +13,7 @@ import pytest
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Config, ExportConfig, WorldConfig
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_path, atomic_write_bytes, atomic_write_json, read_json, to_json
+from ddgrasp.files import atomic_path, atomic_write_bytes, atomic_write_json, new_folder, read_json, to_json
 from ddgrasp.presets import PRESETS
 
 CONFIG = Config(preset="debug")
@@ -31,6 +31,22 @@ def test_a_failing_write_leaves_the_previous_file_and_no_litter(tmp_path):
         raise KeyboardInterrupt
     assert path.read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["params.bin"]
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "sets" / "set") as temporary:
+        (temporary / "inner").mkdir(parents=True)
+        raise KeyboardInterrupt
+    assert list((tmp_path / "sets").iterdir()) == []
+    with new_folder(tmp_path / "sets" / "set") as temporary:
+        temporary.mkdir()
+        (temporary / "file").write_text("whole")
+        assert [path.name for path in (tmp_path / "sets").iterdir()] == [temporary.name]
+    assert (tmp_path / "sets" / "set" / "file").read_text() == "whole"
+    assert len(list((tmp_path / "sets").iterdir())) == 1
+    with pytest.raises(OSError), new_folder(tmp_path / "sets" / "set") as temporary:
+        temporary.mkdir()
+    assert (tmp_path / "sets" / "set" / "file").read_text() == "whole"
 
 
 def test_a_disk_that_fills_up_mid_write_leaves_the_previous_artifact(tmp_path):

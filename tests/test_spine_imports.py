@@ -26,7 +26,7 @@ JAX_FREE = (
     "mjx_envs.render.ray_geometry", "mjx_envs.render.raycast_numpy", "mjx_envs.camera", "rig.world",
     "sensors.models.active_stereo", "sensors.models.matching", "sensors.recordings.recording",
     "evaluation.camera_comparison", "sensors.recordings.importers",
-    "sensors.recordings.realsense", "sensors.recordings.realsense_live",
+    "sensors.recordings.realsense", "sensors.recordings.realsense_live", "app.lerobot",
 )  # fmt: skip
 """Packages and modules whose module-level imports must not reach JAX, however indirectly."""
 

@@ -16,6 +16,7 @@ from app import pipeline
 from app.commands.base import DEFAULT_PRESET, Command, FromPreset
 from app.commands.calibrate import Calibrate, CalibrateBoard
 from app.commands.checks import check_config_values, check_devices, check_memory, check_options
+from app.commands.dataset import DemosExport
 from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
@@ -57,6 +58,7 @@ COMMANDS: dict[str, type] = {
     "teacher eval": TeacherEval,
     "teacher compare": TeacherCompare,
     "demos collect": DemosCollect,
+    "demos export": DemosExport,
     "record": Record,
     "record import": RecordImport,
     "record realsense": RecordRealsense,

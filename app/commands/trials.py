@@ -38,6 +38,8 @@ class DeployTrials:
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
     workers: Annotated[int, Range(1, 64)] = 2
     """Rigs that run side by side."""
+    record: bool = False
+    """Keep every trial's steps and pictures in the folder episodes, for `ddgrasp demos export`."""
     out: Path = Path("runs/trials")
     """Folder for trials.jsonl, table.json and films; trials that it has are not run again."""
 
@@ -61,5 +63,7 @@ class DeployTrials:
         )
         config = config_of(self.policy, self.preset)
         progress = Progress(name="deploy trials")
-        table = rig_trials.run(config, self.policy, series, self.out, self.workers, progress)
+        table = rig_trials.run(
+            config, self.policy, series, self.out, self.workers, progress, record=self.record
+        )
         print(rig_trials.describe(table))

@@ -21,7 +21,7 @@ class SessionOptions:
     recording: Path | None = None
     """Recording for camera replay."""
     object_name: str = ""
-    """Object on the rig's table; empty takes the first configured one."""
+    """Object on the rig's table, empty takes the first configured one; before a real arm it is only noted."""
     seconds: float = 6.0
     """How long to run; inf runs until Ctrl-C."""
     dry_run: bool = False

@@ -1,0 +1,118 @@
+"""The README of a dataset: what a stranger has to know before training on it."""
+
+from dataclasses import dataclass, field
+
+from app.lerobot.episode import Episode, Source
+from app.lerobot.steps import ACTION_KEY, COLOUR, DEPTH, DONE, POSE, STATE_KEY, SUCCESS, Storage
+from ddgrasp import contract
+
+_HEADER = """---
+license: {licence}
+task_categories:
+- robotics
+tags:
+- LeRobot
+- depth
+- grasping
+- franka
+configs:
+- config_name: default
+  data_files: data/*/*.parquet
+---
+
+# {name}: grasping from depth, {kind}
+
+{episodes} episodes, {steps} steps at {hz:g} Hz, in LeRobot's format v3: an arm grasps an object on a table
+and lifts it. Made with DiffuDepGrasp-JAX.
+"""
+_ROWS = {
+    STATE_KEY: "seven joints (rad), then the opening between the gripper's pads (m)",
+    ACTION_KEY: f"seven joint steps in [-1, 1], each times {contract.ACTION_SCALE_RAD:g} rad and added to "
+    "its joint; then the gripper: above 0 it closes, else it opens",
+    DEPTH: "planar depth (along the camera's axis) in millimetres; 0 where the camera has none",
+    COLOUR: "colour of the same moment and view",
+    POSE: "the camera's pose: position in metres, axes as in OpenCV, in the frame of the robot's base",
+    DONE: "true in an episode's last step",
+    SUCCESS: "true in the last step of an episode whose object was lifted and held",
+}
+_STORAGE: dict[Storage, str] = {
+    "video": "Depth is in HEVC videos without loss, one of 4096 values for each millimetre. {farther} pixels "
+    "were farther than 4095 mm and have that value. Colour is in AV1 videos, with loss.",
+    "images": "Depth is in a 16-bit TIFF for each step, colour in a PNG, both without loss.",
+}
+_READING = """
+```python
+from lerobot.datasets import LeRobotDataset
+
+dataset = LeRobotDataset("{name}", root="{name}")
+depth_mm = dataset[0]["{depth}"]  # (1, H, W) float32, millimetres
+succeeded = dataset.meta.filter_episodes(lambda episode: episode["success"])
+```
+"""
+
+
+@dataclass
+class Contents:
+    """What is in a dataset."""
+
+    keys: tuple[str, ...] = ()
+    """What a step has."""
+    steps: int = 0
+    outcomes: list[bool] = field(default_factory=list)
+    """Whether each episode succeeded."""
+    held: int = 0
+    """Steps in which the control loop held the arm."""
+    farther: int = 0
+    """Pixels that were too far for a depth video."""
+    objects: dict[str, int] = field(default_factory=dict)
+    """Episodes by object, "" where nobody noted it."""
+
+    @property
+    def episodes(self) -> int:
+        """How many."""
+        return len(self.outcomes)
+
+    def count(self, episode: Episode, farther: int) -> None:
+        """Adds an episode, `farther` of whose pixels were too far."""
+        self.steps += len(episode.state)
+        self.outcomes.append(episode.success)
+        self.held += int(episode.held.sum())
+        self.farther += farther
+        self.objects[episode.object_name] = self.objects.get(episode.object_name, 0) + 1
+
+
+def render(
+    source: Source, contents: Contents, *, name: str, storage: Storage, licence: str, command: str
+) -> str:
+    """The README's text.
+
+    Args:
+      source: what the episodes are.
+      contents: how many of what.
+      name: the dataset's.
+      storage: how pictures are kept.
+      licence: identifier, for example apache-2.0.
+      command: what made the dataset.
+    """
+    header = _HEADER.format(
+        licence=licence, name=name, kind=source.kind, episodes=contents.episodes, steps=contents.steps,
+        hz=contract.CONTROL_HZ,
+    )  # fmt: skip
+    about = [f"* **{title}**: {text}" for title, text in source.about.items()]
+    objects = ", ".join(f"{object_name or 'not noted'} {n}" for object_name, n in contents.objects.items())
+    about += [
+        f"* **Episodes**: {sum(contents.outcomes)} of {contents.episodes} succeeded. By object: {objects}."
+    ]
+    if contents.held:
+        about += [
+            f"* **Held**: in {contents.held} steps the control loop held the arm; their `action` is no joint "
+            "step, and the gripper as before."
+        ]
+    rows = [f"| `{key}` | {_ROWS[key]} |" for key in contents.keys]
+    stored = _STORAGE[storage].format(farther=contents.farther)
+    reading = _READING.format(name=name, depth=DEPTH)
+    parts = [
+        header, *about, "\n## What a step has\n", "| key | what |", "|---|---|", *rows, f"\n{stored}",
+        f"\n## Made by\n\n```sh\n{command}\n```", "\n## Reading it", reading,
+    ]  # fmt: skip
+    return "\n".join(parts)

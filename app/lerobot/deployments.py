@@ -1,0 +1,96 @@
+"""Deployments and recorded trials, folders of steps and pictures, as episodes."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from app.lerobot.episode import Episode, Picture, Source
+from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.layout import ACTION, STATE
+from deploy.record import STEPS_FILE
+from evaluation.report.deployments import Deployment
+from sensors.recordings.recording import Recording, is_recording
+
+OBJECT = "object"
+"""Where a report names what was to be grasped."""
+OPEN = -1.0
+"""The gripper's command before the first action: the hand starts open."""
+
+
+def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
+    """Those of `found` that can be used as episodes; the others are named with the reason.
+
+    With `objects` only those whose report names one of them. Raises UserError if none is left.
+    """
+    if objects:
+        noted = {str(deployment.report.get(OBJECT, "")) for deployment in found} - {""}
+        if unknown := next((name for name in objects if name not in noted), None):
+            raise unknown_name("object", unknown, noted)
+        found = [deployment for deployment in found if deployment.report.get(OBJECT) in objects]
+    reasons = {deployment.folder: _unusable(deployment) for deployment in found}
+    usable = [deployment for deployment in found if not reasons[deployment.folder]]
+    left_out = [f"{folder.name}: {reason}" for folder, reason in reasons.items() if reason]
+    if not usable:
+        raise UserError(f"{found[0].folder.parent}: no episode can be used ({'; '.join(left_out)}).")
+    about = {
+        "Robot": f"Franka arm; driver or rig: {_each(usable, 'robot')}.",
+        "Camera": f"{_each(usable, 'camera')}, across the table; its depth is raw, with its holes and noise.",
+        "How it was made": f"A depth-only policy ({_each(usable, 'policy')}) moved the arm. `action` is what "
+        "it asked for, before the safety filter. Success is what the rig knows or a person answered.",
+    }
+    return Source("deployments", "franka", about, [partial(_read, each) for each in usable], left_out)
+
+
+def _each(deployments: Sequence[Deployment], key: str) -> str:
+    return ", ".join(dict.fromkeys(str(deployment.report.get(key, "unknown")) for deployment in deployments))
+
+
+def _unusable(deployment: Deployment) -> str:
+    """Why it is no episode; empty if it is one."""
+    report = deployment.report
+    if report["success"] is None:
+        return 'nobody judged it: set "success" in its report.json'
+    if not report["steps"] or report["frames"] != report["steps"]:
+        lacks = f"{report['frames']} pictures for {report['steps']} steps"
+        return f"{lacks}: on a rig deploy with --deploy.film-every 1"
+    if not is_recording(deployment.folder):
+        return "its pictures are gone"
+    return ""
+
+
+def _read(deployment: Deployment) -> Episode:
+    folder = deployment.folder
+    rows = [json.loads(line) for line in (folder / STEPS_FILE).read_text().splitlines()]
+    recording = Recording.open(folder)
+    if len(recording) != len(rows):
+        why = recording.skipped_summary() or f"{len(recording)} pictures for {len(rows)} steps"
+        raise UserError(f"{folder} is damaged ({why}): move it elsewhere.")
+
+    def pictures() -> Iterator[Picture]:
+        for rgb, depth_mm in recording.frames():
+            yield depth_mm, rgb
+
+    return Episode(
+        name=folder.name,
+        object_name=str(deployment.report.get(OBJECT, "")),
+        success=bool(deployment.report["success"]),
+        state=np.array([[*row["q_rad"], row["width_m"]] for row in rows], np.float32).reshape(-1, STATE.size),
+        action=actions(rows),
+        pictures=pictures,
+        held=np.array([row["action"] is None for row in rows]),
+    )
+
+
+def actions(rows: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """(T, 8) float32; a step that was held is what holding does: no joint step, the gripper as before."""
+    made = np.zeros((len(rows), ACTION.size), np.float32)
+    gripper = OPEN
+    for action, row in zip(made, rows, strict=True):
+        if row["action"] is not None:
+            action[:] = row["action"]
+            gripper = action[ACTION.gripper.start]
+        action[ACTION.gripper] = gripper
+    return made

@@ -1,0 +1,31 @@
+"""Finds out what kind of episodes a folder holds."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from app.lerobot import demonstrations, deployments
+from app.lerobot.episode import Source
+from ddgrasp.errors import UserError
+from evaluation.report.deployments import find
+
+
+def open_source(path: Path, objects: Sequence[str] = ()) -> Source:
+    """The episodes at `path`, those with `objects` alone if any are named.
+
+    Raises:
+      UserError: there are none, none with these objects, or what is there is damaged.
+    """
+    if (stage := demonstrations.find(path)) is not None:
+        return demonstrations.read(stage, objects)
+    if found := find(path):
+        return deployments.read(found, objects)
+    raise UserError(
+        f"{path} has neither demos/episodes.zarr nor deployments: give a run (runs/demo) or a folder of "
+        "deployments (runs/deployments)."
+    )
+
+
+def limited(source: Source, episodes: int) -> Source:
+    """The first `episodes` of them, or all if that is 0."""
+    return replace(source, episodes=source.episodes[:episodes]) if episodes else source

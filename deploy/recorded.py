@@ -1,0 +1,86 @@
+"""Trials that leave behind what a deployment does: every step, a picture of each, how it ended."""
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import contract
+from ddgrasp.config import Config
+from deploy.interfaces import Filmed
+from deploy.loop import Step
+from deploy.record import DeploymentRecord
+from deploy.timing import Timings
+from deploy.trials import Bench, Trial, TrialResult, Watch
+from rig.film import Film
+
+
+@dataclass(frozen=True)
+class RecordedBench:
+    """Makes a `RecordingBench` in every worker."""
+
+    make: Callable[[Config, Path], Bench]
+    """Makes what the trials are run on."""
+    folder: Path
+    """Each trial becomes a folder in it."""
+    about: Mapping[str, str]
+    """For every report: robot, camera."""
+
+    def __call__(self, config: Config, policy_path: Path) -> "RecordingBench":
+        return RecordingBench(self, config, policy_path)
+
+
+class RecordingBench:
+    """Runs trials on another bench and keeps them."""
+
+    def __init__(self, what: RecordedBench, config: Config, policy_path: Path):
+        self._what, self._config, self._policy_path = what, config, policy_path
+        self._bench = what.make(config, policy_path)
+
+    def run(self, trial: Trial, watch: Watch | None = None) -> tuple[TrialResult, Film]:
+        """See Bench. A colour picture is drawn in every step, which takes time that is not the robot's."""
+        folder = self._what.folder / f"{trial.index:04d}-{trial.object_name}"
+        about = {**self._what.about, "policy": str(self._policy_path), "object": trial.object_name}
+        kept: list[DeploymentRecord] = []
+        with ExitStack() as frames:
+
+            def look(step: Step, camera: Filmed) -> None:
+                if step.index == 0:  # also where a trial is run again
+                    frames.close()
+                    profile = self._config.world.profile
+                    kept[:] = [DeploymentRecord(camera, profile, f"{about['camera']}, D455 profile", 1)]
+                    frames.enter_context(kept[0].into(folder))
+                kept[0].look(step)
+                if watch is not None:
+                    watch(step, camera)
+
+            result, film = self._bench.run(trial, look)
+        for record in kept:
+            record.finish(folder, _report(result), result.success, about)
+        return result, film
+
+    def close(self) -> None:
+        """See Bench."""
+        self._bench.close()
+
+
+def _report(result: TrialResult) -> dict[str, Any]:
+    """What `LoopReport.as_dict` says of a deployment, as far as a trial's result knows it."""
+    faults = [event.split(" fault: ", 1)[1] for event in result.events if " fault: " in event]
+    timings = Timings(
+        result.sense_s,
+        result.infer_s,
+        result.act_s,
+        result.latency_s,
+        result.period_s,
+        result.missed_deadlines,
+    )
+    return {
+        "steps": result.steps,
+        "holds": result.holds,
+        "fault": next(iter(faults), ""),
+        "safety": result.safety,
+        "events": result.events,
+        **timings.summary(contract.CONTROL_DT_S),
+    }

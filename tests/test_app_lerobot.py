@@ -1,0 +1,245 @@
+"""What goes into a LeRobot dataset; and, where lerobot is installed, what its own reader reads from it."""
+
+import re
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.commands import parse
+from app.lerobot import card, dataset, steps
+from app.lerobot.source import limited, open_source
+from ddgrasp import contract
+from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
+from ddgrasp.progress import Progress
+from lerobot_support import LENGTHS, OBJECTS, SIZE, write_demos, write_deployment
+
+NAMES = get_preset("debug").world.objects
+QUIET = Progress(quiet=True)
+
+
+def write(source, out, **changes):
+    how = {"storage": "video", "task": "", "licence": "apache-2.0", "command": "ddgrasp", "progress": QUIET}
+    return dataset.write(source, out, **{**how, **changes})
+
+
+def test_demonstrations_are_the_store_s_episodes(tmp_path):
+    written = write_demos(tmp_path)
+    for place in (tmp_path, tmp_path / "demos", tmp_path / "demos" / "episodes.zarr"):
+        assert len(open_source(place).episodes) == len(LENGTHS)
+    for read, arrays, which in zip(open_source(tmp_path).episodes, written, OBJECTS, strict=True):
+        episode = read()
+        assert episode.task == f"grasp the {NAMES[which]} and lift it" and episode.success
+        assert not episode.held.any()
+        np.testing.assert_array_equal(episode.state, arrays["state"])
+        np.testing.assert_array_equal(episode.action, arrays["action"])
+        np.testing.assert_array_equal(episode.T_world_cam, arrays["T_world_cam"])
+        depth_mm, rgb = zip(*episode.pictures(), strict=True)
+        np.testing.assert_array_equal(depth_mm, arrays["depth_mm"])
+        np.testing.assert_array_equal(rgb, arrays["rgb"])
+
+
+def test_a_selection_by_object_and_number(tmp_path):
+    write_demos(tmp_path)
+    chosen = open_source(tmp_path, [NAMES[1]])
+    assert [len(read().state) for read in chosen.episodes] == [LENGTHS[0], LENGTHS[2]]
+    assert [len(read().state) for read in limited(chosen, 1).episodes] == [LENGTHS[0]]
+    with pytest.raises(UserError, match="Unknown object 'pineapple'"):
+        open_source(tmp_path, ["pineapple"])
+
+
+def test_a_deployment_is_an_episode_with_its_verdict(tmp_path):
+    states, depth_mm = write_deployment(tmp_path / "one", success=False, held=(0, 2), object="can")
+    (read,) = open_source(tmp_path).episodes
+    episode = read()
+    assert (episode.success, episode.task) == (False, "grasp the can and lift it")
+    np.testing.assert_array_equal(episode.state, states.astype(np.float32))
+    np.testing.assert_array_equal([depth for depth, _ in episode.pictures()], depth_mm)
+    # A step that was held moves no joint and leaves the gripper as it was: open at first, then closing.
+    np.testing.assert_array_equal(episode.action[:, 7], [-1, 1, 1, 1])
+    np.testing.assert_allclose(episode.action[:, 0], [0, 0.1, 0, 0.3], rtol=1e-6)
+    assert episode.held.tolist() == [True, False, True, False]
+
+
+def test_deployments_that_are_no_episodes_are_named(tmp_path):
+    write_deployment(tmp_path / "judged")
+    write_deployment(tmp_path / "open", success=None)
+    write_deployment(tmp_path / "thin", frames=1)
+    source = open_source(tmp_path)
+    assert [read().name for read in source.episodes] == ["judged"]
+    assert sorted(line.split(":")[0] for line in source.left_out) == ["open", "thin"]
+    assert "1 pictures for 4 steps" in " ".join(source.left_out)
+    assert open_source(tmp_path / "judged").episodes[0]().task == "grasp the object and lift it"
+    with pytest.raises(UserError, match="no episode can be used .*film-every 1"):
+        open_source(tmp_path / "thin")
+    with pytest.raises(UserError, match="Unknown object 'can'"):
+        open_source(tmp_path, ["can"])
+
+
+def test_a_folder_without_episodes(tmp_path):
+    with pytest.raises(UserError, match="has neither demos/episodes.zarr nor deployments"):
+        open_source(tmp_path)
+
+
+def test_every_step_has_what_the_features_say(tmp_path):
+    write_demos(tmp_path)
+    episode = open_source(tmp_path).episodes[0]()
+    described = steps.features(SIZE, SIZE, True, "video")
+    made = list(steps.frames(episode, "lift it"))
+    for frame in made:
+        assert frame.pop("task") == "lift it" and frame.keys() == described.keys()
+        assert {key: value.shape for key, value in frame.items()} == {
+            key: described[key]["shape"] for key in frame
+        }
+    assert [bool(frame[steps.DONE][0]) for frame in made] == [False] * 6 + [True]
+    for key in (steps.STATE_KEY, steps.ACTION_KEY):
+        assert len(described[key]["names"]) == 8 and described[key]["names"][0].startswith("joint1.")
+
+
+def test_the_card_says_what_is_in_it(tmp_path):
+    write_demos(tmp_path, with_rgb=False)
+    source = open_source(tmp_path)
+    contents = card.Contents(keys=tuple(steps.features(SIZE, None, True, "video")))
+    for read in source.episodes:
+        contents.count(read(), 3)
+    how = {"name": "set", "storage": "video", "licence": "cc-by-4.0", "command": "ddgrasp demos export x"}
+    text = card.render(source, contents, **how)
+    assert (
+        text.startswith("---\nlicense: cc-by-4.0\n") and f"3 episodes, {sum(LENGTHS)} steps at 10 Hz" in text
+    )
+    for said in (
+        "3 of 3 succeeded", f"{NAMES[1]} 2", f"{NAMES[0]} 1", "Franka Emika Panda", "9 pixels", "millimetres",
+        "ddgrasp demos export x", f"{contract.ACTION_SCALE_RAD:g} rad",
+    ):  # fmt: skip
+        assert said in text, said
+    assert (
+        steps.POSE in text
+        and f"`{steps.COLOUR}`" not in text
+        and "held" not in text.split("##")[0].split("* ")
+    )
+
+
+def test_what_stands_there_is_not_touched(tmp_path, monkeypatch):
+    write_demos(tmp_path / "run")
+    (tmp_path / "set").mkdir()
+    with pytest.raises(UserError, match="set exists: choose another --out"):
+        parse("demos export", [str(tmp_path / "run"), "--out", str(tmp_path / "set")]).run()
+
+
+def test_without_lerobot_it_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "lerobot", None)
+    write_demos(tmp_path / "run")
+    with pytest.raises(UserError, match=r"lerobot 0.6 or newer, on Python 3.12 .*pip install"):
+        parse("demos export", [str(tmp_path / "run"), "--out", str(tmp_path / "set")]).run()
+    assert not (tmp_path / "set").exists()
+
+
+def test_the_command_on_the_card_is_the_one_that_was_typed(tmp_path):
+    words = ["runs/demo", "--out", "sets/a b", "--episodes", "3", "--objects", "cube", "can"]
+    said = parse("demos export", words)._command()
+    assert said == "ddgrasp demos export runs/demo --out 'sets/a b' --episodes 3 --objects cube can"
+
+
+# --- with lerobot ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Read:
+    """A dataset as lerobot reads it."""
+
+    dataset: Any
+    written: list
+
+
+@pytest.fixture(scope="module", params=["video", "images"])
+def read(request, tmp_path_factory):
+    """The demonstrations of `lerobot_support`, exported and opened again."""
+    datasets = pytest.importorskip(
+        "lerobot.datasets", reason="needs pip install -e '.[lerobot]', Python 3.12"
+    )
+    run = tmp_path_factory.mktemp("run")
+    written = write_demos(run)
+    out = run / "set"
+    write(open_source(run), out, storage=request.param)
+    return Read(datasets.LeRobotDataset("set", root=out), written)
+
+
+def test_lerobot_reads_states_actions_and_depth_as_they_were(read):
+    dataset, row = read.dataset, 0
+    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (3, sum(LENGTHS), 10)
+    assert dataset.meta.depth_keys == [steps.DEPTH]
+    for number, arrays in enumerate(read.written):
+        for t in range(len(arrays["state"])):
+            item = dataset[row]
+            assert item["episode_index"] == number and item["frame_index"] == t
+            np.testing.assert_array_equal(item["observation.state"].numpy(), arrays["state"][t])
+            np.testing.assert_array_equal(item["action"].numpy(), arrays["action"][t])
+            np.testing.assert_array_equal(item[steps.DEPTH].numpy()[0], arrays["depth_mm"][t])
+            np.testing.assert_array_equal(item[steps.POSE].numpy(), arrays["T_world_cam"])
+            assert bool(item["next.success"]) == (t == len(arrays["state"]) - 1)
+            assert item["task"] == f"grasp the {NAMES[OBJECTS[number]]} and lift it"
+            row += 1
+
+
+def test_lerobot_finds_episodes_that_succeeded(read):
+    found = read.dataset.meta.filter_episodes(lambda episode: episode["success"])
+    assert found == [0, 1, 2]
+
+
+def test_lerobot_gives_windows_of_time(read):
+    import torch
+    from lerobot.datasets import LeRobotDataset
+
+    deltas = {steps.DEPTH: [-0.2, -0.1, 0.0], "action": [0.1 * i for i in range(4)]}
+    windows = LeRobotDataset("set", root=read.dataset.root, delta_timestamps=deltas)
+    batch = next(iter(torch.utils.data.DataLoader(windows, batch_size=2)))
+    assert batch[steps.DEPTH].shape == (2, 3, 1, *SIZE) and batch["action"].shape == (2, 4, 8)
+    expected = read.written[0]["depth_mm"][[0, 0, 1]]
+    np.testing.assert_array_equal(batch[steps.DEPTH][1, :, 0].numpy(), expected)
+
+
+def test_the_page_s_lines_read_it(read):
+    page = (Path(__file__).parents[1] / "docs" / "data.md").read_text()
+    _, code = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert '"sets/demo"' in code
+    names: dict = {}
+    exec(code.replace('"sets/demo"', repr(str(read.dataset.root))), names)
+    assert names["before_the_first"].tolist() == [True, True, False]
+    expected = read.written[0]["depth_mm"][[0, 0, 0]]
+    np.testing.assert_array_equal(names["depth_mm"][:, 0].numpy(), expected)
+
+
+def test_an_interrupted_export_leaves_nothing(read, tmp_path):
+    write_demos(tmp_path / "run")
+    source = open_source(tmp_path / "run")
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write(replace(source, episodes=[source.episodes[0], interrupted]), tmp_path / "sets" / "set")
+    assert list((tmp_path / "sets").iterdir()) == []
+
+
+def test_pictures_of_another_size_are_refused(read, tmp_path):
+    write_demos(tmp_path / "run", with_rgb=False)
+    source, other = open_source(tmp_path / "run"), open_source(read.dataset.root.parent)
+    mixed = replace(source, episodes=[source.episodes[0], other.episodes[0]])
+    with pytest.raises(UserError, match="a dataset has one size"):
+        write(mixed, tmp_path / "set")
+
+
+def test_a_video_caps_what_is_too_far_and_the_card_says_so(read, tmp_path):
+    from lerobot.datasets import LeRobotDataset
+
+    written = write_demos(tmp_path / "run", with_rgb=False, largest_mm=6000)
+    contents = write(limited(open_source(tmp_path / "run"), 1), tmp_path / "set")
+    depth_mm = written[0]["depth_mm"]
+    assert contents.farther == np.count_nonzero(depth_mm > 4095) > 0
+    assert f"{contents.farther} pixels" in (tmp_path / "set" / "README.md").read_text()
+    item = LeRobotDataset("set", root=tmp_path / "set")[2]
+    np.testing.assert_array_equal(item[steps.DEPTH][0].numpy(), np.minimum(depth_mm[2], 4095))

@@ -1,0 +1,65 @@
+"""Trials that are kept: a deployment's folder each, and the same trials as without."""
+
+import json
+
+import numpy as np
+import pytest
+
+from app.lerobot.source import open_source
+from ddgrasp import policy_metadata as metadata
+from ddgrasp.config import Config, PictureConfig, StudentConfig, WorldConfig
+from ddgrasp.progress import Progress
+from deploy.recorded import RecordedBench
+from deploy.trials import Rig, Trial
+from deploy_support import write_policy
+from evaluation import rig_trials
+from evaluation.report import deployments
+from evaluation.rig_trials import Series
+from sensors.recordings.recording import Recording
+
+CONFIG = Config(
+    preset="test",
+    world=WorldConfig(objects=("cube", "apple"), camera_scale=0.125, episode_steps=4),
+    student=StudentConfig(picture=PictureConfig(height_px=56, width_px=72)),
+)
+
+
+@pytest.fixture
+def policy(tmp_path):
+    """Lowers the arm by what the first pixel shows, so that what it sees is in what it does."""
+    info = metadata.describe_run(CONFIG, project_version="0", student_manifest_hash="0")
+    gain, bias = np.zeros((3, info.chunk, 8)), np.zeros((info.chunk, 8))
+    gain[2, :, 1], bias[:, 7] = 1e-4, -1.0
+    return write_policy(tmp_path / "policy.onnx", info, depth_gain=gain, bias=bias)
+
+
+def test_a_recorded_trial_is_an_episode(tmp_path, policy):
+    out, series = tmp_path / "out", Series("development", ("apple",), 1, seconds=0.4)
+    rig_trials.run(CONFIG, policy, series, out, 0, Progress(quiet=True), record=True)
+    (folder,) = (out / rig_trials.EPISODES).iterdir()
+    report = json.loads((folder / "report.json").read_text())
+    assert (report["steps"], report["frames"], report["object"]) == (4, 4, "apple")
+    assert report["success"] is False and report["robot"] == "rig development"
+    (read,) = open_source(out / rig_trials.EPISODES, ["apple"]).episodes
+    episode = read()
+    assert episode.task == "grasp the apple and lift it" and not episode.success
+    corner_mm = [float(depth_mm[0, 0]) for depth_mm, _ in episode.pictures()]
+    np.testing.assert_allclose(episode.action[:, 1], np.clip(np.multiply(corner_mm, 1e-4), -1, 1), rtol=1e-5)
+    assert all(rgb.any() for _, rgb in episode.pictures())
+    assert deployments.verdict(deployments.find(out / rig_trials.EPISODES)).startswith("Success 0.0 % of 1")
+
+
+def test_recording_changes_nothing_in_a_trial(tmp_path, policy):
+    trial = Trial(3, "cube")
+    plain, _ = Rig(CONFIG, policy).run(trial)
+    bench = RecordedBench(Rig, tmp_path / "kept", {"robot": "rig", "camera": "stereo"})(CONFIG, policy)
+    states: dict[str, list] = {"first": [], "again": []}
+    for name in states:
+        kept, _ = bench.run(trial, lambda step, camera, name=name: states[name].append(step.state.vector()))
+        assert (kept.steps, kept.success, kept.safety, kept.events) == (
+            plain.steps, plain.success, plain.safety, plain.events,
+        )  # fmt: skip
+    bench.close()
+    np.testing.assert_array_equal(states["first"], states["again"])
+    recording = Recording.open(tmp_path / "kept" / "0003-cube")
+    assert len(recording) == 4 and recording.consecutive and not recording.skipped
