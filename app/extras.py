@@ -23,6 +23,8 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "deploy trials": ("sim",),
     "objects list": ("sim",),
     "rig fr3": ("fr3",),
+    "rig pictures": ("fr3",),
+    "record fr3": ("fr3",),
     "calibrate": ("franka", "realsense"),
     "calibrate board": ("franka", "realsense"),
     "record realsense": ("realsense",),

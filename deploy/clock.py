@@ -1,9 +1,8 @@
 """The clocks a loop can run on."""
 
 import time
-from collections.abc import Callable
 
-from deploy.interfaces import RobotError
+from deploy.interfaces import RobotError, TimedRobot
 
 _SPIN_S = 0.0005
 """The last half millisecond is waited for awake: the scheduler wakes sleepers tens of microseconds late."""
@@ -34,17 +33,20 @@ class RobotClock:
     def __init__(self, stalled_after_s: float = 5.0):
         """`stalled_after_s` of the machine's time without any of the robot's is an error."""
         self._stalled_after_s = stalled_after_s
-        self._read: Callable[[], float | None] = lambda: None
+        self._robot: TimedRobot | None = None
         self._before_s = 0.0
         self._robot_s = 0.0
 
-    def follow(self, read: Callable[[], float | None]) -> None:
-        """Keep the time that `read` tells, in seconds; None where there is none."""
-        self._read = read
+    def follow(self, robot: TimedRobot) -> None:
+        """Keep the time that `robot` tells."""
+        self._robot = robot
 
     def now(self) -> float:
-        """Seconds, monotonic: a robot that counts anew after a new connection goes on from where it was."""
-        seconds = self._read()
+        """Seconds, monotonic: a robot that counts anew after a new connection goes on from where it was.
+
+        Raises RobotError.
+        """
+        seconds = self._read_s()
         if seconds is not None:
             if seconds < self._robot_s:
                 self._before_s += self._robot_s
@@ -52,7 +54,10 @@ class RobotClock:
         return self._before_s + self._robot_s
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Returns when `now` has reached the deadline. Raises RobotError if the robot's time stands still."""
+        """Returns when `now` has reached the deadline.
+
+        Raises RobotError if the robot's time stands still: with the robot's own reason where it has one.
+        """
         now_s, moved_at = self.now(), time.monotonic()
         while now_s < deadline_s:
             time.sleep(max(deadline_s - now_s - _SPIN_S, _SPIN_S))  # robots are not faster than the machine
@@ -60,7 +65,20 @@ class RobotClock:
             if now_s > before_s:
                 moved_at = time.monotonic()
             elif time.monotonic() - moved_at > self._stalled_after_s:
+                self._ask_why()
                 raise RobotError(f"the robot's clock has stood still for {self._stalled_after_s:g} s")
+
+    def _read_s(self) -> float | None:
+        return None if self._robot is None else self._robot.time_s()
+
+    def _ask_why(self) -> None:
+        """Raises the RobotError of whatever stopped the robot, if it knows.
+
+        A driver tells the last time that it heard of; that nothing more came, it says when it is asked for
+        the joints.
+        """
+        if self._robot is not None and self._read_s() is not None:
+            self._robot.read_state()
 
 
 class SimClock:

@@ -4,10 +4,13 @@ All timestamps are seconds on the clock's own monotonic scale, so that ages can 
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8, UInt16
+
+if TYPE_CHECKING:
+    import mujoco
 
 Depth = UInt16[np.ndarray, "H W"] | Float32[np.ndarray, "H W"]
 
@@ -168,6 +171,15 @@ class Simulated(Protocol):
 
     def clean_mm(self) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 millimetres of the moment, 0 = nothing in range."""
+        ...
+
+
+@runtime_checkable
+class Staged(Protocol):
+    """A camera before a simulation that can be looked at from anywhere."""
+
+    def scene(self) -> "tuple[mujoco.MjModel, mujoco.MjData]":
+        """What is simulated; both change in place as it goes on."""
         ...
 
 

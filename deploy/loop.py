@@ -72,6 +72,10 @@ class LoopReport:
     """What ended the run where the robot did: a reflex, a lost connection."""
     width_m: float | None = None
     """The gripper's opening at the last step."""
+    clock_s: float = 0.0
+    """Seconds from the first step to the end of the last, on the loop's clock."""
+    machine_s: float = 0.0
+    """The same on this machine's: more where a simulated robot is slower than real."""
     timings: Timings = field(default_factory=Timings)
     safety: SafetyCounts = field(default_factory=SafetyCounts)
     events: list[Event] = field(default_factory=list)
@@ -85,6 +89,8 @@ class LoopReport:
             "interrupted": self.interrupted,
             "fault": self.fault,
             "width_m": self.width_m,
+            "clock_s": round(self.clock_s, 3),
+            "machine_s": round(self.machine_s, 3),
             "safety": self.safety.as_dict(),
             "events": [str(event) for event in self.events],
             "events_dropped": self.events_dropped,
@@ -144,7 +150,7 @@ class ControlLoop:
 
     def _keep_time(self, max_steps: int | None, on_step: Callable[[Step], bool | None] | None) -> None:
         deadline, previous, done = self._clock.now(), None, max_steps == 0
-        self._start_s = deadline
+        self._start_s, started = deadline, time.monotonic()
         while not done:
             self._clock.sleep_until(deadline)
             begun = self._clock.now()
@@ -156,6 +162,7 @@ class ControlLoop:
             done = self._report.steps == max_steps
             if on_step is not None:
                 done = bool(on_step(step)) or done
+            self._report.clock_s, self._report.machine_s = self._now_s(), time.monotonic() - started
             deadline = self._next_deadline(deadline)
         self._clock.sleep_until(deadline)
         self._look_at_hand()

@@ -129,7 +129,7 @@ def keep_time_of(robot: Robot, clock: Clock, options: SessionOptions) -> None:
         return
     if not isinstance(robot, TimedRobot):
         raise UserError(f"robot {options.robot!r} has no clock of its own: set deploy.clock machine.")
-    clock.follow(robot.time_s)
+    clock.follow(robot)
 
 
 def _new_folder(out: Path) -> Path:
@@ -175,6 +175,7 @@ def describe(report: LoopReport) -> str:
     return "\n".join([
         *rows,
         f"{report.steps} steps, {report.timings.missed_deadlines} missed deadlines, {report.holds} holds",
+        f"{report.clock_s:.1f} s on the loop's clock took {report.machine_s:.1f} s of this machine's time",
         f"safety filter: {safety}",
         *([f"ended by: {report.fault}"] if report.fault else []),
     ])  # fmt: skip

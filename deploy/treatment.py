@@ -1,14 +1,17 @@
 """What may be done to recorded depth on its way to the policy: a camera that hands out treated frames."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from ddgrasp.errors import UserError
-from deploy.interfaces import Camera, CameraError, Depth, Filmed, Frame
+from deploy.interfaces import Camera, CameraError, Depth, Filmed, Frame, Simulated
 from sensors.inpainting import RADIUS_PX, inpainted
+
+CleanDepth = Callable[[], UInt16[np.ndarray, "H W"]]
 
 
 @runtime_checkable
@@ -22,6 +25,15 @@ class Treatment(Protocol):
 
     def __call__(self, depth: Depth, rgb: UInt8[np.ndarray, "h w 3"] | None) -> Depth:
         """(H, W) depth of the same size and unit; `rgb` of the same moment, where `needs_rgb`."""
+        ...
+
+
+@runtime_checkable
+class Replacement(Protocol):
+    """A treatment that before a simulation may put other depth in the place of what was recorded."""
+
+    def replace(self, depth: Depth, clean_mm: CleanDepth) -> Depth:
+        """(H, W) depth that the policy sees; `clean_mm` gives what a camera without errors would."""
         ...
 
 
@@ -46,9 +58,12 @@ class Inpaint:
 class TreatedCamera:
     """A camera whose frames are treated, each once. What is not a frame (films, verdicts), ask the camera."""
 
-    def __init__(self, camera: Camera, treatment: Treatment):
-        """Raises UserError if the treatment needs colour and the camera gives none."""
-        if treatment.needs_rgb and not isinstance(camera, Filmed):
+    def __init__(self, camera: Camera, treatment: Treatment | Replacement):
+        """Raises UserError if the treatment needs what the camera does not give: colour, clean depth."""
+        if isinstance(treatment, Replacement):
+            if not isinstance(camera, Simulated):
+                raise UserError(f"{type(treatment).__name__} needs a simulation: choose a rig's camera.")
+        elif treatment.needs_rgb and not isinstance(camera, Filmed):
             raise UserError(f"{type(treatment).__name__} needs a camera with colour: choose another camera.")
         self._camera, self._treatment = camera, treatment
         self._taken: Frame | None = None
@@ -62,22 +77,27 @@ class TreatedCamera:
         """See Camera: the newest frame, treated. Raises CameraError."""
         taken = self._camera.read()
         if self._frame is None or taken is not self._taken:
-            depth = self._treatment(taken.depth, self._colour(taken))
-            self._taken, self._frame = taken, replace(taken, depth=depth)
+            self._taken, self._frame = taken, replace(taken, depth=self._treat(taken))
         return self._frame
 
     def stop(self) -> None:
         """See Camera."""
         self._camera.stop()
 
-    def _colour(self, frame: Frame) -> UInt8[np.ndarray, "h w 3"] | None:
-        if not self._treatment.needs_rgb or frame.rgb is not None:
+    def _treat(self, frame: Frame) -> Depth:
+        if isinstance(self._treatment, Replacement):
+            assert isinstance(self._camera, Simulated)
+            return self._treatment.replace(frame.depth, self._camera.clean_mm)
+        return self._treatment(frame.depth, self._colour(frame, self._treatment))
+
+    def _colour(self, frame: Frame, treatment: Treatment) -> UInt8[np.ndarray, "h w 3"] | None:
+        if not treatment.needs_rgb or frame.rgb is not None:
             return frame.rgb
         if not isinstance(self._camera, Filmed):
             raise CameraError("no colour with the frame")
         return self._camera.picture()
 
 
-def treated(camera: Camera, treatment: Treatment | None) -> Camera:
+def treated(camera: Camera, treatment: Treatment | Replacement | None) -> Camera:
     """`camera` itself without a treatment."""
     return camera if treatment is None else TreatedCamera(camera, treatment)

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from ddgrasp.config import Config
+from deploy.changes import AS_IT_IS, Change
 from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
 from deploy.devices.rig_robot import SimRobot
@@ -23,7 +24,7 @@ from deploy.interfaces import Depth, Filmed
 from deploy.loop import ControlLoop, LoopReport, Step
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
-from deploy.treatment import Treatment, treated
+from deploy.treatment import Replacement, Treatment, treated
 from rig.film import Film
 
 _STREAM = 0x526967
@@ -73,8 +74,8 @@ def plan(config: Config) -> list[Trial]:
     return simulated + real
 
 
-Watch = Callable[[Step, Filmed], None]
-"""Is called after every step, with the camera of the trial for colour pictures."""
+Watch = Callable[[Step, Filmed], bool | None]
+"""Is called after every step, with the camera of the trial for colour pictures; True ends the trial."""
 
 
 WatchPolicy = Callable[[Depth, np.ndarray, np.ndarray], None]
@@ -93,41 +94,61 @@ class Bench(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Draw:
+    """What chance decides about a trial."""
+
+    world_seed: int
+    """The object's place, its size, the arm's dynamics follow from it (`rig.world.RigWorld.reset`)."""
+    policy_seed: int
+    T_world_cam: Float[np.ndarray, "4 4"]
+    """(4, 4) where the camera stands."""
+    rng: np.random.Generator
+    """Draws the camera's noise."""
+
+
+def drawn(config: Config, trial: Trial) -> Draw:
+    """The same for the same seed and trial, whatever else is changed."""
+    from rig.camera import camera_pose
+
+    rng = np.random.default_rng([config.seed, _STREAM, trial.index])
+    world_seed, policy_seed = int(rng.integers(2**31)), int(rng.integers(2**31))
+    return Draw(world_seed, policy_seed, camera_pose(config, rng), rng)
+
+
 class Rig:
     """World, camera and policy, built once and used for one trial after the other."""
 
     def __init__(
-        self, config: Config, policy_path: Path, ideal: bool = False, treatment: Treatment | None = None
+        self,
+        config: Config,
+        policy_path: Path,
+        change: Change = AS_IT_IS,
+        treatment: Treatment | Replacement | None = None,
     ):
-        """`ideal` looks through a camera without errors instead of the stereo camera; `treatment` is what is
-        done to depth before the policy sees it."""
+        """`change` is what is otherwise than in the development rig; `treatment` is what is done to depth
+        before the policy sees it."""
         import cv2
 
-        from rig.camera import make_camera
-        from rig.world import make_world
-
         cv2.setNumThreads(1)
-        self._config, self._treatment = config, treatment
+        self._config, self._treatment, self._change = config, treatment, change
         self._policy = OnnxPolicy(
             policy_path, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None
         )
-        self._world = make_world(config.world)
-        self._camera = make_camera(config, self._world, ideal)
+        self._world = change.make_world(config)
+        self._camera = change.make_camera(config, self._world)
 
     def run(self, trial: Trial, watch: Watch | None = None) -> tuple[TrialResult, Film]:
         """Run one trial. The same trial gives the same result on the simulated clock."""
-        from rig.camera import camera_pose
-
-        config = self._config
-        rng = np.random.default_rng([config.seed, _STREAM, trial.index])
-        self._world.reset(int(rng.integers(2**31)), trial.object_name)
-        self._policy.reset(int(rng.integers(2**31)))
+        config, draw = self._config, drawn(self._config, trial)
+        self._world.reset(draw.world_seed, trial.object_name)
+        self._camera.model = self._world.model  # some changes compile it anew for every trial
+        self._policy.reset(draw.policy_seed)
         clock = RealClock() if trial.realtime else SimClock()
         settings = loop_settings(config.deploy, self._policy.info)
         robot = SimRobot(self._world, clock, settings.period_s)
-        camera = StereoCamera(
-            self._world, self._camera, camera_pose(config, rng), rng, robot.catch_up, trial.object_name
-        )
+        pose = self._change.displaced(draw.T_world_cam, draw.world_seed)
+        camera = StereoCamera(self._world, self._camera, pose, draw.rng, robot.catch_up, trial.object_name)
         safety = safety_filter(config.deploy, self._policy.info)
         seen = treated(camera, self._treatment)
         loop = ControlLoop(seen, robot, self._policy, safety, clock, settings)
@@ -188,12 +209,11 @@ class Filming:
         self._camera, self._every, self._watch = camera, every, watch
         self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
 
-    def look(self, step: Step) -> None:
-        """Takes the picture if it is due; what the loop's `on_step` is called with."""
+    def look(self, step: Step) -> bool | None:
+        """Takes the picture if it is due; what the loop's `on_step` is called with. True ends the trial."""
         if step.index % self._every == 0 and step.frame is not None:
             self._columns.append((step.index, self._camera.picture(), step.frame.depth))
-        if self._watch is not None:
-            self._watch(step, self._camera)
+        return None if self._watch is None else self._watch(step, self._camera)
 
     def film(self) -> Film:
         """The pictures so far."""

@@ -1,31 +1,18 @@
-"""What a person watches a trial with: a video file, or Rerun, in a window or in the browser."""
+"""What a person watches a trial with: a film (deploy/video.py), Rerun, or MuJoCo's own viewer."""
 
+import sys
+import time
+import warnings
 from collections.abc import Callable
-from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-from jaxtyping import UInt8, UInt16
-
 from ddgrasp import contract
-from ddgrasp.depth import to_millimetres
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_path
-from deploy.interfaces import Depth, Filmed, Simulated
+from deploy.interfaces import Filmed, Staged
 from deploy.loop import Step
-from rig.film import colored
-
-VIDEO_CODECS = {".mp4": "mp4v", ".webm": "VP90"}
-"""By the file's ending; browsers play WebM, and mp4v only players do."""
-PANEL_PX = 640
-"""Width of one picture in a video."""
-NEAR_MM, FAR_MM = 350.0, 1100.0
-"""Ends of the depth pictures' colour scale."""
-VERDICT_S = 1.0
-"""How long a video stays at the last picture."""
-_LINE_PX = 30
+from deploy.video import millimetres
 
 
 class Viewer(Protocol):
@@ -43,87 +30,13 @@ class Viewer(Protocol):
         """The trial has ended like this."""
         ...
 
+    def watched(self) -> bool:
+        """Whether it is still looked at: a window may have been closed."""
+        ...
+
     def close(self) -> None:
         """There are no more trials."""
         ...
-
-
-Noise = Callable[[UInt16[np.ndarray, "H W"]], UInt16[np.ndarray, "H W"]]
-"""Clean depth -> depth with a camera's errors, millimetres."""
-
-
-class Video:
-    """Colour beside the depth that the policy sees, a picture for every control step; with `noise` also what
-    that makes of clean depth, before cameras that know it."""
-
-    def __init__(self, path: Path, noise: Noise | None = None):
-        """UserError for another ending than .mp4 or .webm, or if OpenCV has no such encoder."""
-        import cv2
-
-        if path.suffix not in VIDEO_CODECS:
-            raise UserError(f"--out {path}: a film ends with {' or '.join(VIDEO_CODECS)}.")
-        self._files, self._path, self._cv2, self._noise = ExitStack(), path, cv2, noise
-        self._writer: Any = None
-        self._title, self._last = "", np.zeros((0, 0, 3), np.uint8)
-
-    def begin(self, title: str) -> None:
-        """See `Viewer`."""
-        self._title = title
-
-    def look(self, step: Step, camera: Filmed) -> None:
-        """See `Viewer`."""
-        if step.frame is None:
-            return
-        panels = [self._panel("colour", camera.picture(), exact=False)]
-        panels.append(self._panel("camera's depth", depth_picture(step.frame.depth)))
-        if self._noise is not None and isinstance(camera, Simulated):
-            panels.append(self._panel("generator's depth", depth_picture(self._noise(camera.clean_mm()))))
-        self._last = np.concatenate(panels, axis=1)
-        text = f"{self._title}   step {step.index}   hand {1e3 * step.state.width_m:.0f} mm"
-        self._write(self._labelled(text))
-
-    def end(self, verdict: str) -> None:
-        """See `Viewer`."""
-        for _ in range(round(VERDICT_S * contract.CONTROL_HZ)):
-            self._write(self._labelled(f"{self._title}   {verdict}"))
-
-    def close(self) -> None:
-        """The film takes its name."""
-        if self._writer is not None:
-            self._writer.release()
-        self._files.close()
-
-    def _panel(
-        self, caption: str, picture: UInt8[np.ndarray, "H W 3"], exact: bool = True
-    ) -> UInt8[np.ndarray, "h w 3"]:
-        height, width = picture.shape[:2]
-        size = PANEL_PX, 2 * round(PANEL_PX * height / width / 2)
-        how = self._cv2.INTER_NEAREST if exact else self._cv2.INTER_CUBIC
-        panel = self._cv2.resize(picture, size, interpolation=how)
-        self._say(panel, caption, (255, 255, 255), size[1] - 10)
-        return panel
-
-    def _say(self, picture: UInt8[np.ndarray, "h w 3"], text: str, rgb: tuple[int, ...], y: int) -> None:
-        font = self._cv2.FONT_HERSHEY_SIMPLEX
-        self._cv2.putText(picture, text, (8, y), font, 0.5, rgb, 1, self._cv2.LINE_AA)
-
-    def _labelled(self, text: str) -> UInt8[np.ndarray, "h w 3"]:
-        bar = np.full((_LINE_PX, self._last.shape[1], 3), 255, np.uint8)
-        self._say(bar, text, (0, 0, 0), _LINE_PX - 10)
-        return np.concatenate([bar, self._last])
-
-    def _write(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-        if self._writer is None:
-            self._writer = self._opened(picture.shape[1], picture.shape[0])
-        self._writer.write(picture[..., ::-1])
-
-    def _opened(self, width: int, height: int) -> Any:
-        temporary = self._files.enter_context(atomic_path(self._path))
-        code = self._cv2.VideoWriter.fourcc(*VIDEO_CODECS[self._path.suffix])
-        writer = self._cv2.VideoWriter(str(temporary), code, contract.CONTROL_HZ, (width, height))
-        if not writer.isOpened():
-            raise UserError(f"This OpenCV cannot write {self._path.suffix} films: try another ending.")
-        return writer
 
 
 class Rerun:
@@ -160,7 +73,7 @@ class Rerun:
         if step.frame is not None:
             depth = step.frame.depth
             rr.log("camera/colour", rr.Image(camera.picture()))
-            rr.log("camera/depth", rr.DepthImage(_millimetres(depth), meter=1000.0))
+            rr.log("camera/depth", rr.DepthImage(millimetres(depth), meter=1000.0))
         rr.log("robot/joints_rad", rr.Scalars(step.state.q_rad))
         rr.log("robot/width_mm", rr.Scalars(1e3 * step.state.width_m))
         if step.action is not None:
@@ -169,6 +82,10 @@ class Rerun:
     def end(self, verdict: str) -> None:
         """See `Viewer`."""
         self._note(verdict)
+
+    def watched(self) -> bool:
+        """See `Viewer`: who looks is not known."""
+        return True
 
     def close(self) -> None:
         """What was shown has been sent or is in the file."""
@@ -179,10 +96,75 @@ class Rerun:
         self._rr.log("trials", self._rr.TextLog(text))
 
 
-def depth_picture(depth: Depth) -> UInt8[np.ndarray, "H W 3"]:
-    """(H, W, 3) uint8 of (H, W) depth on one scale for all frames; magenta where there is none."""
-    return colored(_millimetres(depth), NEAR_MM, FAR_MM)
+class MujocoWindow:
+    """MuJoCo's passive viewer: the scene from wherever the mouse looks, no faster than it happens."""
+
+    def __init__(self, key: Callable[[int], None] | None = None):
+        """`key` is told GLFW's code of every key. UserError where no window can be opened."""
+        if sys.platform == "linux" and not _can_open():
+            raise UserError("--viewer mujoco: no window can be opened on this display: choose web, or film.")
+        self._key = key
+        self._handle: Any = None
+        self._model: Any = None
+        self._closed = False
+        self._next_s = 0.0
+
+    def begin(self, title: str) -> None:
+        """See `Viewer`; the title goes to the terminal alone."""
+
+    def look(self, step: Step, camera: Filmed) -> None:
+        """See `Viewer`. UserError if the camera's scene cannot be shown, or the window not opened."""
+        if self._closed:
+            return
+        if not isinstance(camera, Staged):
+            raise UserError("--viewer mujoco shows rigs alone: choose another viewer.")
+        model, data = camera.scene()
+        if model is not self._model:
+            self._open(model, data)
+        self._closed = not self._handle.is_running()
+        if not self._closed:
+            self._handle.sync()
+            self._keep_pace()
+
+    def end(self, verdict: str) -> None:
+        """See `Viewer`."""
+
+    def watched(self) -> bool:
+        """See `Viewer`."""
+        self._closed = self._closed or (self._handle is not None and not self._handle.is_running())
+        return not self._closed
+
+    def close(self) -> None:
+        """The window goes."""
+        if self._handle is not None:
+            self._handle.close()
+
+    def _open(self, model: Any, data: Any) -> None:
+        self.close()
+        viewer = import_module("mujoco.viewer")
+        try:
+            self._handle = viewer.launch_passive(
+                model, data, key_callback=self._key, show_left_ui=False, show_right_ui=False
+            )
+        except RuntimeError as error:  # on macOS it wants mjpython
+            raise UserError(f"--viewer mujoco: {error}: choose web.") from error
+        self._model = model
+        with self._handle.lock():
+            self._handle.cam.lookat[:] = _LOOK_AT_M
+            self._handle.cam.distance, self._handle.cam.azimuth, self._handle.cam.elevation = _FROM
+
+    def _keep_pace(self) -> None:
+        now_s = time.monotonic()
+        time.sleep(max(0.0, self._next_s - now_s))
+        self._next_s = max(now_s, self._next_s) + contract.CONTROL_DT_S
 
 
-def _millimetres(depth: Depth) -> np.ndarray:
-    return depth if depth.dtype == np.uint16 else to_millimetres(depth)
+def _can_open() -> bool:
+    """MuJoCo ends the whole process where GLFW cannot start."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return bool(import_module("glfw").init())
+
+
+_LOOK_AT_M, _FROM = (0.4, 0.0, 0.25), (1.6, 140.0, -20.0)
+"""Where the window looks at first: a point, and metres, azimuth and elevation (degrees) from it."""

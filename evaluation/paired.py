@@ -1,7 +1,8 @@
 """Whether two policies tried on the very same trials differ, and what many such questions cost."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
@@ -37,3 +38,21 @@ def holm(p_values: Sequence[float]) -> list[float]:
         least = max(least, min(1.0, (len(p_values) - place) * p_values[index]))
         adjusted[index] = least
     return adjusted
+
+
+def compared(reference: Mapping[int, bool], row: Mapping[int, bool]) -> dict[str, Any]:
+    """Success of two series by number of the trial, on the trials that both have.
+
+    Keys: n, pairs of trials; only_reference, only_row, pairs in which one alone succeeded; p, McNemar's exact
+    two-sided one; difference, the reference's success less the row's.
+    """
+    both = reference.keys() & row.keys()
+    only_reference = sum(reference[i] and not row[i] for i in both)
+    only_row = sum(row[i] and not reference[i] for i in both)
+    return {
+        "n": len(both),
+        "only_reference": only_reference,
+        "only_row": only_row,
+        "difference": (only_reference - only_row) / len(both) if both else 0.0,
+        "p": mcnemar_exact(only_reference, only_row),
+    }

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt16
 from ddgrasp.config import Config
 from ddgrasp.layout import OBSERVATION
 from ddgrasp.progress import Progress
+from deploy.changes import Change
 from deploy.policy import POLICY_FILE
 from deploy.trials import Rig
 from evaluation.rig_trials import Series
@@ -50,7 +51,7 @@ def measure(config: Config, run_dir: Path, series: Series, progress: Progress) -
 
     policy = run_dir / "export" / POLICY_FILE
     config = series.configured(config, policy)
-    rig = Rig(config, policy, ideal=series.camera == "ideal")
+    rig = Rig(config, policy, Change(sight="ideal" if series.camera == "ideal" else "stereo"))
     params = load_params(run_dir / "student" / PARAMS_FILE)
     outcomes, parts = [], []
     plan = series.plan()

@@ -14,9 +14,12 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from ddgrasp.progress import Progress
-from deploy.fr3_trials import Fr3Bench, Shapes, Sight
+from deploy.changes import Change
+from deploy.fr3_lab import Shapes
+from deploy.fr3_trials import Fr3Bench, Sight
 from deploy.recorded import RecordedBench
 from deploy.stage import STAGE
+from deploy.treatment import Replacement, Treatment
 from deploy.trial_log import TrialLog
 from deploy.trials import Bench, Rig, Trial, TrialResult, run_trials
 from evaluation import wilson
@@ -61,7 +64,7 @@ class Series:
         """The objects. UserError for an unknown one, or a choice that the rig does not have."""
         if self.rig == "development" and (self.camera == "coarse" or self.shapes != "mesh"):
             raise UserError("--camera coarse and --shapes are rig fr3's: drop them, or choose --rig fr3.")
-        known = self._known()
+        known = self.known()
         names = known if self.objects == (EVERYTHING,) else self.objects
         for name in names:
             if name not in known:
@@ -70,12 +73,11 @@ class Series:
 
     def plan(self) -> list[Trial]:
         """Object after object; trial i of an object is the same whichever others are asked for."""
-        known = self._known()
-        return [
-            Trial(known.index(name) * len(seeds.SEEDS[self.split]) + i, name)
-            for name in self.names()
-            for i in range(self.trials)
-        ]
+        return [self.trial(name, i) for name in self.names() for i in range(self.trials)]
+
+    def trial(self, name: str, i: int) -> Trial:
+        """Trial i of the object of that name, one of `known`."""
+        return Trial(self.known().index(name) * len(seeds.SEEDS[self.split]) + i, name)
 
     def configured(self, config: Config, policy: Path) -> Config:
         """`config` with the trials' length, seed and objects. UserError if `policy` is no file."""
@@ -85,14 +87,19 @@ class Series:
         world = replace(config.world, objects=_trained(), episode_steps=steps)
         return replace(config, seed=seeds.seed(self.split, self.number), world=world)
 
-    def make(self, config: Config) -> Callable[[Config, Path], Bench]:
-        """What makes a bench in every worker. UserError where a network's weights are missing."""
-        treatment = make_treatment(self.depth, config)
+    def make(
+        self, config: Config, treatment: Treatment | Replacement | None = None
+    ) -> Callable[[Config, Path], Bench]:
+        """What makes a bench in every worker; `treatment` takes the place of what `depth` names. UserError
+        where a network's weights are missing."""
+        treatment = treatment or make_treatment(self.depth, config)
         if self.rig == "fr3":
             return Fr3Bench(self.shapes, self.camera, self.contact, treatment)
-        return partial(Rig, ideal=self.camera == "ideal", treatment=treatment)
+        change = Change(sight="ideal" if self.camera == "ideal" else "stereo")
+        return partial(Rig, change=change, treatment=treatment)
 
-    def _known(self) -> tuple[str, ...]:
+    def known(self) -> tuple[str, ...]:
+        """Every object that the rig has."""
         if self.rig == "development" or self.shapes == "primitive":
             return _trained()
         from rig.meshes.objects import MESH_OBJECTS
@@ -109,12 +116,28 @@ def run(
     Leaves trials.jsonl, table.json and films in `out`: each object's first success, its first `failures`;
     with `record` a folder in `EPISODES` for every trial, as a deployment leaves it.
     """
-    config, trials = series.configured(config, policy), series.plan()
-    out.mkdir(parents=True, exist_ok=True)
-    log = TrialLog(out / TRIALS_FILE, _header(config, policy, series))
-    make = series.make(config)
+    config = series.configured(config, policy)
+    header, make = _header(config, policy, series), series.make(config)
     if record:
         make = RecordedBench(make, out / EPISODES, {"robot": f"rig {series.rig}", "camera": series.camera})
+    results = run_missing(config, policy, series.plan(), make, header, out, workers, progress, failures)
+    table = tabulate(results)
+    atomic_write_text(out / TABLE_FILE, json.dumps({"series": asdict(series), **table}, indent=1) + "\n")
+    return table
+
+
+def run_missing(
+    config: Config, policy: Path, trials: Sequence[Trial], make: Callable[[Config, Path], Bench],
+    header: dict[str, Any], out: Path, workers: int, progress: Progress, failures: float = math.inf,
+) -> list[TrialResult]:  # fmt: skip
+    """Results of `trials` in their order; those that `out` has are not run again. Films as in `run`.
+
+    Args:
+      make: what makes a bench in every worker.
+      header: what the trials belong to. UserError if `out` has trials of something else.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    log = TrialLog(out / TRIALS_FILE, header)
     todo = [trial for trial in trials if (trial.index, False) not in log.results]
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(trials) - len(todo))
@@ -125,9 +148,7 @@ def run(
             if film.steps and shown < (1 if result.success else failures):
                 _keep(out, result, film)
             task.advance(success=sum(r.success for r in log.results.values()) / len(log.results))
-    table = tabulate([log.results[trial.index, False] for trial in trials])
-    atomic_write_text(out / TABLE_FILE, json.dumps({"series": asdict(series), **table}, indent=1) + "\n")
-    return table
+    return [log.results[trial.index, False] for trial in trials]
 
 
 def _keep(out: Path, result: TrialResult, film: Film) -> None:
@@ -177,8 +198,12 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     """What the trials belong to; how many of which objects may grow."""
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
+    return made_with(config, policy) | bench
+
+
+def made_with(config: Config, policy: Path) -> dict[str, str]:
+    """Policy and configuration in the header of a log of trials."""
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),
-        **bench,
     }

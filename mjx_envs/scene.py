@@ -5,6 +5,8 @@ Link masses, centres of mass and inertias: Gaz, Cognetti, Oliva, Robuffo Giordan
 Identification of the Franka Emika Panda Robot", RA-L 2019. Geometry is our own: primitives only.
 """
 
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -223,9 +225,15 @@ def scene_xml(sim_dt_s: float = 0.005, layout: SlotLayout = DEFAULT_SLOTS) -> st
 </mujoco>"""
 
 
-def build_model(sim_dt_s: float = 0.005, layout: SlotLayout = DEFAULT_SLOTS) -> mujoco.MjModel:
-    """A new compiled model; change it freely."""
-    model = mujoco.MjModel.from_xml_string(scene_xml(sim_dt_s, layout))
+def build_model(
+    sim_dt_s: float = 0.005,
+    layout: SlotLayout = DEFAULT_SLOTS,
+    edit: Callable[[ET.Element], None] = lambda scene: None,
+) -> mujoco.MjModel:
+    """A new compiled model; change it freely. `edit` may change the MJCF before."""
+    root = ET.fromstring(scene_xml(sim_dt_s, layout))
+    edit(root)
+    model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
     _widen_object_bounds(model)
     return model
 

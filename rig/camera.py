@@ -1,5 +1,7 @@
 """The pseudo-real rig's camera: colour and active-stereo depth of a MuJoCo state. JAX-free."""
 
+from functools import partial
+
 import mujoco
 import numpy as np
 from jaxtyping import Float, Float64, UInt8, UInt16
@@ -41,27 +43,31 @@ class RigCamera:
     ) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 millimetres as the camera reports them, 0 = invalid."""
 
-        def draw(camera: Camera) -> Buffers:
-            return render(self.model, data, camera, far_m=FAR_M)
-
-        def draw_depth(camera: Camera) -> Float[np.ndarray, "H W"]:
-            return render_depth(self.model, data, camera, far_m=FAR_M)
-
         if self._ideal:
             return self.clean_mm(data, T_world_cam)
+        draw, draw_depth = partial(self._draw, data), partial(self._draw_depth, data)
         return self.stereo.sense(draw, T_world_cam, rng, rig_materials(self.model, object_name), draw_depth)
 
     def clean_mm(
         self, data: mujoco.MjData, T_world_cam: Float[np.ndarray, "4 4"]
     ) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 millimetres as a camera without errors would report them."""
-        camera = self.stereo.camera(T_world_cam)
-        return to_millimetres(render_depth(self.model, data, camera, far_m=FAR_M))
+        return to_millimetres(self._draw_depth(data, self.pinhole(T_world_cam)))
 
     def rgb(self, data: mujoco.MjData, T_world_cam: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour, aligned to depth."""
-        buffers = render(self.model, data, self.stereo.camera(T_world_cam), far_m=FAR_M)
+        buffers = self._draw(data, self.pinhole(T_world_cam))
         return np.rint(np.clip(buffers.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+    def pinhole(self, T_world_cam: Float[np.ndarray, "4 4"]) -> Camera:
+        """The camera of the pictures that it gives."""
+        return self.stereo.camera(T_world_cam)
+
+    def _draw(self, data: mujoco.MjData, camera: Camera) -> Buffers:
+        return render(self.model, data, camera, far_m=FAR_M)
+
+    def _draw_depth(self, data: mujoco.MjData, camera: Camera) -> Float[np.ndarray, "H W"]:
+        return render_depth(self.model, data, camera, far_m=FAR_M)
 
 
 def make_camera(config: Config, world: RigWorld, ideal: bool = False) -> RigCamera:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from ddgrasp import contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
+from ddgrasp.contract import CameraProfile
 from ddgrasp.job import Job
 from ddgrasp.layout import ACTION, closes
 from ddgrasp.progress import Progress
@@ -59,7 +60,9 @@ def record_trajectory(
     name = config.world.objects[index % len(config.world.objects)]
     world.reset(int(rng.integers(2**31)), name)
     T_world_cam = jittered_pose(config.record, rng)
-    with RecordingWriter(path, _meta(config, name)) as writer:
+    profile = config.world.profile
+    sensor = f"pseudo-real rig, active stereo, D455 profile at scale {config.world.camera_scale:g}"
+    with RecordingWriter(path, describe_recording(profile, sensor, name)) as writer:
         for _ in range(config.record.frames):
             writer.add(
                 camera.rgb(world.data, T_world_cam), camera.depth_mm(world.data, T_world_cam, rng, name)
@@ -76,10 +79,10 @@ def act(world: RigWorld, action: Float[np.ndarray, "8"]) -> None:
     world.step(contract.CONTROL_DT_S)
 
 
-def _meta(config: Config, object_name: str) -> dict[str, Any]:
-    profile = config.world.profile
+def describe_recording(profile: CameraProfile, sensor: str, object_name: str) -> dict[str, Any]:
+    """What meta.json says of a rig's recording: frames of `profile`, one per control step."""
     return {
-        "sensor": f"pseudo-real rig, active stereo, D455 profile at scale {config.world.camera_scale:g}",
+        "sensor": sensor,
         "object": object_name,
         "color_aligned_to_depth": True,
         "consecutive_frames": True,

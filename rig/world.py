@@ -47,11 +47,11 @@ class RigWorld:
         self._spec = self._choose_pose(rng, self.objects[object_name])
         drawn = draws.dynamics(self._random, _units(rng))
         size, mass, friction = (float(f) for f in drawn[:3])
-        scene.fill_slots(self.model, self._spec, self._layout, size, mass, friction)
+        rest_height_m = self._put(seed, size, mass, friction)
         self._set_dynamics(drawn)
         mujoco.mj_setConst(self.model, self.data)  # inertia that MuJoCo precomputes for free bodies
         mujoco.mj_resetData(self.model, self.data)
-        self._set_pose(rng, self._spec.rest_height_m * size)
+        self._set_pose(rng, rest_height_m)
         mujoco.mj_forward(self.model, self.data)
         self._branch = float(
             grasp_math.yaw_branch(self.data.qpos[QPOS.object_quat], self._spec.grasp_symmetry)
@@ -90,6 +90,12 @@ class RigWorld:
     def _held(self) -> bool:
         away_m = np.linalg.norm(self.data.qpos[QPOS.object_pos] - np.array(contract.LIFT_TARGET_M))
         return bool(away_m < contract.LIFT_TOLERANCE_M)
+
+    def _put(self, seed: int, size: float, mass: float, friction: float) -> float:
+        """Makes the object that of `self._spec`, by those factors; returns its origin's height at rest."""
+        del seed
+        scene.fill_slots(self.model, self._spec, self._layout, size, mass, friction)
+        return self._spec.rest_height_m * size
 
     def _choose_pose(self, rng: np.random.Generator, spec: ObjectSpec) -> ObjectSpec:
         other = rng.random() < self._random.other_pose_share

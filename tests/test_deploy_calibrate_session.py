@@ -240,7 +240,7 @@ def test_the_jacobian_is_the_derivative_of_the_grip_pose():
 
 def test_an_arm_that_is_held_up_is_given_up_and_steps_keep_the_speed():
     arm, clock = Arm(), RobotClock()
-    clock.follow(arm.time_s)
+    clock.follow(arm)
     driver = Driver(arm, safety_filter(CONFIG.deploy, INFO, "franka"), clock, 0.3)
     steps = []
     free = arm.command

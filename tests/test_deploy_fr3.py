@@ -58,7 +58,7 @@ def config_for(host: str, **changes) -> DeployConfig:
 def connect(config: DeployConfig, confirm=None) -> tuple[FrankaRobot, RobotClock]:
     clock = RobotClock()
     robot = FrankaRobot(config.franka, clock, confirm)
-    clock.follow(robot.time_s)
+    clock.follow(robot)
     return robot, clock
 
 
@@ -330,6 +330,17 @@ def test_killed_server_ends_the_lab_s_own_command_with_a_report(tmp_path, open_g
     with Fr3Rig("127.0.0.16", primitive("cube")):  # the ports are free again
         again = deploy(preset, path, replace(options, seconds=0.3), say)
     assert (again.steps, again.fault) == (3, "")
+
+
+def test_time_that_stands_still_is_put_down_to_the_lost_connection():
+    with Fr3Rig("127.0.0.18", primitive("cube")) as rig:
+        robot, clock = connect(config_for(rig.host))
+        robot.start()
+        robot.command(robot.read_state().q_rad, close=False)
+        rig.kill()
+        with pytest.raises(RobotError, match=f"^the connection to {rig.host} is lost"):
+            clock.sleep_until(clock.now() + 30.0)
+        robot.stop()
 
 
 def _wait_for_motion(host: str) -> None:

@@ -19,7 +19,8 @@ from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from deploy.clock import SimClock
 from deploy.devices import fr3_camera
-from deploy.fr3_trials import free_host
+from deploy.fr3_lab import free_host
+from deploy.fr3_trials import Fr3Runner
 from deploy.trials import TrialResult
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import rig_trials
@@ -28,7 +29,7 @@ from mjx_envs.camera import nominal_camera
 from mjx_envs.scene import HOME_RAD
 from rig import seeds
 from rig.fr3 import scene
-from rig.fr3.picture import ScenePicture
+from rig.fr3.picture import of_scene
 from rig.fr3.process import Fr3Rig
 
 PROFILE = contract.D455.scaled(0.25)
@@ -43,7 +44,7 @@ def picture():
     sim.add_robot(initial_q=list(HOME_RAD), initial_hand_width=0.08)
     scene.furnish(sim.scene, scene.meshed("wheel"), 3)
     try:
-        made = ScenePicture(ET.tostring(sim.scene, encoding="unicode"))
+        made = of_scene(ET.tostring(sim.scene, encoding="unicode"))
         made.pose(made.model.qpos0)
         made.rgb(fr3_camera.pinhole(PROFILE, T_WORLD_CAM))
     except Exception as error:  # the back ends raise whatever their loaders do
@@ -155,3 +156,26 @@ def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):
     assert again == table and (out / rig_trials.TRIALS_FILE).read_text().splitlines() == lines
     with pytest.raises(UserError, match="trials of another policy or configuration"):
         rig_trials.run(config, policy, replace(series, number=1), out, 0, Progress(quiet=True))
+
+
+def test_a_trial_whose_rig_is_killed_is_run_again(tmp_path, open_gl):
+    policy = write_policy(
+        tmp_path / "policy.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.0, -1.0)
+    )
+    series = Series(objects=("cube",), trials=1, shapes="primitive", camera="ideal", seconds=0.5)
+    runner = series.make(get_preset("debug"))(series.configured(get_preset("debug"), policy), policy)
+    assert isinstance(runner, Fr3Runner)
+    killed = []
+
+    def kill_once(step, camera):
+        if step.index == 2 and not killed:
+            assert runner.lab.rig is not None
+            killed.append(runner.lab.rig.pid)
+            runner.lab.rig.kill()
+
+    try:
+        result, _ = runner.run(series.plan()[0], kill_once)
+    finally:
+        runner.close()
+    assert len(killed) == 1 and (result.steps, result.success) == (5, False)
+    assert not any("fault" in event for event in result.events), "only a busy machine's missed deadlines"

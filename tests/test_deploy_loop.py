@@ -54,6 +54,7 @@ def test_good_frames_move_the_robot_one_step_per_period(tmp_path):
     assert (report.steps, report.holds, report.timings.missed_deadlines, report.events) == (5, 0, 0, [])
     np.testing.assert_allclose(report.timings.period_s, [0.1] * 4, atol=1e-12)
     assert clock.now() == pytest.approx(0.5), "the last command had its whole period"
+    assert report.clock_s == pytest.approx(0.4) and 0 < report.machine_s < 60
     assert len(report.timings.infer_s) == len(report.timings.latency_s) == 5
 
 

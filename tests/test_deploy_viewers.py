@@ -1,6 +1,9 @@
 """Watching a policy: films that OpenCV reads back, Rerun's absence, the command at its shortest."""
 
+import os
+import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -9,10 +12,12 @@ from app.commands import parse
 from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import PRETRAINED
+from deploy.devices.rig_camera import StereoCamera
 from deploy.interfaces import Frame, RobotState
 from deploy.loop import Step
 from deploy.policy import POLICY_FILE, OnnxPolicy
-from deploy.viewers import FAR_MM, NEAR_MM, PANEL_PX, VERDICT_S, Rerun, Video, depth_picture
+from deploy.video import ANIMATION_PANEL_PX, FAR_MM, NEAR_MM, PANEL_PX, VERDICT_S, Video, depth_picture
+from deploy.viewers import MujocoWindow, Rerun
 from rig.film import INVALID_RGB
 
 STUDENT = PRETRAINED / "student"
@@ -64,9 +69,7 @@ class _Simulated(_RedCamera):
 
 @pytest.mark.parametrize(("camera", "panels"), [(_RedCamera(), 2), (_Simulated(), 3)])
 def test_a_generator_s_depth_is_shown_where_clean_depth_is_known(tmp_path, camera, panels):
-    video = Video(
-        tmp_path / "film.mp4", noise=lambda clean_mm: np.where(clean_mm == 500, 0, 1).astype("uint16")
-    )
+    video = Video(tmp_path / "film.mp4", lambda clean_mm: np.where(clean_mm == 500, 0, 1).astype("uint16"))
     video.begin("apple")
     video.look(_step(0, 700), camera)
     video.close()
@@ -76,10 +79,27 @@ def test_a_generator_s_depth_is_shown_where_clean_depth_is_known(tmp_path, camer
     assert (np.abs(last - INVALID_RGB).max() < 12) == (panels == 3)
 
 
+def test_a_moving_picture_for_pages_keeps_every_step(tmp_path):
+    import cv2
+
+    video = Video(tmp_path / "film.webp")
+    video.begin("apple")
+    for i in range(3):
+        video.look(_step(i, 400 + 300 * i), _RedCamera())
+    video.close()
+    ok, film = cv2.imreadanimation(str(tmp_path / "film.webp"))
+    assert ok and len(film.frames) == 3 and film.loop_count == 0
+    assert [int(duration) for duration in film.durations] == [100] * 3
+    assert film.frames[0].shape[1] == 2 * ANIMATION_PANEL_PX
+    centres = [frame[100, 3 * ANIMATION_PANEL_PX // 2, :3].astype(int) for frame in film.frames]
+    assert np.abs(centres[0] - centres[2]).max() > 50
+
+
 def test_a_step_without_a_frame_is_left_out(tmp_path):
     video = Video(tmp_path / "film.mp4")
     video.begin("apple")
     video.look(Step(0, None, RobotState(np.zeros(7), 0.08, 0.0), None, None), _RedCamera())
+    video.end("failed")
     video.close()
     assert list(tmp_path.iterdir()) == []
 
@@ -92,7 +112,7 @@ def test_depth_has_one_colour_scale_for_all_frames():
 
 
 def test_another_ending_is_refused_before_anything_runs(tmp_path):
-    with pytest.raises(UserError, match="ends with .mp4 or .webm"):
+    with pytest.raises(UserError, match="ends with .mp4 or .webm or .webp"):
         Video(tmp_path / "film.avi")
 
 
@@ -110,7 +130,7 @@ def test_the_pretrained_onnx_file_is_its_students():
 
 def test_the_command_plays_the_pretrained_student_into_a_film(tmp_path, capsys):
     film = tmp_path / "play.mp4"
-    parse("play", ["--objects", "cube", "--camera", "ideal", "--seconds", "1", "--out", str(film)]).run()
+    parse("play", ["--object", "cube", "--noise", "none", "--seconds", "1", "--out", str(film)]).run()
     assert "0 of 1 lifted and held" in capsys.readouterr().out
     assert len(_frames(film)) == 10 + round(VERDICT_S * contract.CONTROL_HZ)
 
@@ -124,13 +144,54 @@ def test_the_pretrained_generator_s_depth_stands_beside_the_camera_s(tmp_path):
     assert 0.01 < lost < 0.3
 
 
-@pytest.mark.parametrize("options", [("--rig", "fr3"), ("--viewer", "web"), ("--out", "a.rrd")])
-def test_a_generator_that_could_not_be_shown_is_refused(options):
-    with pytest.raises(UserError, match="films of rig development alone"):
-        parse("play", ["--generator", "pretrained/ddg", *options]).run()
+def test_a_generator_that_is_not_there_is_refused_before_anything_runs(tmp_path):
+    with pytest.raises(UserError, match="nothing"):
+        parse("play", ["--generator", str(tmp_path / "nothing"), "--out", str(tmp_path / "a.mp4")]).run()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_object_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(UserError, match="appel"):
         parse("play", ["--objects", "appel", "--out", str(tmp_path / "play.mp4")]).run()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not os.environ.get("DISPLAY"), reason="no display: MuJoCo's window needs one")
+def test_mujoco_s_window_shows_the_rig_until_it_is_closed():
+    from rig.world import RigWorld
+
+    world = RigWorld(("cube",))
+    world.reset(0, "cube")
+    camera = StereoCamera(world, None, np.eye(4), np.random.default_rng(0), lambda: 0.0)
+    window = MujocoWindow()
+    started = time.monotonic()
+    for i in range(4):
+        window.look(_step(i, 500), camera)
+    assert window.watched() and time.monotonic() - started > 0.25
+    window.close()
+    while window.watched():
+        assert time.monotonic() - started < 30
+    window.look(_step(5, 500), camera)
+
+
+@pytest.mark.skipif(not os.environ.get("DISPLAY"), reason="no display: MuJoCo's window needs one")
+def test_a_camera_without_a_scene_has_no_window():
+    with pytest.raises(UserError, match="shows rigs alone"):
+        MujocoWindow().look(_step(0, 500), _RedCamera())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="displays with a number are X11's")
+def test_a_display_that_is_not_there_is_named_before_the_policy_is_loaded():
+    command = [sys.executable, "-m", "app.cli", "play", "--viewer", "mujoco"]
+    environment = os.environ | {"DISPLAY": ":9731"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=STUDENT.parents[1])
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines()[-1].endswith("on this display: choose web, or film.")
+
+
+def test_without_a_display_a_window_is_refused_before_anything_runs(monkeypatch, tmp_path):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(UserError, match="--viewer mujoco: there is no display"):
+        parse("play", ["--viewer", "mujoco"]).run()

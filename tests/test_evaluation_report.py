@@ -4,6 +4,7 @@ import base64
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,12 +15,18 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from evaluation import wilson
 from evaluation.report import figures
 from evaluation.report.comparison import differences
+from evaluation.report.html import flatten
+from evaluation.report.meanings import explain
 from evaluation.report.stage import write_report
 from evaluation.report.summary import build_report, print_summary, summary_rows
+from evaluation.report.targets import targets
+from report_support import unexplained
 
 CONFIG = Config(preset="debug")
+ROOT = Path(__file__).parents[1]
 METRICS = {
     "teacher": {"success": {"successes": 9, "n": 10}, "per_object": {"cube": {"successes": 4, "n": 5}}},
     "demos": {"episodes": 120},
@@ -93,6 +100,7 @@ def test_the_page_is_self_contained_and_shows_curves_and_pictures(run_dir):
     progress = Progress(run_dir / "ddg", quiet=True)
     progress.scalars(1, loss=1.0)
     progress.scalars(2, loss=0.5)
+    progress.scalars(2, grad_norm=3.0)
     depth = np.full((20, 30), 800, np.uint16)
     depth[5:9] = 0
     progress.picture(
@@ -102,12 +110,55 @@ def test_the_page_is_self_contained_and_shows_curves_and_pictures(run_dir):
     write_report(run_dir)
     page = (run_dir / "report.html").read_text()
     images = re.findall(r'<img alt="([^"]*)" src="data:image/png;base64,([^"]*)"', page)
-    assert [alt for alt, _ in images] == ["curves of stage ddg", "grafting"]
+    assert [alt for alt, _ in images] == ["loss of ddg", "grad_norm of ddg", "grafting"]
     for _, data in images:
         png = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
         assert png.shape[0] > 50 and png.std() > 5
-    assert not re.search(r'(src|href)="(?!data:)', page)
-    assert "<td>keypoints</td><td>0.6</td>" in page
+    assert not re.search(r'(src|href)="?(?!data:|"?#|"?data:)', page)
+    assert "<td>keypoints</td><td>60 %</td>" in page
+
+
+def test_the_page_opens_with_the_verdict_and_leads_to_every_section(run_dir):
+    write_report(run_dir)
+    page = (run_dir / "report.html").read_text()
+    opening = page[: page.index("<nav")]
+    assert "Targets: 2 met, 2 not met, 2 not measured." in opening
+    assert "<td class=missed>not met" in opening and "50.0 % of 10 (23.7 to 76.3)" in opening
+    anchors = re.findall(r'<a href="#([^"]*)"', page)
+    assert anchors == re.findall(r'<h2 id="([^"]*)"', page)
+    assert len(anchors) == len(METRICS) + 2
+
+
+@pytest.mark.parametrize(("missed", "mark"), [(0, "met"), (2, "missed")])
+def test_missed_deadlines_are_red(run_dir, missed, mark):
+    metrics = METRICS["deploy"] | {"missed_deadlines": missed}
+    artifacts.finish(run_dir / "deploy", "deploy", CONFIG, seconds=10, metrics=metrics)
+    write_report(run_dir)
+    assert f"at most 0<td>{missed}<td class={mark}>" in (run_dir / "report.html").read_text()
+
+
+def test_targets_are_judged_by_what_was_measured():
+    report = {"config": {"export": {"max_abs_diff": 1e-4}}}
+    assert {target["met"] for target in targets(report)} == {"not measured"}
+    report["teacher"] = {
+        "success": wilson.success(954, 1000),
+        "objects": {"cube": wilson.success(99, 100), "can": wilson.success(91, 100)},
+    }
+    report["export"], report["deploy"] = {"max_abs_diff": 2e-4}, {"latency_ms": {"p99": 99.0}}
+    report["score"] = {"targets": [{"target": "FID", "measured": "0.1", "met": "met"}]}
+    judged = [target["met"] for target in targets(report)]
+    assert judged == ["met", "not met", "met", "not met", "not measured", "met", "not measured"]
+    assert "91.0 % of 100" in targets(report)[1]["measured"]
+
+
+def test_every_number_of_a_whole_run_has_a_meaning_and_a_unit_where_it_needs_one():
+    report = json.loads((ROOT / "pretrained" / "report.json").read_text())
+    assert unexplained(report) == []
+    shown = dict(flatten(report["record"]) + flatten(report["deploy"]))
+    assert shown["invalid_fraction"] == "9.05 %" and shown["sense_ms.p50"] == "26.32 ms"
+    assert explain("deploy.sense_ms.p50") == ("ms", "reading camera and joints: half take no longer")
+    assert explain("loss/v_loss") == ("", "training loss: the value network's")
+    assert explain("nonsense.of.ours") == ("", "")
 
 
 def test_invalid_depth_has_a_colour_that_no_depth_has():

@@ -16,6 +16,7 @@ import pytest
 from app import pipeline
 from ddgrasp import artifacts
 from ddgrasp.presets import PRESETS
+from report_support import unexplained
 from tutorial_support import code, moved, small
 
 ROOT = Path(__file__).parents[1]
@@ -90,6 +91,11 @@ def test_the_report_has_every_promised_number(finished):
         entry = report["stages"][stage.name]
         assert entry["seconds"] > 0
         assert entry["trained"] != entry["loaded"]
+
+
+def test_every_number_and_curve_of_the_report_is_explained(finished):
+    out, _, _ = finished
+    assert unexplained(json.loads((out / "report.json").read_text()), out) == []
 
 
 def test_the_last_line_printed_is_the_student_in_the_rig(finished):

@@ -170,6 +170,23 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 120
 
 
+def test_the_film_at_the_top_of_the_readme_is_small_and_moves():
+    import cv2
+
+    (film,) = [link for link in _links("README.md") if link.endswith(".webp")]
+    assert (ROOT / "README.md").read_text().index(film) < 500
+    assert (ROOT / film).stat().st_size < 3e6
+    ok, pictures = cv2.imreadanimation(str(ROOT / film))
+    assert ok and len(pictures.frames) > 100
+
+
+def test_every_result_in_the_readme_links_to_where_it_was_measured():
+    results = (ROOT / "README.md").read_text().split("## Results")[1].split("\n## ")[0]
+    rows = [line for line in results.splitlines() if line.startswith("| ")][1:]
+    assert rows
+    assert [row for row in rows if not re.search(r"\]\(docs/\w+\.md(#[\w-]+)?\) \|$", row)] == []
+
+
 def _documented(docstring: str) -> set[str]:
     """Names in the section Args of a docstring."""
     (section,) = re.findall(r"^Args:\n((?:[ \t]+.*\n?|\n)*)", docstring + "\n", re.MULTILINE) or [""]

@@ -243,6 +243,7 @@ INSTALLED_WITH = {
         "sensors.recordings.realsense_live", "sensors.recordings.importers",
     ),
     ("sim",): ("evaluation.rig_trials", "deploy.viewers", "deploy.devices", "mjx_envs.objects"),
+    ("sim", "franka", "fr3"): ("rig.fr3", "rig.meshes", "deploy.fr3_record", "evaluation.rig_sheet"),
 }  # fmt: skip
 """Extras -> modules (and what is in packages of that name) that an installation with them must import."""
 

@@ -211,6 +211,12 @@ def test_no_string_that_names_a_module_is_left_behind():
     assert left == set()
 
 
+def test_only_one_file_knows_where_the_repository_is():
+    files = [file for top in TOPS for file in (ROOT / top).rglob("*.py")]
+    asking = {str(f.relative_to(ROOT)) for f in files if re.search(r"__file__\).*parent", f.read_text())}
+    assert asking == {"ddgrasp/shipped.py"}, "a wheel has other folders: ddgrasp.shipped.PRETRAINED"
+
+
 def _fields(cls: type, above: str = ""):
     """Names of settings, "deploy.clock"."""
     for field in dataclasses.fields(cls):

@@ -18,14 +18,14 @@ from app.commands.calibrate import Calibrate, CalibrateBoard
 from app.commands.checks import check_config_values, check_devices, check_memory, check_options
 from app.commands.dataset import DemosExport
 from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
-from app.commands.depth import DemosCollect, Record, RecordImport, RecordRealsense, SensorsCompare
+from app.commands.depth import DemosCollect, Record, RecordFr3, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
 from app.commands.parsing import HELP_ALL, parsed
 from app.commands.play import Play
-from app.commands.rig import RigFr3
+from app.commands.rig import RigFr3, RigPictures
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
 from app.commands.student import Deploy, Export, StudentEval, StudentPerception, StudentTrain, config_of
-from app.commands.study import StudyTable2
+from app.commands.study import StudyCauses, StudyTable2
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
 from app.commands.trials import DeployTrials
 from ddgrasp.config import Config
@@ -62,6 +62,7 @@ COMMANDS: dict[str, type] = {
     "record": Record,
     "record import": RecordImport,
     "record realsense": RecordRealsense,
+    "record fr3": RecordFr3,
     "ddg fit": DDGFit,
     "ddg sample": DDGSample,
     "ddg score": DDGScore,
@@ -80,7 +81,9 @@ COMMANDS: dict[str, type] = {
     "calibrate": Calibrate,
     "calibrate board": CalibrateBoard,
     "study table2": StudyTable2,
+    "study causes": StudyCauses,
     "rig fr3": RigFr3,
+    "rig pictures": RigPictures,
     "weights convert": WeightsConvert,
     "weights list": WeightsList,
     "report": Report,

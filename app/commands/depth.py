@@ -1,16 +1,17 @@
 """ddgrasp demos, record, sensors: depth of every kind."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
-from app.commands.base import OneStage
+from app.commands.base import DEFAULT_PRESET, OneStage
 from ddgrasp import contract
 from ddgrasp.config import CameraScale, RecordConfig, StereoConfig
 from ddgrasp.config.checks import Count, Range, Seed, Share
 from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,40 @@ class RecordRealsense:
             raise UserError(
                 f"the camera stopped ({take.trouble}): what it gave is kept; check the USB 3 cable."
             )
+
+
+@dataclass(frozen=True)
+class RecordFr3:
+    """Record RGB-D on the test rig: a D455 at 848x480, the FR3 led over the table through its driver."""
+
+    out: Path = Path("recordings/fr3")
+    """The recordings become folders in it; those that it has are kept, so that a run can go on."""
+    trajectories: Count | None = None
+    """How many; none takes the preset's."""
+    frames: Count | None = None
+    """Frames of each, 10 per second; none takes the preset's."""
+    objects: tuple[str, ...] = ()
+    """Names, in turn; none takes the six that a student trains on."""
+    shapes: Literal["mesh", "primitive"] = "mesh"
+    """mesh, or the development rig's primitives."""
+    number: Annotated[int, Range(0, 999)] = 0
+    """Which development seed."""
+    preset: str = DEFAULT_PRESET
+    """Configuration of the camera: size of the pictures, and how far it is moved from one to the next."""
+
+    def run(self) -> None:
+        """Records what is missing and says what there is."""
+        from ddgrasp.progress import Progress
+        from deploy import fr3_record
+        from rig import seeds
+
+        config = get_preset(self.preset)
+        given = {"trajectories": self.trajectories, "frames": self.frames}
+        changed = {name: value for name, value in given.items() if value is not None}
+        config = replace(config, record=replace(config.record, **changed))
+        takes = fr3_record.Takes(seeds.seed("development", self.number), self.objects, self.shapes)
+        recordings = fr3_record.record(config, takes, self.out, Progress(name="record fr3"))
+        print(fr3_record.describe(recordings, self.out))
 
 
 @dataclass(frozen=True)

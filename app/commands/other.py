@@ -1,14 +1,19 @@
 """ddgrasp weights, objects, report."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from ddgrasp import contract
 from ddgrasp.config.checks import Range
+from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
+
+if TYPE_CHECKING:
+    from evaluation.report.trials_page import Trials
 
 
 @dataclass(frozen=True)
@@ -59,20 +64,23 @@ class WeightsList:
 
 @dataclass(frozen=True)
 class Report:
-    """Write the report of a run, or of a folder of deployments, anew; of several runs, what differs."""
+    """Write the report of a run, of trials or of deployments; of several runs or trials, what differs."""
 
     out: tyro.conf.Positional[Path]
-    """Directory of a run; or one deployment's, or the folder of all (runs/deployments)."""
+    """Directory of a run, or of trials (`deploy trials`); or a deployment's, or that of all deployments."""
     others: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Runs to set beside it."""
+    """Others of its kind to set beside it."""
 
     def run(self) -> None:
         """Writes the files and prints their places and the table."""
         if self.others:
             _compare((self.out, *self.others))
             return
-        from evaluation.report import deployments
+        from evaluation.report import deployments, trials_page
 
+        if trials := trials_page.find(self.out):
+            print(f"{trials_page.write(trials)}\n\n{trials_page.verdict(trials)}")
+            return
         if found := deployments.find(self.out):
             print(f"{deployments.write(self.out, found)}\n\n{deployments.verdict(found)}")
             return
@@ -84,23 +92,40 @@ class Report:
         print_summary(report)
 
 
-def _compare(runs: tuple[Path, ...]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from evaluation.report import comparison
+def _compare(runs: Sequence[Path]) -> None:
+    from evaluation.report import comparison, trials_page
     from evaluation.report.summary import build_report
 
+    tried = [trials_page.find(run) for run in runs]
+    if any(tried):
+        _compare_trials(runs, [trials for trials in tried if trials is not None])
+        return
     reports = [build_report(run) for run in runs]
     print(f"{comparison.write(runs, reports)}\n")
-    console = Console()
     for title, rows in zip(
         ("configured otherwise", "measured"), comparison.differences(reports), strict=True
     ):
-        shown = Table(title, *(str(run) for run in runs), box=None)
-        for row in rows:
-            shown.add_row(*row)
-        console.print(shown)
+        _print_table((title, *(str(run) for run in runs)), rows)
+
+
+def _compare_trials(runs: Sequence[Path], tried: Sequence["Trials"]) -> None:
+    from evaluation.report import comparison, trials_page
+
+    if len(tried) < len(runs):
+        others = [str(run) for run in runs if trials_page.find(run) is None]
+        raise UserError(f"{', '.join(others)}: no finished trials to set beside {tried[0].folder}.")
+    print(f"{trials_page.write_comparison(tried, comparison.COMPARISON_HTML)}\n")
+    _print_table(*trials_page.compare(tried))
+
+
+def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    shown = Table(*header, box=None)
+    for row in rows:
+        shown.add_row(*row)
+    Console().print(shown)
 
 
 @dataclass(frozen=True)

@@ -1,38 +1,53 @@
 """ddgrasp play: watch a policy grasp."""
 
 import contextlib
+import itertools
 import os
 import sys
-import threading
+from collections import Counter
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import PRETRAINED
+from deploy.controls import KEYS, Controls, Noise
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from deploy.interfaces import Depth
+    from deploy.treatment import CleanDepth
     from deploy.trials import Bench, Trial
-    from deploy.viewers import Noise, Viewer
+    from deploy.video import NoiseModel
+    from deploy.viewers import Viewer
+    from evaluation.rig_trials import Series
 
 WEB_PORT = 9090
 """Rerun's own, of its web viewer."""
+PRETRAINED_GENERATOR = PRETRAINED / "ddg"
 
 
 @dataclass(frozen=True)
 class Play:
-    """Watch the pretrained student, or a policy of yours, grasp in simulation: a film, or Rerun's viewer."""
+    """Watch the pretrained student, or a policy of yours, grasp in simulation: a film, or live in a viewer.
+
+    In a viewer, object and noise can be changed as it runs, by typing their names on the terminal.
+    """
 
     policy: Path | None = None
     """ONNX file that `ddgrasp export` wrote; without it the student under pretrained/."""
-    objects: tuple[str, ...] = ("apple", "banana", "can")
+    objects: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--object",))] = ("apple", "banana", "can")
     """Names, or all (`ddgrasp objects list` has them)."""
     rig: Literal["development", "fr3"] = "development"
     """development (MuJoCo's Franka, seconds a trial) or fr3 (the test rig: another arm behind Franka's own
     protocol, meshes; a minute a trial)."""
-    camera: Literal["stereo", "ideal"] = "stereo"
-    """stereo (a D455's errors) or ideal (none)."""
+    noise: Noise = "camera"
+    """Whose errors the policy sees: camera (a simulated D455's), none, or generator (the learned ones)."""
     trials: Count = 1
     """How many with every object."""
     seconds: Annotated[float, Range(0.5, 60)] = 6.0
@@ -40,77 +55,112 @@ class Play:
     number: Annotated[int, Range(0, 999)] = 0
     """Another number, other places of the objects."""
     generator: Path | None = None
-    """Folder of a fitted generator (a run's ddg), whose depth a film then shows beside the camera's."""
-    viewer: Literal["film", "rerun", "web"] = "film"
-    """film (a video file), rerun (a window), or web (in the browser, also of another machine)."""
+    """Folder of a fitted generator (a run's ddg) for noise generator, instead of pretrained/ddg; a film then
+    shows its depth beside the camera's."""
+    viewer: Literal["film", "mujoco", "rerun", "web"] = "film"
+    """film (a file), mujoco (MuJoCo's window), rerun (Rerun's), or web (Rerun in the browser, also of another
+    machine)."""
     out: Path = Path("runs/play.mp4")
-    """The film, .mp4, or .webm for browsers; .rrd keeps what Rerun would show."""
+    """The film: .mp4, .webm for browsers, .webp for pages; .rrd keeps what Rerun would show."""
 
     def run(self) -> None:
         """Runs the trials, prints how each ended, and where the film is."""
         from app.commands.student import config_of
         from evaluation.rig_trials import Series
 
-        series = Series(
-            self.rig, self.objects, self.trials, number=self.number, camera=self.camera, seconds=self.seconds
-        )
+        series = Series(self.rig, self.objects, self.trials, number=self.number, seconds=self.seconds)
         trials = series.plan()
-        self._check_generator()
-        viewer = self._viewer()
+        noise = _ChosenNoise(Controls(series.known(), self.noise), self.generator or PRETRAINED_GENERATOR)
+        viewer = self._viewer(noise)
         policy = self.policy or _pretrained()
         config = series.configured(config_of(policy, None), policy)
-        bench = series.make(config)(config, policy)
+        bench = series.make(config, noise)(config, policy)
         try:
-            lifted = sum(_watched(bench, trial, viewer) for trial in trials)
-            film = f": {self.out}" if self.viewer == "film" else ""
-            print(f"{lifted} of {len(trials)} lifted and held{film}", flush=True)
-            self._wait()
+            if self._live:
+                self._play_on(bench, series, viewer, noise.controls)
+            else:
+                lifted = sum(_watched(bench, trial, viewer, noise.controls) for trial in trials)
+                print(f"{lifted} of {len(trials)} lifted and held: {self.out}", flush=True)
         finally:
             bench.close()
             viewer.close()
 
-    def _check_generator(self) -> None:
-        if self.generator and (self.rig == "fr3" or self.viewer != "film" or self.out.suffix == ".rrd"):
-            raise UserError(
-                "--generator is shown in films of rig development alone: drop it, or --rig, --viewer, .rrd."
-            )
+    @property
+    def _live(self) -> bool:
+        return self.viewer != "film" and self.out.suffix != ".rrd"
 
-    def _viewer(self) -> "Viewer":
-        from deploy.viewers import Rerun, Video
+    def _viewer(self, noise: "_ChosenNoise") -> "Viewer":
+        from deploy.video import Video
+        from deploy.viewers import MujocoWindow, Rerun
 
+        if self.generator or self.noise == "generator":
+            _ = noise.generator  # what is wrong with it is said before anything runs
         if self.out.suffix == ".rrd":
             return Rerun(browser=False, file=self.out)
         if self.viewer == "film":
-            return Video(self.out, self.generator and _noise_of(self.generator))
-        if self.viewer == "rerun" and sys.platform == "linux" and not _has_display():
-            raise UserError("--viewer rerun: there is no display here: choose web, or film.")
+            return Video(self.out, noise.generator if self.generator else None)
+        if self.viewer != "web" and sys.platform == "linux" and not _has_display():
+            raise UserError(f"--viewer {self.viewer}: there is no display here: choose web, or film.")
+        if self.viewer == "mujoco":
+            return MujocoWindow(noise.controls.key)
         viewer = Rerun(browser=self.viewer == "web")
         if self.viewer == "web":
             print(f"http://localhost:{WEB_PORT}/?url={viewer.address}", flush=True)
         return viewer
 
-    def _wait(self) -> None:
-        """The browser fetches what it shows from this process."""
-        if self.viewer == "web" and self.out.suffix != ".rrd":
-            print("Ctrl-C ends the viewer.", flush=True)
-            with contextlib.suppress(KeyboardInterrupt):
-                threading.Event().wait()
+    def _play_on(self, bench: "Bench", series: "Series", viewer: "Viewer", controls: Controls) -> None:
+        """The trials, then those that are asked for, until Ctrl-C or the window's end."""
+        controls.listen(sys.stdin, lambda text: print(text, flush=True))
+        print(f"{controls.help} {KEYS}." if self.viewer == "mujoco" else controls.help, flush=True)
+        planned = itertools.chain.from_iterable([name] * self.trials for name in series.names())
+        tried: Counter[str] = Counter()
+        with contextlib.suppress(KeyboardInterrupt):
+            while viewer.watched() and not controls.ended:
+                name = controls.next_object() or next(planned, None)
+                if name is None:
+                    controls.wait(viewer.watched)
+                    continue
+                _watched(bench, series.trial(name, tried[name]), viewer, controls)
+                tried[name] += 1
 
 
-def _watched(bench: "Bench", trial: "Trial", viewer: "Viewer") -> bool:
+class _ChosenNoise:
+    """The depth that the policy sees, as `controls` say: see `deploy.treatment.Replacement`."""
+
+    def __init__(self, controls: Controls, folder: Path):
+        self.controls, self._folder = controls, folder
+
+    @cached_property
+    def generator(self) -> "NoiseModel":
+        """Loaded when it is first asked for."""
+        return _noise_of(self._folder)
+
+    def replace(self, depth: "Depth", clean_mm: "CleanDepth") -> "Depth":
+        """See `Replacement`."""
+        if self.controls.noise == "camera":
+            return depth
+        return clean_mm() if self.controls.noise == "none" else self.generator(clean_mm())
+
+
+def _watched(bench: "Bench", trial: "Trial", viewer: "Viewer", controls: Controls) -> bool:
     """One trial before `viewer`; whether the object was lifted and held."""
-    viewer.begin(trial.object_name)
-    result, _ = bench.run(trial, viewer.look)
-    verdict = "lifted and held" if result.success else "failed"
+    controls.begin(trial.object_name)
+    viewer.begin(f"{trial.object_name}, noise: {controls.noise}")
+
+    def look(step, camera) -> bool:
+        viewer.look(step, camera)
+        return controls.interrupts or not viewer.watched()
+
+    result, _ = bench.run(trial, look)
+    stopped = controls.interrupts or not viewer.watched()
+    verdict = "lifted and held" if result.success else "stopped" if stopped else "failed"
     viewer.end(verdict)
     print(f"{trial.object_name:<12} {verdict}", flush=True)
     return result.success
 
 
-def _noise_of(generator: Path) -> "Noise":
+def _noise_of(generator: Path) -> "NoiseModel":
     """The generator's depth of one frame after the other of an episode."""
-    from itertools import count
-
     import jax
     import numpy as np
 
@@ -121,10 +171,10 @@ def _noise_of(generator: Path) -> "Noise":
     one = replace(loaded.config, sampling=replace(loaded.config.sampling, batch_size=1))
     source = GeneratorSource(replace(loaded, config=one), jax.random.key(0))
     if source.needs_rgb:
-        raise UserError(f"--generator {generator} looks at colour: a film can show one with another prior.")
-    frames = count()
+        raise UserError(f"--generator {generator} looks at colour: play can show one with another prior.")
+    frames = itertools.count()
 
-    def noisy(clean_mm: np.ndarray) -> np.ndarray:
+    def noisy(clean_mm: "np.ndarray") -> "np.ndarray":
         return source.frames(clean_mm[None], None, np.zeros(1, int), np.array([next(frames)]))[0]
 
     return noisy

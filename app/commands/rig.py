@@ -1,10 +1,14 @@
-"""ddgrasp rig: the test rig's simulated arm, to be driven as one drives a real arm."""
+"""ddgrasp rig: the test rig's simulated arm, to be driven as one drives a real arm, and pictures of it."""
 
 import time
 from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Annotated, Literal
 
 from ddgrasp.config.checks import Range, Seed
+from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_bytes
 
 
 @dataclass(frozen=True)
@@ -36,3 +40,22 @@ class RigFr3:
             print(f"FR3 at {self.host} before {self.object_name!r}. Drive it: {drive}", flush=True)
             while rig.running():
                 time.sleep(0.2)
+
+
+@dataclass(frozen=True)
+class RigPictures:
+    """Draw the test rig for whoever sets up an arm: where the camera stands and what it sees, the board."""
+
+    object_name: str = "apple"
+    """What lies on the table; `ddgrasp objects list --meshes` names them."""
+    out: Path = Path("mounting.png")
+    """The picture's file."""
+
+    def run(self) -> None:
+        """Writes the picture and prints where it is."""
+        if find_spec("franky_sim") is None:
+            raise UserError("pictures of the FR3 rig need franky-sim: pip install 'ddgrasp[fr3]'.")
+        from evaluation.rig_sheet import draw
+
+        atomic_write_bytes(self.out, draw(self.object_name))
+        print(self.out)

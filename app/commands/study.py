@@ -1,7 +1,7 @@
-"""ddgrasp study table2: the paper's Table II, its ablation of grafting, and hand-made ripple beside them."""
+"""ddgrasp study: Table II with its ablations, and where a policy loses, by cause."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -83,6 +83,47 @@ class StudyTable2(FromPreset):
             _check_row(config, name)
         check_devices(config, self.out / results.SHARED)
         return Study(config, self.out, names, series, self.workers, left_out)
+
+
+@dataclass(frozen=True)
+class StudyCauses:
+    """Where a policy loses, by cause: the development rig with one change at a time, the same trials."""
+
+    policy: Path
+    """ONNX file that `ddgrasp export` wrote."""
+    rows: tuple[str, ...] = ("all",)
+    """all, or of: ideal, full_size, meshes, off_2mm, off_10mm, furniture, dark_table, spring, fr3, test_rig.
+    What they are compared with is tried too."""
+    objects: tuple[str, ...] = ("all",)
+    """Names, or all."""
+    trials: Count = 10
+    """How many with every object, the same for every row."""
+    number: Annotated[int, Range(0, 999)] = 0
+    """Which development seed."""
+    seconds: Annotated[float, Range(0.5, 60)] = 6.0
+    """Length of a trial."""
+    preset: str | None = None
+    """Configuration of camera and loop; without it that of the run that the policy lies in."""
+    workers: Annotated[int, Range(1, 64)] = 2
+    """Rigs that run side by side."""
+    out: Path = Path("runs/causes")
+    """Folder for causes.json, causes.md and a folder for every row; trials that it has are not run again."""
+
+    def run(self) -> None:
+        """Runs what is missing and prints the table."""
+        from app.commands.student import config_of
+        from evaluation import causes
+        from evaluation.rig_trials import Series
+
+        rows = causes.chosen(self.rows)
+        series = Series("development", self.objects, self.trials, "development", self.number)
+        series = replace(series, seconds=self.seconds)
+        series.names()
+        made = causes.run(
+            config_of(self.policy, self.preset), self.policy, rows, series, self.out, self.workers
+        )
+        print(self.out / causes.JSON_FILE, self.out / causes.TABLE_FILE, sep="\n")
+        print(causes.markdown(made["rows"]))
 
 
 def _check_row(config: Config, name: str) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt8, UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import StereoConfig
@@ -15,8 +15,11 @@ from deploy.interfaces import CameraError, Clock, Depth, Frame, Robot
 from mjx_envs.camera import Camera as Pinhole
 
 if TYPE_CHECKING:
+    import mujoco
+
     from rig.fr3.channel import Channel
     from rig.fr3.picture import ScenePicture
+    from sensors.models.active_stereo import ActiveStereo
 
 Pose = Float[np.ndarray, "4 4"]
 RIG_SCALE = 0.25
@@ -48,17 +51,22 @@ def stereo(
 
     `profile` is the policy's picture.
     """
-    from sensors.models.active_stereo import ActiveStereo
     from sensors.models.materials import rig_materials
 
-    windows = stream.fx_px / contract.D455.scaled(RIG_SCALE).fx_px
-    camera, driver = ActiveStereo(config, stream, windows), RealSenseCamera(clock, profile, stream=stream)
+    camera, driver = stream_stereo(config, stream), RealSenseCamera(clock, profile, stream=stream)
 
     def sense(picture: "ScenePicture", T_world_cam: Pose, name: str) -> Depth:
         materials = rig_materials(picture.model, name)
         return driver.convert(camera.sense(picture.buffers, T_world_cam, rng, materials, picture.depth_m))
 
     return sense
+
+
+def stream_stereo(config: StereoConfig, stream: contract.CameraProfile) -> "ActiveStereo":
+    """The matcher for pictures of `stream`: its windows cover as much of a surface as at `RIG_SCALE`."""
+    from sensors.models.active_stereo import ActiveStereo
+
+    return ActiveStereo(config, stream, stream.fx_px / contract.D455.scaled(RIG_SCALE).fx_px)
 
 
 def ideal(profile: contract.CameraProfile) -> Sense:
@@ -97,11 +105,11 @@ class Fr3Camera:
     def start(self) -> None:
         """Connect and build the scene. Raises UserError if no rig runs at the host."""
         from rig.fr3.channel import Channel
-        from rig.fr3.picture import ScenePicture
+        from rig.fr3.picture import of_scene
 
         self._channel = Channel(self._host)
         scene = self._channel.ask("scene")
-        self._picture, self._object = ScenePicture(scene["xml"]), scene["object"]
+        self._picture, self._object = of_scene(scene["xml"]), scene["object"]
 
     def read(self) -> Frame:
         """The scene as it is now. Raises CameraError if the rig does not answer."""
@@ -141,6 +149,16 @@ class Fr3Camera:
         """(H, W, 3) uint8 colour of the scene as it was last read, from the same place (for people)."""
         assert self._picture is not None
         return self._picture.rgb(pinhole(self._profile, self._T_world_cam))
+
+    def clean_mm(self) -> UInt16[np.ndarray, "H W"]:
+        """See Simulated; as of the last `read`."""
+        assert self._picture is not None
+        return to_millimetres(self._picture.depth_m(pinhole(self._profile, self._T_world_cam)))
+
+    def scene(self) -> "tuple[mujoco.MjModel, mujoco.MjData]":
+        """See Staged; as of the last `read`."""
+        assert self._picture is not None
+        return self._picture.model, self._picture.data
 
 
 def pinhole(profile: contract.CameraProfile, T_world_cam: Pose) -> Pinhole:

@@ -43,10 +43,10 @@ class Fr3Imager:
     def start(self) -> None:
         """Connect and build the scene. Raises UserError if no rig runs at the host."""
         from rig.fr3.channel import Channel
-        from rig.fr3.picture import ScenePicture
+        from rig.fr3.picture import of_scene
 
         self._channel = Channel(self._host)
-        self._picture = ScenePicture(self._channel.ask("scene")["xml"], FINER * contract.D455.width_px)
+        self._picture = of_scene(self._channel.ask("scene")["xml"], FINER * contract.D455.width_px)
 
     def lens(self) -> Lens:
         """Without distortion, as a D4xx's rectified imagers are."""

@@ -11,6 +11,8 @@ from deploy.devices.rig_robot import SimRobot
 from deploy.interfaces import Frame, Robot
 
 if TYPE_CHECKING:
+    import mujoco
+
     import rig.camera
     import rig.world
 
@@ -69,3 +71,7 @@ class StereoCamera:
     def clean_mm(self) -> UInt16[np.ndarray, "H W"]:
         """See Simulated."""
         return self._camera.clean_mm(self._world.data, self._T_world_cam)
+
+    def scene(self) -> "tuple[mujoco.MjModel, mujoco.MjData]":
+        """See Staged."""
+        return self._world.model, self._world.data

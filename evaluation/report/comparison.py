@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp.files import atomic_write_text
-from evaluation.report.html import flatten, page, table
+from evaluation.report.html import contents, flatten, heading, page, table
+from evaluation.report.meanings import explain
+from evaluation.report.targets import targets, verdict
 
 COMPARISON_HTML = "comparison.html"
-_NO_RESULT = {"stages", "config", "machine", "versions", "created", "contract_version"}
+_NO_RESULT = {"stages", "config", "machine", "versions", "created", "contract_version", "targets"}
 """Parts of a report that measure nothing."""
 Rows = list[tuple[str, ...]]
 
@@ -26,16 +28,32 @@ def write(runs: Sequence[Path], reports: Sequence[Mapping[str, Any]]) -> Path:
     """Writes the page into the first of `runs`; returns its path."""
     header = ("", *(str(run) for run in runs))
     settings, results = differences(reports)
+    sections = ("Targets", "Configured otherwise", "Measured")
+    verdicts = (
+        f"<p class=verdict>{run}: {verdict(targets(r))}</p>" for run, r in zip(runs, reports, strict=True)
+    )
     body = [
         f"<h1>{' and '.join(run.name for run in runs)}</h1>",
-        "<h2>Configured otherwise</h2>",
+        *verdicts,
+        contents(sections),
+        heading(sections[0]),
+        table(header, _target_rows(reports)),
+        heading(sections[1]),
         table(header, settings) if settings else "<p>Nothing.</p>",
-        "<h2>Measured</h2><p class=note>Success: rate of n trials, Wilson 95 % interval.</p>",
-        table(header, results),
+        heading(sections[2]),
+        "<p class=note>Where they differ. Success: rate of n trials, Wilson 95 % interval.</p>",
+        table((*header, "meaning"), [(*row, explain(row[0])[1]) for row in results]),
     ]
     path = runs[0] / COMPARISON_HTML
     atomic_write_text(path, page("Runs side by side: DiffuDepGrasp-JAX", body))
     return path
+
+
+def _target_rows(reports: Sequence[Mapping[str, Any]]) -> Rows:
+    """(target, what each report measured and whether that meets it)."""
+    judged = [{t["target"]: f"{t['measured']} {t['met']}".strip() for t in targets(r)} for r in reports]
+    names = dict.fromkeys(name for column in judged for name in column)
+    return [(name, *(column.get(name, "") for column in judged)) for name in names]
 
 
 def _results(report: Mapping[str, Any]) -> dict[str, str]:

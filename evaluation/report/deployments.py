@@ -10,9 +10,14 @@ from typing import Any
 from ddgrasp.files import atomic_write_text
 from deploy.record import FILM_FILE, REPORT_FILE, STEPS_FILE
 from evaluation import wilson
-from evaluation.report.html import REPORT_HTML, image, page, table
+from evaluation.report.html import REPORT_HTML, contents, film, heading, page, table
 
 _HEADER = ("deployment", "policy", "robot", "camera", "ended", "steps", "missed", "holds", "frame to command")
+_NOTE = (
+    "<p class=note>Missed: control steps left out since the one before took too long. Holds: steps in which "
+    "the arm stood still for want of a frame or a state. Frame to command: from a frame in hand to the "
+    "command sent.</p>"
+)
 _ENDED = {True: "lifted and held", False: "failed", None: "not judged"}
 
 
@@ -49,7 +54,9 @@ def render(deployments: Sequence[Deployment]) -> str:
     """The page."""
     body = [
         "<h1>Deployments</h1>",
-        f"<p><strong>{escape(verdict(deployments))}</strong></p>",
+        f"<p class={_alarm(deployments)}>{escape(verdict(deployments))}</p>",
+        contents([_title(deployment) for deployment in deployments]),
+        _NOTE,
         table(_HEADER, [_row(deployment) for deployment in deployments]),
         *(part for deployment in deployments for part in _section(deployment)),
     ]
@@ -76,9 +83,19 @@ def _row(deployment: Deployment) -> list[str]:
 
 
 def _section(deployment: Deployment) -> list[str]:
-    parts = [f"<h2>{escape(deployment.folder.name)}: {escape(deployment.ended)}</h2>"]
-    if (film := deployment.folder / FILM_FILE).exists():
-        parts.append(image(film.read_bytes(), f"film of {deployment.folder.name}"))
+    parts = [heading(_title(deployment))]
+    if (strip := deployment.folder / FILM_FILE).exists():
+        parts.append(film(strip.read_bytes(), f"film of {deployment.folder.name}"))
     if events := deployment.report["events"]:
         parts.append("<pre>" + escape("\n".join(events)) + "</pre>")
     return parts
+
+
+def _title(deployment: Deployment) -> str:
+    return f"{deployment.folder.name}: {deployment.ended}"
+
+
+def _alarm(deployments: Sequence[Deployment]) -> str:
+    """Red where a deadline was missed or a robot failed."""
+    bad = any(d.report["missed_deadlines"] or d.report["fault"] for d in deployments)
+    return "missed" if bad else "verdict"

@@ -71,17 +71,25 @@ def draw_sheet(rows: Mapping[str, Sequence[Real[np.ndarray, "_ _ 3"]]], titles: 
     return to_png(_grid([list(_to_rgb(np.stack(row))) for row in rows.values()], list(titles), list(rows)))
 
 
-def draw_curves(curves: Mapping[str, Sequence[tuple[int, float]]], columns: int = 4) -> bytes:
-    """PNG of small multiples, one per named curve of (step, value) points."""
-    rows = -(-len(curves) // columns)
-    figure = Figure(figsize=(3.1 * columns, 2.1 * rows), layout="constrained")
-    for index, (name, points) in enumerate(curves.items()):
-        axes = figure.add_subplot(rows, columns, index + 1)
-        steps, values = zip(*points, strict=True)
-        axes.plot(steps, values, linewidth=1.3, marker="." if len(points) < 3 else "")
-        axes.set_title(name, fontsize=9)
-        axes.tick_params(labelsize=7)
-        axes.grid(alpha=0.3)
+def draw_curve(points: Sequence[tuple[int, float]], title: str, x_label: str, unit: str) -> bytes:
+    """PNG of one curve of (step, value) points, to be read on a telephone.
+
+    Args:
+      points: in the order of their steps.
+      title: the curve's name.
+      x_label: what a step is.
+      unit: of the values; "%" of shares, which are drawn times 100.
+    """
+    figure = Figure(figsize=(3.6, 2.4), layout="constrained")
+    axes = figure.add_subplot()
+    steps, values = zip(*points, strict=True)
+    factor = 100.0 if unit == "%" else 1.0
+    axes.plot(steps, [factor * v for v in values], linewidth=1.4, marker="." if len(points) < 3 else "")
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel(x_label, fontsize=9)
+    axes.set_ylabel(unit or "no unit", fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.3)
     return to_png(figure)
 
 

@@ -4,7 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp.files import atomic_write_json, atomic_write_text
-from evaluation.report.html import REPORT_HTML, render_html
+from evaluation.report.html import REPORT_HTML
+from evaluation.report.run_page import render_html
 from evaluation.report.summary import REPORT, build_report
 
 

@@ -13,6 +13,7 @@ from ddgrasp import artifacts, contract, cores
 from ddgrasp.errors import UserError
 from ddgrasp.stages import ON_REQUEST, STAGES
 from evaluation import backends, perception_table, teacher_trials, wilson
+from evaluation.report.targets import MISSED, targets, verdict
 
 REPORT = "report.json"
 _TOP_LEVEL = "student_"
@@ -23,8 +24,8 @@ def build_report(run_dir: Path) -> dict[str, Any]:
 
     Keys: `stages.<name>.{seconds, trained, loaded}`; `<name>` holds what that stage measured, except keys
     that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top; `machine`,
-    `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`. A success rate is {rate, n,
-    successes, low, high}.
+    `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`; `targets`, each with what was
+    measured and whether it is met. A success rate is {rate, n, successes, low, high}.
     `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows; `teacher.backends`, if `ddgrasp
     teacher compare` was, is `evaluation.backends.table`; `student.perception`, if `ddgrasp student
     perception` was, is `evaluation.perception.tabulate`.
@@ -69,6 +70,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     if "student" in finished and (rows := perception_table.load(run_dir / "student")):
         report["student"]["perception"] = rows
     report["config"] = latest.config
+    report["targets"] = targets(report)
     return report
 
 
@@ -133,7 +135,7 @@ def trial_run(report: Mapping[str, Any]) -> str:
 
 
 def print_summary(report: Mapping[str, Any]) -> None:
-    """Prints the table of `summary_rows` to standard output, a trial run's with a warning above it."""
+    """Prints verdict and table of `summary_rows` to standard output, a trial run's with a warning above."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -143,6 +145,13 @@ def print_summary(report: Mapping[str, Any]) -> None:
         console = Console(width=140)
     if warning := trial_run(report):
         console.print(warning, style="bold", highlight=False)
+    judged = targets(report)
+    console.print(verdict(judged), style="bold", highlight=False)
+    for target in judged:
+        if target["met"] == MISSED:
+            console.print(
+                f"  not met: {target['target']}: {target['measured']}", style="red", highlight=False
+            )
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for title in ("Stage", "From", "Time", "Measured (success: rate of n, Wilson 95 % interval)"):
         table.add_column(title, overflow="fold")

@@ -106,14 +106,4 @@ def compare(table: Table, tried: Mapping[str, Sequence[TrialResult]]) -> list[di
 
 def _against(reference: str, row: str, tried: Mapping[str, Sequence[TrialResult]]) -> dict[str, Any]:
     ours, theirs = ({r.index: r.success for r in tried[name]} for name in (reference, row))
-    both = ours.keys() & theirs.keys()
-    only_reference = sum(ours[i] and not theirs[i] for i in both)
-    only_row = sum(theirs[i] and not ours[i] for i in both)
-    return {
-        "row": row,
-        "n": len(both),
-        "only_reference": only_reference,
-        "only_row": only_row,
-        "difference": (only_reference - only_row) / len(both) if both else 0.0,
-        "p": paired.mcnemar_exact(only_reference, only_row),
-    }
+    return {"row": row, **paired.compared(ours, theirs)}

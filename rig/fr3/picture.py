@@ -22,24 +22,30 @@ _GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
 """As a number: an array compared with the enumeration itself is compared object by object."""
 
 
+def prepare(root: ET.Element, largest_px: int = 2048) -> None:
+    """Adds to the MJCF in `root` what drawing needs; no picture is wider or higher than `largest_px`."""
+    world = root.find("worldbody")
+    assert world is not None
+    world.append(ET.Element("camera", {"name": CAMERA}))
+    visual = ET.SubElement(root, "visual")
+    ET.SubElement(visual, "global", {"offwidth": str(largest_px), "offheight": str(largest_px)})
+    ET.SubElement(visual, "quality", {"offsamples": "0"})  # a pixel is one surface, not a mixture
+
+
+def of_scene(scene_xml: str, largest_px: int = 2048) -> "ScenePicture":
+    """Pictures of what the rig's side channel answers to `scene`, visual meshes included."""
+    root = ET.fromstring(scene_xml)
+    prepare(root, largest_px)
+    return ScenePicture(mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode")))
+
+
 class ScenePicture:
-    """The scene seen by pinhole cameras that have no errors and look straight ahead.
+    """The scene seen by pinhole cameras that have no errors and look straight ahead."""
 
-    Args:
-      scene_xml: what the rig's side channel answers to `scene`, visual meshes included.
-      largest_px: no picture is wider or higher.
-    """
-
-    def __init__(self, scene_xml: str, largest_px: int = 2048):
-        root = ET.fromstring(scene_xml)
-        world = root.find("worldbody")
-        assert world is not None
-        world.append(ET.Element("camera", {"name": CAMERA}))
-        visual = ET.SubElement(root, "visual")
-        ET.SubElement(visual, "global", {"offwidth": str(largest_px), "offheight": str(largest_px)})
-        ET.SubElement(visual, "quality", {"offsamples": "0"})  # a pixel is one surface, not a mixture
-        self.model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
-        self._data = mujoco.MjData(self.model)
+    def __init__(self, model: mujoco.MjModel):
+        """`model` is of a scene that `prepare` has seen."""
+        self.model = model
+        self.data = mujoco.MjData(self.model)
         self._rgb = np.concatenate(
             [geom_rgb(self.model), np.zeros((1, 3), np.float32)]
         )  # black where none is
@@ -48,8 +54,8 @@ class ScenePicture:
 
     def pose(self, qpos: Float64[np.ndarray, " nq"]) -> None:
         """The scene from now on."""
-        self._data.qpos[:] = qpos
-        mujoco.mj_kinematics(self.model, self._data)
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
 
     def depth_m(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
         """(H, W) planar depth, metres; 0 = nothing there."""
@@ -83,11 +89,11 @@ class ScenePicture:
         own, T = self.model.camera(CAMERA), np.asarray(camera.T_world_cam)
         own.pos, own.fovy = T[:3, 3], math.degrees(2 * math.atan(camera.height_px / 2 / camera.fy_px))
         mujoco.mju_mat2Quat(own.quat, (T[:3, :3] @ _T_OPENCV_OPENGL).ravel())
-        mujoco.mj_camlight(self.model, self._data)
+        mujoco.mj_camlight(self.model, self.data)
         size = (camera.height_px, camera.width_px)
         if size not in self._renderers:
             self._renderers[size] = mujoco.Renderer(self.model, *size)
-        self._renderers[size].update_scene(self._data, CAMERA)
+        self._renderers[size].update_scene(self.data, CAMERA)
         return self._renderers[size]
 
 

@@ -37,11 +37,12 @@ class Fr3Rig:
         speed: float = 1.0,
         q_rad: Sequence[float] = HOME_RAD,
         with_board: bool = False,
+        bare: bool = False,
     ):
         """Starts nothing yet.
 
         `speed` is the largest share of real time, `q_rad` (7,) where the arm stands, `with_board` puts the
-        calibration board into its hand.
+        calibration board into its hand, `bare` leaves table, wall and clutter out.
 
         Raises UserError: franky-sim is absent, a port is taken, or `speed` makes no sense.
         """
@@ -52,7 +53,7 @@ class Fr3Rig:
         check_ports(host)
         self.host = host
         given = {"host": host, "seed": seed, "speed": speed, "q_rad": list(q_rad), "with_board": with_board}
-        self._options = given | {"thing": asdict(thing)}
+        self._options = given | {"thing": asdict(thing), "bare": bare}
         self._process: subprocess.Popen[str] | None = None
         self._channel: Channel | None = None
 

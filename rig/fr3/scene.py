@@ -13,7 +13,7 @@ from mjx_envs.object_spec import ObjectSpec, SlotLayout, slot_layout
 from mjx_envs.objects import get_object
 
 OBJECT_BODY, OBJECT_JOINT = "object", "object_free"
-TABLE = "table"
+TABLE, TABLE_RGBA = "table", "0.55 0.5 0.45 1"
 FLOOR_Z_M = -0.75
 TABLE_CENTER_M, TABLE_HALF_M = (0.45, 0.0, -0.02), (0.85, 0.75, 0.02)
 WALL_CENTER_M, WALL_HALF_M = (-0.62, 0.0, 0.6), (0.02, 1.5, 1.35)
@@ -36,6 +36,10 @@ class SceneObject:
     """Height of that origin above the table, as it lies."""
     assets_xml: str = ""
     """Children of <asset>; mesh files by absolute path."""
+    grasp_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """From the origin to where a hand grips it from above, its fingers closing along the body's y."""
+    grasp_symmetry: int = 1
+    """Yaws per turn in which it can be gripped alike; 0 = every yaw."""
 
 
 def primitive(name: str) -> SceneObject:
@@ -44,7 +48,9 @@ def primitive(name: str) -> SceneObject:
     layout = slot_layout([spec])
     inertia = _numbers(spec.inertia_kg_m2())
     inertial = f'<inertial mass="{spec.mass_kg}" pos="0 0 0" diaginertia="{inertia}"/>'
-    return SceneObject(name, inertial + _slot_geoms(spec, layout), spec.rest_height_m)
+    geoms = inertial + _slot_geoms(spec, layout)
+    grasp = {"grasp_offset_m": spec.grasp_offset_m, "grasp_symmetry": spec.grasp_symmetry}
+    return SceneObject(name, geoms, spec.rest_height_m, **grasp)
 
 
 def meshed(name: str) -> SceneObject:
@@ -67,15 +73,17 @@ def meshed(name: str) -> SceneObject:
         mesh = f"{OBJECT_BODY}_contact{i}"
         assets.append(f'<mesh name="{mesh}" vertex="{_numbers(vertices_m.ravel())}"/>')
         geoms.append(f'<geom name="{mesh}" type="mesh" mesh="{mesh}" group="3" mass="0" {touching}/>')
-    return SceneObject(name, "".join(geoms), body.rest_height_m, "".join(assets))
+    grasp = {"grasp_offset_m": body.grasp_offset_m, "grasp_symmetry": body.grasp_symmetry}
+    return SceneObject(name, "".join(geoms), body.rest_height_m, "".join(assets), **grasp)
 
 
-def furnish(scene: ET.Element, thing: SceneObject, seed: int) -> None:
+def furnish(scene: ET.Element, thing: SceneObject, seed: int, bare: bool = False) -> None:
     """Adds table, wall, clutter and the object to franky-sim's scene; its ground becomes the floor.
 
     Args:
       scene: root of the MJCF, before it is compiled.
       seed: clutter and the object's place on the table follow from it.
+      bare: the object alone, on the ground on which the arm stands.
     """
     option = scene.find("option")
     assert option is not None
@@ -85,15 +93,21 @@ def furnish(scene: ET.Element, thing: SceneObject, seed: int) -> None:
     ground = scene.find("worldbody/geom[@name='ground']")
     assets = scene.find("asset")
     assert world is not None and ground is not None and assets is not None
-    ground.set("pos", f"0 0 {FLOOR_Z_M}")
-    _box(world, TABLE, TABLE_CENTER_M, TABLE_HALF_M, "0.55 0.5 0.45 1")
-    _box(world, "wall", WALL_CENTER_M, WALL_HALF_M, "0.75 0.75 0.72 1")
     rng = np.random.default_rng(seed)
-    for index in range(CLUTTER_COUNT):
-        _clutter(world, index, rng)
+    if not bare:
+        ground.set("pos", f"0 0 {FLOOR_Z_M}")
+        _box(world, TABLE, TABLE_CENTER_M, TABLE_HALF_M, TABLE_RGBA)
+        add_surroundings(world, rng)
     assets.extend(ET.fromstring(f"<asset>{thing.assets_xml}</asset>"))
     xy_m, yaw_rad = start_pose(rng)
     world.append(_object(thing, xy_m, yaw_rad))
+
+
+def add_surroundings(world: ET.Element, rng: np.random.Generator) -> None:
+    """The wall, and clutter as drawn, into a <worldbody>."""
+    _box(world, "wall", WALL_CENTER_M, WALL_HALF_M, "0.75 0.75 0.72 1")
+    for index in range(CLUTTER_COUNT):
+        _clutter(world, index, rng)
 
 
 def start_pose(rng: np.random.Generator) -> tuple[tuple[float, float], float]:

@@ -42,6 +42,8 @@ class Options:
     """Where the arm stands when it is switched on."""
     with_board: bool = False
     """Whether the hand holds the calibration board."""
+    bare: bool = False
+    """Whether table, wall and clutter are left out."""
 
 
 class Rig:
@@ -52,7 +54,7 @@ class Rig:
         self.thing = scene.SceneObject(**options.thing)
         self._sim = MujocoSimulator()
         self._robot = self._sim.add_robot(initial_q=options.q_rad, initial_hand_width=0.08)
-        scene.furnish(self._sim.scene, self.thing, options.seed)
+        scene.furnish(self._sim.scene, self.thing, options.seed, options.bare)
         if options.with_board:
             from rig.fr3.board import hold
             from sensors.charuco_board import CharucoBoard

@@ -1,0 +1,184 @@
+"""Where a policy loses, by cause: the development rig with one thing changed at a time, on the same trials.
+
+DIR/<row>/trials.jsonl     outcome of every trial, kept and not run again
+DIR/causes.json, causes.md the table
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from ddgrasp import artifacts
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.files import atomic_write_json, atomic_write_text, read_json
+from ddgrasp.progress import Progress
+from deploy.changes import Change
+from deploy.fr3_trials import Fr3Bench
+from deploy.trial_log import read_results
+from deploy.trials import Bench, Rig, TrialResult
+from evaluation import paired, rig_trials, wilson
+from evaluation.rig_trials import Series
+
+JSON_FILE, TABLE_FILE, TIMES_FILE = "causes.json", "causes.md", "seconds.json"
+EVERYTHING = "all"
+REFERENCE, IDEAL = "development", "ideal"
+_FR3 = ("franky_sim", "franky", "trimesh")
+_FILMED_FAILURES = 1
+
+
+@dataclass(frozen=True)
+class Row:
+    """One change."""
+
+    title: str
+    cause: str
+    """What of the test rig's differences it is."""
+    bench: Change | Fr3Bench
+    against: str = REFERENCE
+    """The row that it differs from in one thing."""
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Modules of the extra [fr3] that it takes."""
+        return _FR3 if isinstance(self.bench, Fr3Bench) else _FR3[2:] if self.bench.world == "meshes" else ()
+
+    def make(self) -> Callable[[Config, Path], Bench]:
+        """What makes a bench in every worker."""
+        return self.bench if isinstance(self.bench, Fr3Bench) else partial(Rig, change=self.bench)
+
+
+ROWS: dict[str, Row] = {
+    REFERENCE: Row("development rig", "", Change()),
+    IDEAL: Row("camera without errors", "camera noise", Change(sight="ideal")),
+    "full_size": Row("stereo matched at 848x480", "camera resolution", Change(sight="full size")),
+    "meshes": Row("meshes instead of primitives", "object shape", Change("meshes")),
+    "off_2mm": Row("camera off by 2 mm and 0.2 degrees", "calibration", Change(off=(0.002, 0.2))),
+    "off_10mm": Row("camera off by 10 mm and 1 degree", "calibration", Change(off=(0.010, 1.0))),
+    "furniture": Row("end of the table, wall, clutter", "table and clutter", Change("furniture")),
+    "dark_table": Row("dark table", "table and clutter", Change("dark table")),
+    "spring": Row("arm follows as the Franka driver lets it", "dynamics", Change("spring")),
+    "fr3": Row(
+        "FR3 behind its protocol, on the same ground, primitives", "robot model",
+        Fr3Bench("primitive", "ideal", bare=True, paired=True), against=IDEAL,
+    ),
+    "test_rig": Row("test rig: all of it together", "everything", Fr3Bench(paired=True)),
+}  # fmt: skip
+"""What the table can have, in its order."""
+
+
+def chosen(names: Sequence[str]) -> tuple[str, ...]:
+    """Rows by name, with those that they are compared with, in the table's order.
+
+    UserError for an unknown one, or for one whose packages are absent.
+    """
+    asked = tuple(ROWS) if tuple(names) == (EVERYTHING,) else names
+    for name in asked:
+        if name not in ROWS:
+            raise unknown_name("row", name, (*ROWS, EVERYTHING))
+        if missing := [module for module in ROWS[name].needs if find_spec(module) is None]:
+            raise UserError(f"row {name!r} needs {' and '.join(missing)}: pip install 'ddgrasp[fr3]'.")
+    needed = {*asked, *(ROWS[name].against for name in asked), REFERENCE}
+    return tuple(name for name in ROWS if name in needed)
+
+
+def run(
+    config: Config, policy: Path, names: Sequence[str], series: Series, out: Path, workers: int
+) -> dict[str, Any]:
+    """The table of the rows `names`; writes it after every row. Trials that `out` has are not run again.
+
+    Args:
+      series: objects, trials and seed, the same for every row; its other values count for nothing.
+    """
+    series = replace(series, rig="development")
+    config = one_pose(series.configured(config, policy))
+    trials = series.plan()
+    made: dict[str, Any] = {}
+    for place, name in enumerate(names, 1):
+        folder, progress = out / name, Progress(name=name)
+        progress.note(f"row {place} of {len(names)}: {ROWS[name].title}")
+        header = rig_trials.made_with(config, policy) | {"row": name, "number": series.number}
+        known = len(_known(folder))
+        begun = time.monotonic()
+        rig_trials.run_missing(
+            config, policy, trials, ROWS[name].make(), header, folder, workers, progress, _FILMED_FAILURES
+        )
+        new = len(_known(folder)) - known
+        if new:
+            seconds = (time.monotonic() - begun) / new
+            atomic_write_json(folder / TIMES_FILE, {"seconds_per_trial": seconds, "workers": workers})
+        made = write(out, {"number": series.number, "policy": str(policy)})
+    return made
+
+
+def one_pose(config: Config) -> Config:
+    """`config` in which can and block rest as their meshes do: else their pose would be a second change."""
+    random = replace(config.world.random, other_pose_share=0.0)
+    return replace(config, world=replace(config.world, random=random))
+
+
+def write(out: Path, about: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes causes.json and causes.md from what `out` has; returns what causes.json holds."""
+    made = {
+        "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "versions": artifacts.library_versions(),
+        **about,
+        "rows": table(out),
+    }
+    atomic_write_json(out / JSON_FILE, made)
+    atomic_write_text(out / TABLE_FILE, markdown(made["rows"]))
+    return made
+
+
+def table(out: Path) -> list[dict[str, Any]]:
+    """A row each of those that were tried.
+
+    Keys: row, cause, change; success with its Wilson interval; objects; faults; seconds_per_trial; against
+    and the pairs (`evaluation.paired.compared`), None for the reference; p_holm, corrected for all rows.
+    """
+    tried = {name: {r.index: r.success for r in _known(out / name)} for name in ROWS}
+    rows = [_row(out, name, tried) for name in ROWS if tried[name]]
+    asked = [row for row in rows if row["pairs"]]
+    for row, p in zip(asked, paired.holm([row["pairs"]["p"] for row in asked]), strict=True):
+        row["pairs"]["p_holm"] = p
+    return rows
+
+
+def _row(out: Path, name: str, tried: Mapping[str, Mapping[int, bool]]) -> dict[str, Any]:
+    row, counts = ROWS[name], rig_trials.tabulate(_known(out / name))
+    times = out / name / TIMES_FILE
+    reference = tried[row.against] if name != REFERENCE else {}
+    return {
+        "row": name,
+        "cause": row.cause,
+        "change": row.title,
+        "success": counts["all"],
+        "objects": counts["objects"],
+        "faults": counts["faults"],
+        "seconds_per_trial": read_json(times)["seconds_per_trial"] if times.exists() else None,
+        "against": row.against if reference else None,
+        "pairs": paired.compared(reference, tried[name]) if reference else None,
+    }
+
+
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The table for a page."""
+    head = "| cause | change | success (Wilson 95 %) | against | lost, gained | p (Holm) | s a trial |"
+    lines = [head, "|---|---|---|---|---|---|---|"]
+    for row in rows:
+        pairs, seconds = row["pairs"], row["seconds_per_trial"]
+        against = ROWS[row["against"]].title if pairs else ""
+        flips = f"{pairs['only_reference']}, {pairs['only_row']} of {pairs['n']}" if pairs else ""
+        p = f"{pairs['p_holm']:.3f}" if pairs else ""
+        took = f"{seconds:.0f}" if seconds is not None else ""
+        cells = (row["cause"], row["change"], wilson.describe(row["success"]), against, flips, p, took)
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _known(folder: Path) -> list[TrialResult]:
+    return read_results(folder / rig_trials.TRIALS_FILE)

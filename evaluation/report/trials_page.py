@@ -1,0 +1,124 @@
+"""Trials on a rig (`ddgrasp deploy trials`) as one page: verdict, success by object, films of both kinds."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ddgrasp.files import atomic_write_text, read_json
+from deploy.trial_log import read_results
+from deploy.trials import TrialResult
+from evaluation import wilson
+from evaluation.paired import mcnemar_exact
+from evaluation.report.html import REPORT_HTML, contents, film, heading, page, table
+from evaluation.rig_trials import TABLE_FILE, TRIALS_FILE
+
+_SECTIONS = ("By object", "Failures", "Successes", "Which trials")
+_SAME = ("rig", "shapes", "split", "number", "seconds")
+"""What two series agree on where trial i of an object is the same trial."""
+_QUALITY = 75
+"""The films' WebP takes a sixth of the PNG files that they are made from."""
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What one folder holds."""
+
+    folder: Path
+    table: dict[str, Any]
+    """See `evaluation.rig_trials.tabulate`; `series` says which trials they are."""
+    results: Sequence[TrialResult]
+
+
+def find(folder: Path) -> Trials | None:
+    """The finished series in `folder`, if there is one."""
+    if not ((folder / TABLE_FILE).exists() and (folder / TRIALS_FILE).exists()):
+        return None
+    return Trials(folder, read_json(folder / TABLE_FILE), read_results(folder / TRIALS_FILE))
+
+
+def verdict(trials: Trials) -> str:
+    """Success of all, what ended by a fault, deadlines missed."""
+    missed = sum(result.missed_deadlines for result in trials.results)
+    steps = sum(result.steps for result in trials.results)
+    rate = wilson.describe(trials.table["all"])
+    faults = trials.table["faults"]
+    return f"Success {rate}. Ended by a fault: {faults}. Missed deadlines: {missed} in {steps:,} steps."
+
+
+def write(trials: Trials) -> Path:
+    """Writes the page into the trials' folder; returns its path."""
+    bad = trials.table["faults"] or any(result.missed_deadlines for result in trials.results)
+    body = [
+        f"<h1>Trials <code>{trials.folder.name}</code></h1>",
+        f"<p class={'missed' if bad else 'verdict'}>{verdict(trials)}</p>",
+        contents(_SECTIONS),
+        heading(_SECTIONS[0]),
+        "<p class=note>Success: the object at the lift target, held there; rate of n trials, Wilson 95 % "
+        "interval.</p>",
+        table(("object", "success"), _rows(trials.table)),
+        *_films(trials.folder, _SECTIONS[1], "failure"),
+        *_films(trials.folder, _SECTIONS[2], "success"),
+        heading(_SECTIONS[3]),
+        table(("setting", "value"), [(k, str(v)) for k, v in trials.table["series"].items()]),
+    ]
+    path = trials.folder / REPORT_HTML
+    atomic_write_text(path, page(f"Trials {trials.folder.name}: DiffuDepGrasp-JAX", body))
+    return path
+
+
+def compare(all_trials: Sequence[Trials]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """(header, rows) of several series side by side: success by object, then trials that the first lost and
+    another won, and the other way round, among those that both ran, with McNemar's exact p."""
+    header = ("", *(str(trials.folder) for trials in all_trials))
+    rates = [dict(_rows(trials.table)) for trials in all_trials]
+    names = dict.fromkeys(name for column in rates for name in column)
+    pairs = ["", *(_pair(all_trials[0], trials) for trials in all_trials[1:])]
+    rows = [(name, *(column.get(name, "") for column in rates)) for name in names]
+    return header, [*rows, (f"against {all_trials[0].folder.name}, same trials", *pairs)]
+
+
+def write_comparison(all_trials: Sequence[Trials], file: str) -> Path:
+    """Writes `compare` as a page into the first folder; returns its path."""
+    header, rows = compare(all_trials)
+    verdicts = (f"<p class=verdict>{trials.folder}: {verdict(trials)}</p>" for trials in all_trials)
+    note = "<p class=note>Success: rate of n trials, Wilson 95 % interval. p: McNemar's test, exact.</p>"
+    body = ["<h1>Trials side by side</h1>", *verdicts, note, table(header, rows, last_bold=True)]
+    path = all_trials[0].folder / file
+    atomic_write_text(path, page("Trials side by side: DiffuDepGrasp-JAX", body))
+    return path
+
+
+def _rows(made: dict[str, Any]) -> list[tuple[str, str]]:
+    groups = {name: made[name] for name in ("seen", "unseen", "other", "all") if name in made}
+    return [(name, wilson.describe(row)) for name, row in {**made["objects"], **groups}.items()]
+
+
+def _outcomes(trials: Trials) -> dict[tuple[int, str], bool]:
+    return {(r.index, r.object_name): r.success for r in trials.results if not r.realtime}
+
+
+def _pair(first: Trials, other: Trials) -> str:
+    if any(first.table["series"][name] != other.table["series"][name] for name in _SAME):
+        return "other trials"
+    before, after = _outcomes(first), _outcomes(other)
+    both = before.keys() & after.keys()
+    won = sum(after[key] and not before[key] for key in both)
+    lost = sum(before[key] and not after[key] for key in both)
+    return f"{won} won, {lost} lost of {len(both)}, p {mcnemar_exact(won, lost):.2g}"
+
+
+def _films(folder: Path, title: str, outcome: str) -> list[str]:
+    strips = sorted(folder.glob(f"*-{outcome}.png"))
+    parts = [f"<h3>{strip.stem}</h3>{_film(strip)}" for strip in strips]
+    return [heading(title), *(parts or ["<p>No film.</p>"])]
+
+
+def _film(strip: Path) -> str:
+    import cv2
+
+    picture = cv2.imread(str(strip))
+    if picture is None:
+        return f"<p>{strip.name} cannot be shown: it is no whole PNG.</p>"
+    _, data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+    return film(data.tobytes(), strip.stem, "webp")

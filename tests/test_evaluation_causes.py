@@ -1,0 +1,118 @@
+"""Where a policy loses, by cause: which rows there are, and the table that they leave behind."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ddgrasp.errors import UserError
+from ddgrasp.layout import QPOS
+from ddgrasp.presets import get_preset
+from deploy.changes import Change
+from deploy.fr3_trials import Fr3Bench, Fr3Runner
+from deploy.trials import Rig, Trial, drawn
+from deploy_support import constant_bias, describe, write_policy
+from evaluation import causes, rig_trials
+from evaluation.rig_trials import Series
+from rig.world import make_world
+
+CONFIG = get_preset("debug")
+PROFILE = CONFIG.world.profile
+SERIES = Series("development", objects=("cube", "can"), trials=1, seconds=0.5)
+
+
+@pytest.fixture
+def policy(tmp_path):
+    info = describe(depth_height=PROFILE.height_px, depth_width=PROFILE.width_px)
+    return write_policy(tmp_path / "policy.onnx", info, bias=constant_bias(0.0, -1.0))
+
+
+def test_every_row_is_one_change_of_what_it_is_compared_with():
+    for name, row in causes.ROWS.items():
+        reference = causes.ROWS[row.against].bench
+        if isinstance(row.bench, Change) and name != causes.REFERENCE:
+            assert isinstance(reference, Change)
+            fields = ("world", "sight", "off")
+            assert sum(getattr(row.bench, f) != getattr(reference, f) for f in fields) == 1, name
+    fr3 = causes.ROWS["fr3"]
+    assert fr3.bench == Fr3Bench("primitive", "ideal", bare=True, paired=True) and fr3.against == "ideal"
+
+
+def test_rows_bring_what_they_are_compared_with():
+    pytest.importorskip("franky_sim", reason="needs pip install -e '.[fr3]'")
+    assert causes.chosen(("off_2mm",)) == ("development", "off_2mm")
+    assert causes.chosen(("fr3",)) == ("development", "ideal", "fr3")
+    assert causes.chosen(("all",)) == tuple(causes.ROWS)
+    with pytest.raises(UserError, match="Unknown row 'mesh'. Did you mean 'meshes'"):
+        causes.chosen(("mesh",))
+
+
+def test_the_table_is_kept_and_its_trials_are_not_run_again(tmp_path, policy):
+    out = tmp_path / "causes"
+    names = causes.chosen(("ideal", "off_10mm"))
+    made = causes.run(CONFIG, policy, names, SERIES, out, 0)
+    rows = {row["row"]: row for row in made["rows"]}
+    assert list(rows) == ["development", "ideal", "off_10mm"]
+    assert rows["development"]["pairs"] is None and rows["development"]["success"]["n"] == 2
+    pairs = rows["off_10mm"]["pairs"]
+    assert (pairs["n"], pairs["only_reference"], pairs["only_row"], pairs["p"]) == (2, 0, 0, 1.0)
+    assert rows["ideal"]["seconds_per_trial"] > 0
+    lines = (out / causes.TABLE_FILE).read_text().splitlines()
+    assert len(lines) == 5 and "0.0 % of 2 (0.0 to 65.8)" in lines[2] and "| 0, 0 of 2 |" in lines[4]
+    assert json.loads((out / causes.JSON_FILE).read_text())["rows"] == made["rows"]
+    log = (out / "ideal" / rig_trials.TRIALS_FILE).read_bytes()
+    assert causes.run(CONFIG, policy, names, SERIES, out, 0)["rows"] == made["rows"]
+    assert (out / "ideal" / rig_trials.TRIALS_FILE).read_bytes() == log
+    with pytest.raises(UserError, match="trials of another policy or configuration"):
+        causes.run(CONFIG, policy, names, Series("development", ("cube",), 1, number=1, seconds=0.5), out, 0)
+
+
+def test_pairs_and_holm_are_those_of_the_outcomes(tmp_path, policy):
+    names = causes.chosen(("ideal",))
+    causes.run(CONFIG, policy, names, SERIES, tmp_path, 0)
+    log = tmp_path / "development" / rig_trials.TRIALS_FILE
+    log.write_text(log.read_text().replace('"success": false', '"success": true'))
+    reference, ideal = causes.table(tmp_path)
+    assert reference["success"]["rate"] == 1.0 and ideal["success"]["rate"] == 0.0
+    pairs = ideal["pairs"]
+    assert (pairs["only_reference"], pairs["only_row"], pairs["difference"]) == (2, 0, 1.0)
+    assert pairs["p"] == pairs["p_holm"] == 0.5  # 2 of 2 one way: 2 / 2^2
+
+
+def test_a_trial_of_the_fr3_is_the_development_rig_s(policy, tmp_path):
+    config, trial = causes.one_pose(SERIES.configured(CONFIG, policy)), Trial(9000, "can")
+    draw = drawn(config, trial)
+    world = make_world(config.world)
+    world.reset(draw.world_seed, "can")
+    runner = Fr3Runner(config, policy, Fr3Bench("primitive", "ideal", bare=True, paired=True))
+    made = runner.draw(trial)
+    at = world.data.qpos[QPOS.object_pos]
+    assert (made.place["x_m"], made.place["y_m"]) == pytest.approx((at[0], at[1]))
+    np.testing.assert_array_equal(made.T_world_cam, draw.T_world_cam)
+    assert made.policy_seed == draw.policy_seed
+    quat = world.data.qpos[QPOS.object_quat]
+    yaw_rad = made.place["yaw_rad"]
+    np.testing.assert_allclose(
+        np.abs(quat), np.abs([np.cos(yaw_rad / 2), 0, 0, np.sin(yaw_rad / 2)]), atol=1e-9
+    )
+
+
+def test_a_bare_fr3_stands_on_the_development_rig_s_ground(policy, tmp_path, open_gl):
+    pytest.importorskip("franky_sim", reason="needs pip install -e '.[fr3]'")
+    pytest.importorskip("franky", reason="needs pip install -e '.[fr3]'")
+    config = causes.one_pose(SERIES.configured(CONFIG, policy))
+    trial, seen = SERIES.plan()[0], {}
+
+    def keep(name):
+        return lambda step, camera: seen.setdefault(name, step.frame.depth)
+
+    fr3 = Fr3Runner(config, policy, Fr3Bench("primitive", "ideal", bare=True, paired=True))
+    try:
+        result, _ = fr3.run(trial, keep("fr3"))
+    finally:
+        fr3.close()
+    Rig(config, policy, Change(sight="ideal")).run(trial, keep("development"))
+    assert result.steps == 5 and not any("fault" in event for event in result.events)
+    ours, theirs = (seen[name].astype(int) for name in ("fr3", "development"))
+    lower = slice(PROFILE.height_px // 2, None)  # below the arms: ground and object
+    assert np.mean(np.abs(ours - theirs)[lower] <= 3) > 0.97

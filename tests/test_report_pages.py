@@ -1,0 +1,128 @@
+"""The pages that people look at, as a browser shows them, and the page of a series of trials."""
+
+import json
+from dataclasses import asdict
+
+import cv2
+import numpy as np
+import pytest
+
+from app.commands import parse
+from browser_support import WIDTHS_PX, look
+from ddgrasp import artifacts
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from deploy.trials import TrialResult
+from evaluation.report import html, trials_page
+from evaluation.rig_trials import TABLE_FILE, TRIALS_FILE, Series, tabulate
+
+CONFIG = Config(preset="debug")
+
+
+def _result(index: int, name: str, success: bool, missed: int = 0) -> TrialResult:
+    times = {name: [0.01] * 3 for name in ("sense_s", "infer_s", "act_s", "latency_s", "period_s")}
+    made = {"safety": {"commands": 3}, "events": [], "holds": 0, "steps": 3, "realtime": False}
+    return TrialResult(
+        index=index, object_name=name, success=success, missed_deadlines=missed, **made, **times
+    )
+
+
+def _trials(folder, outcomes, missed=0, number=0):
+    """A folder as `ddgrasp deploy trials` leaves it, with a film of a success and of a failure."""
+    folder.mkdir()
+    results = [_result(i, name, success, missed) for i, (name, success) in enumerate(outcomes)]
+    lines = [{"policy_sha256": ""}, *map(asdict, results)]
+    (folder / TRIALS_FILE).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    series = asdict(Series("development", number=number))
+    (folder / TABLE_FILE).write_text(json.dumps({"series": series, **tabulate(results)}))
+    for outcome in {result.success for result in results}:
+        strip = np.random.default_rng(0).integers(0, 255, (200, 3200, 3), np.uint8)
+        cv2.imwrite(str(folder / f"cube-0-{'success' if outcome else 'failure'}.png"), strip)
+    return folder
+
+
+@pytest.fixture
+def trials(tmp_path):
+    return _trials(tmp_path / "tried", [("cube", True), ("cube", False), ("can", False), ("can", False)])
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A finished stage with everything that is wide: curves, many columns, a long film."""
+    columns = {f"acceleration_p99_of_joint_{i}": 0.123456 for i in range(12)}
+    metrics = {"success": {"successes": 9, "n": 10}, "motion": [{"object": "cube", **columns}] * 3}
+    progress = Progress(tmp_path / "run" / "teacher", quiet=True)
+    for step in range(3):
+        progress.scalars(step, **{name: step for name in ("loss", "success", "episode/return")})
+    progress.picture("film", depth=np.full((8, 90, 160), 0.8))
+    progress.close()
+    artifacts.finish(tmp_path / "run" / "teacher", "teacher", CONFIG, seconds=1, metrics=metrics)
+    parse("report", [str(tmp_path / "run")]).run()
+    return tmp_path / "run"
+
+
+def _fits(page, folder):
+    """The page is as wide as the window on a telephone and on a laptop; the console is silent."""
+    seen, console = look(page, folder)
+    assert console == []
+    assert tuple(seen) == WIDTHS_PX
+    for found in seen.values():
+        assert found["excess"] == 0 and found["over"] == [] and found["broken"] == []
+    return seen[WIDTHS_PX[0]]["images"]
+
+
+def test_a_run_s_report_fits_a_telephone_and_says_nothing_on_the_console(run, tmp_path):
+    assert _fits(run / html.REPORT_HTML, tmp_path) == 4
+
+
+def test_trials_and_comparisons_fit_too(trials, tmp_path):
+    other = _trials(tmp_path / "other", [("cube", True), ("cube", True), ("can", True), ("can", False)])
+    parse("report", [str(trials)]).run()
+    parse("report", [str(trials), str(other)]).run()
+    assert _fits(trials / html.REPORT_HTML, tmp_path) == 2
+    _fits(trials / "comparison.html", tmp_path)
+
+
+def test_a_page_that_does_not_fit_is_found(tmp_path):
+    wide = '<div style="width:600px">wide</div><img alt=lost src="data:image/png;base64,AAAA">'
+    (tmp_path / "wide.html").write_text(html.page("wide", [wide, "<script>console.error('no')</script>"]))
+    seen, console = look(tmp_path / "wide.html", tmp_path)
+    assert seen[390]["excess"] > 200 and "600px" in seen[390]["over"][0]
+    assert seen[1280]["excess"] == 0 and seen[1280]["broken"] == ["lost"]
+    assert len(console) == len(WIDTHS_PX) and "no" in console[0]
+
+
+def test_trials_open_with_success_and_show_both_kinds_of_film(trials, capsys):
+    parse("report", [str(trials)]).run()
+    assert "Success 25.0 % of 4 (4.6 to 69.9)" in capsys.readouterr().out
+    page = (trials / html.REPORT_HTML).read_text()
+    opening = page[: page.index("<nav")]
+    assert "class=verdict" in opening and "Missed deadlines: 0 in 12 steps" in opening
+    assert page.index("Failures") < page.index("cube-0-failure") < page.index("cube-0-success")
+    assert page.count("data:image/webp") == 2
+    assert "<td>can</td><td>0.0 % of 2" in page
+
+
+def test_a_film_cut_short_is_named(trials):
+    (trials / "cube-0-success.png").write_bytes(b"PNG")
+    assert "cube-0-success.png cannot be shown" in trials_page.write(trials_page.find(trials)).read_text()
+
+
+def test_a_missed_deadline_is_red(tmp_path):
+    page = trials_page.write(trials_page.find(_trials(tmp_path / "late", [("cube", True)], missed=2)))
+    assert "<p class=missed>" in page.read_text() and "2 in 3 steps" in page.read_text()
+
+
+def test_the_same_trials_are_compared_in_pairs(trials, tmp_path, capsys):
+    other = _trials(tmp_path / "other", [("cube", False), ("cube", True), ("can", True), ("can", True)])
+    parse("report", [str(trials), str(other)]).run()
+    # three won and one lost: p = 2 (1 + 4) / 2^4
+    assert trials_page.compare([trials_page.find(trials), trials_page.find(other)])[1][-1][-1] == (
+        "3 won, 1 lost of 4, p 0.62"
+    )
+    elsewhere = _trials(tmp_path / "elsewhere", [("cube", False)], number=1)
+    pair = trials_page.compare([trials_page.find(trials), trials_page.find(elsewhere)])
+    assert pair[1][-1][-1] == "other trials"
+    with pytest.raises(UserError, match="no finished trials to set beside"):
+        parse("report", [str(trials), str(tmp_path)]).run()
