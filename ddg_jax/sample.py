@@ -24,6 +24,7 @@ from ddgrasp.arrays import AnyArray
 from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.depth import resize_nearest
 from ddgrasp.errors import UserError
+from ddgrasp.shipped import shipped
 from learning import diffusion
 from learning.params import Params, load_params, save_params
 
@@ -53,7 +54,7 @@ class Generator:
           steps: the same for network evaluations per map; for sampler progressive a number to which the stage
             distilled on its way.
         """
-        directory = Path(directory)
+        directory = shipped(directory)
         manifest = artifacts.read_manifest(directory)
         if manifest.stage != "ddg":
             raise UserError(f"{directory} holds a {manifest.stage!r} artifact; expected one of stage 'ddg'.")

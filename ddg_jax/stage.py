@@ -22,6 +22,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
+from ddgrasp.shipped import shipped
 from learning.params import Params
 from sensors.statistics import stats
 
@@ -93,7 +94,7 @@ def fitted_generator(
 
 def _loaded(config: DDGConfig) -> Params:
     """Parameters of `config.init_from`'s fitted network, refused if network or depth space are others."""
-    source = Path(config.init_from)
+    source = shipped(config.init_from)
     generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source, sampler="ddim")
     for name in (
         "depth.height_px", "depth.width_px", "depth.representation", "training.hole_loss", "depth.surface",

@@ -50,6 +50,8 @@ FR3 = Arm(
 """Franka Research 3. Within a few hundredths of a radian of a position limit it allows less speed."""
 ARMS = {arm.name: arm for arm in (PANDA, FR3)}
 
+HOME_RAD = (0.0, -0.2016, 0.0, -2.4853, 0.0, 2.2836, 0.7854)
+"""Grip 0.26 m above the table over x = 0.45, fingers down, opening along world y."""
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 JOINT_LOWER_RAD = PANDA.joint_lower_rad

@@ -22,7 +22,6 @@ from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from deploy.interfaces import Camera, Filmed, Judge
 from deploy.loop import Step
 from rig.film import Film, contact_sheet
-from sensors.recordings.recording import RecordingWriter
 
 STEPS_FILE, REPORT_FILE, FILM_FILE = "steps.jsonl", "report.json", "film.png"
 FILM_COLUMNS = 12
@@ -111,12 +110,14 @@ class DeploymentRecord:
         if first is None:
             return
         try:
+            from sensors.recordings.recording import RecordingWriter
+
             with RecordingWriter(folder, self._meta) as writer:
                 taken: tuple[np.ndarray, np.ndarray] | None = first
                 while taken is not None:
                     writer.add(*taken)
                     taken = self._queue.get()
-        except (UserError, OSError) as error:
+        except (UserError, OSError, ImportError) as error:
             self._trouble = str(error)  # the arm goes on; the report says what is missing
 
 

@@ -81,7 +81,7 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
         if name not in ROWS:
             raise unknown_name("row", name, (*ROWS, EVERYTHING))
         if missing := [module for module in ROWS[name].needs if find_spec(module) is None]:
-            raise UserError(f"row {name!r} needs {' and '.join(missing)}: pip install -e '.[fr3]'.")
+            raise UserError(f"row {name!r} needs {' and '.join(missing)}: pip install 'ddgrasp[fr3]'.")
     needed = {*asked, *(ROWS[name].against for name in asked), REFERENCE}
     return tuple(name for name in ROWS if name in needed)
 

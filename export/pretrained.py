@@ -1,28 +1,23 @@
-"""The student under pretrained/ as an ONNX file, exported when it is first asked for."""
+"""`python -m export.pretrained`: writes the ONNX file of the student under pretrained/ beside its parameters.
+
+It is kept there so that `ddgrasp play` needs no JAX; a test says when it is not its student's any more.
+"""
 
 from pathlib import Path
 
 from ddgrasp import artifacts
-from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_bytes, atomic_write_text, user_cache
+from ddgrasp.files import atomic_write_bytes
+from ddgrasp.shipped import PRETRAINED
 from export.stage import POLICY_FILE, export_policy, load_student
 
-STUDENT = Path(__file__).parents[1] / "pretrained" / "student"
 
-
-def pretrained_policy(student: Path = STUDENT) -> Path:
-    """Path of the ONNX file of the student stage in `student`; its folder has the manifest, so that the
-    configuration is found beside it. Kept in the user's caches, one folder for each student.
-
-    Raises UserError if there is no student.
-    """
-    if not artifacts.is_finished(student):
-        raise UserError(f"{student} holds no student: give --policy, or start in a clone of the project.")
+def write(student: Path = PRETRAINED / "student") -> Path:
+    """Exports the finished student stage in `student` into its own folder; UserError if there is none."""
     artifact = artifacts.read_artifact(student)
-    folder = user_cache("pretrained") / artifact.hash
-    policy = folder / POLICY_FILE
-    if not policy.exists():
-        config = artifacts.config_from_json(artifact.manifest.config)
-        atomic_write_text(folder / artifacts.MANIFEST, (student / artifacts.MANIFEST).read_text())
-        atomic_write_bytes(policy, export_policy(config, load_student(student), artifact.hash))
-    return policy
+    config = artifacts.config_from_json(artifact.manifest.config)
+    atomic_write_bytes(student / POLICY_FILE, export_policy(config, load_student(student), artifact.hash))
+    return student / POLICY_FILE
+
+
+if __name__ == "__main__":
+    print(write())

@@ -21,10 +21,11 @@ from jaxtyping import Float, Float32
 from ddgrasp import artifacts
 from ddgrasp.errors import UserError
 from ddgrasp.files import read_json
+from ddgrasp.shipped import PRETRAINED
 from learning.params import load_params
 
 NAME = "depthfeat-v1"
-DIRECTORY = Path(__file__).parents[1] / "pretrained" / NAME
+DIRECTORY = PRETRAINED / NAME
 PARAMS_FILE = "params.msgpack"
 WIDTH_PX = 320
 """Maps are brought to this width, the one the network was trained at."""

@@ -69,8 +69,7 @@ FINGER_POS_M = (0.0, 0.0, 0.0584)
 GRIP_POS_M = (0.0, 0.0, 0.1034)
 """Site between the finger pads, in the hand frame; z points out of the hand, fingers open along y."""
 
-HOME_RAD = (0.0, -0.2016, 0.0, -2.4853, 0.0, 2.2836, 0.7854)
-"""Grip 0.26 m above the table over x = 0.45, fingers down, opening along world y."""
+HOME_RAD = contract.HOME_RAD
 
 ARM_GAIN_NM_RAD = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)
 """Stiffness of libfranka's internal joint impedance controller in its examples."""

@@ -17,6 +17,7 @@ import numpy as np
 from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_json
 from ddgrasp.progress import Progress
+from ddgrasp.shipped import shipped
 from demos.rollout import Roller
 from demos.store import EpisodeStore
 from learning.loop import Metrics, run_steps
@@ -98,7 +99,7 @@ class Trainer:
             return
         self.params = init_params(jax.random.key(self._config.seed), self._student, self._profile)
         if self._student.init_from:
-            source = Path(self._student.init_from)
+            source = shipped(self._student.init_from)
             source = source if (source / PARAMS_FILE).exists() else source / "student"
             self.params = load_params(source / PARAMS_FILE, self.params)
         else:

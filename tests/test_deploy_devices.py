@@ -157,7 +157,7 @@ def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
 )
 def test_missing_driver_names_the_extra(monkeypatch, module, start, extra):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UserError, match=rf"pip install -e '\.\[{extra}\]'") as error:
+    with pytest.raises(UserError, match=rf"pip install 'ddgrasp\[{extra}\]'") as error:
         start()
     assert "\n" not in str(error.value)
 

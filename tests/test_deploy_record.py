@@ -106,7 +106,7 @@ def test_a_disk_that_takes_no_frames_stops_nothing(run, monkeypatch):
     def full(self, rgb, depth_mm):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("deploy.record.RecordingWriter.add", full)
+    monkeypatch.setattr("sensors.recordings.recording.RecordingWriter.add", full)
     report, folder = run()
     kept = json.loads((folder / "report.json").read_text())
     assert report.steps == 5 and "No space left" in kept["frames_lost"] and not (folder / "depth").exists()

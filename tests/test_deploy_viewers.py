@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 
 from app.commands import parse
-from ddgrasp import contract
+from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
+from ddgrasp.shipped import PRETRAINED
 from deploy.devices.rig_camera import StereoCamera
 from deploy.interfaces import Frame, RobotState
 from deploy.loop import Step
+from deploy.policy import POLICY_FILE, OnnxPolicy
 from deploy.video import ANIMATION_PANEL_PX, FAR_MM, NEAR_MM, PANEL_PX, VERDICT_S, Video, depth_picture
 from deploy.viewers import MujocoWindow, Rerun
-from export.pretrained import STUDENT, pretrained_policy
 from rig.film import INVALID_RGB
+
+STUDENT = PRETRAINED / "student"
 
 HEIGHT, WIDTH = 90, 160
 
@@ -119,13 +122,10 @@ def test_without_rerun_the_remedy_is_named(monkeypatch):
         Rerun(browser=True)
 
 
-def test_the_pretrained_student_is_exported_once(tmp_path, monkeypatch):
-    monkeypatch.setenv("DDGRASP_CACHE", str(tmp_path))
-    policy = pretrained_policy()
-    made = policy.stat().st_mtime_ns
-    assert pretrained_policy() == policy and policy.stat().st_mtime_ns == made
-    with pytest.raises(UserError, match="holds no student"):
-        pretrained_policy(tmp_path)
+def test_the_pretrained_onnx_file_is_its_students():
+    policy = OnnxPolicy(STUDENT / POLICY_FILE)
+    again = "pretrained/student was replaced: python -m export.pretrained"
+    assert policy.info.student_manifest_hash == artifacts.read_artifact(STUDENT).hash, again
 
 
 def test_the_command_plays_the_pretrained_student_into_a_film(tmp_path, capsys):

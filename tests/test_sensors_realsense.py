@@ -216,7 +216,7 @@ def test_a_counter_that_starts_again_is_followed():
 
 def test_a_missing_library_names_the_remedy(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(UserError, match=r"needs pyrealsense2 .* pip install -e '\.\[realsense\]'"):
+    with pytest.raises(UserError, match=r"needs pyrealsense2 .* pip install 'ddgrasp\[realsense\]'"):
         record(tmp_path)
     monkeypatch.delitem(sys.modules, "pyrealsense2")
     (tmp_path / "path").mkdir()

@@ -5,10 +5,13 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
+
+from app.commands import COMMANDS
+from app.extras import NEEDS, TELLS, distribution
 
 ROOT = Path(__file__).parents[1]
 ORDER = (
@@ -64,8 +67,6 @@ def test_importing_every_deploy_module_loads_no_jax():
 
 
 def test_every_package_with_code_is_installed():
-    import tomllib
-
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
     nested = [
         str(path.parent.relative_to(ROOT)) for name in ORDER for path in (ROOT / name).rglob("__init__.py")
@@ -233,37 +234,79 @@ def _under(name: str, prefixes) -> bool:
     return any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes)
 
 
-OTHERWISE_NAMED = {
-    "cv2": "opencv-python-headless",
-    "franky": "franky-control",
-    "mujoco_playground": "playground",
-    "orbax": "orbax-checkpoint",
-    "rerun": "rerun-sdk",
-    "sklearn": "scikit-learn",
-}
-"""Import name -> name on the package index, where they differ by more than a hyphen."""
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+INSTALLED_WITH = {
+    (): ("app.cli", "app.commands", "deploy.policy", "deploy.loop", "deploy.setup", "ddgrasp"),
+    ("franka", "realsense"): (
+        "deploy.session", "deploy.calibration", "deploy.devices.franka_robot",
+        "deploy.devices.realsense_camera", "deploy.devices.realsense_imager",
+        "sensors.recordings.realsense_live", "sensors.recordings.importers",
+    ),
+    ("sim",): ("evaluation.rig_trials", "deploy.viewers", "deploy.devices", "mjx_envs.objects"),
+    ("sim", "franka", "fr3"): ("rig.fr3", "rig.meshes", "deploy.fr3_record", "evaluation.rig_sheet"),
+}  # fmt: skip
+"""Extras -> modules (and what is in packages of that name) that an installation with them must import."""
+
+
+@pytest.mark.parametrize("extras", INSTALLED_WITH, ids=",".join)
+def test_an_extra_has_all_that_its_modules_import(extras):
+    graph = module_graph(ROOT)
+    waiting = [name for name in graph if _under(name, INSTALLED_WITH[extras])]
+    seen, foreign = set(waiting), {}
+    while waiting:
+        for name in graph[importer := waiting.pop()]:
+            if name not in graph:
+                foreign.setdefault(distribution(name), importer)
+            elif name not in seen:
+                seen.add(name)
+                waiting.append(name)
+    optional = PROJECT["optional-dependencies"]
+    there = {*PROJECT["dependencies"], *(line for extra in extras for line in optional[extra])}
+    lacking = foreign.keys() - _names(there) - sys.stdlib_module_names
+    assert {name: foreign[name] for name in lacking} == {}
+
+
+def test_what_tells_that_an_extra_is_there_comes_with_it_and_not_without():
+    base, optional = _names(PROJECT["dependencies"]), PROJECT["optional-dependencies"]
+    for extra, module in TELLS.items():
+        assert distribution(module) in _names(optional[extra]) - base
+    assert set(NEEDS) <= set(COMMANDS)
+    assert {extra for extras in NEEDS.values() for extra in extras} <= set(TELLS)
 
 
 def test_what_is_imported_is_declared():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    groups = [project["dependencies"], *project["optional-dependencies"].values()]
-    declared = {re.split(r"[\[<>=;! ]", line)[0] for group in groups for line in group}
+    groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
+    declared = _names(line for group in groups for line in group)
     wanted = {
-        OTHERWISE_NAMED.get(name, name.replace("_", "-")): file
-        for folder in (*ORDER, "benchmarks")
+        distribution(name): file
+        for folder in (*ORDER, "benchmarks", "tests", "docs")
         for file in sorted((ROOT / folder).rglob("*.py"))
         for name in _foreign(file)
     }
     assert {name: str(file) for name, file in wanted.items() if name not in declared} == {}
+    assert {"ml-dtypes", "rerun-sdk", "pyrealsense2", "mkdocs", "beartype"} <= wanted.keys()
+
+
+def _names(requirements: Iterable[str]) -> set[str]:
+    return {re.split(r"[\[<>=;! ]", line)[0] for line in requirements}
 
 
 def _foreign(file: Path) -> Iterator[str]:
     """Top-level names of the packages of other people that `file` imports, wherever it does."""
     for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        else:
-            names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+        match node:
+            case ast.Import():
+                names = [alias.name for alias in node.names]
+            case ast.ImportFrom(module=str(module), level=0):
+                names = [module]
+            case ast.Call(
+                func=ast.Name(id="import_module") | ast.Attribute(attr="import_module" | "importorskip"),
+                args=[ast.Constant(value=str(module)), *_],
+            ):
+                names = [module]
+            case _:
+                continue
         for name in {name.split(".")[0] for name in names}:
-            if name not in sys.stdlib_module_names and not (ROOT / name).is_dir():
+            ours = (ROOT / name).is_dir() or (ROOT / "tests" / f"{name}.py").is_file()
+            if name not in sys.stdlib_module_names and not ours:
                 yield name

@@ -5,7 +5,7 @@ Stages are imported inside `run`, so that `--help` starts without JAX.
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from app.commands.trials import DeployTrials
 from ddgrasp.config import Config
 from ddgrasp.presets import get_preset
 from ddgrasp.scaling import scaled
+from ddgrasp.shipped import shipped
 
 
 @dataclass(frozen=True)
@@ -108,18 +109,24 @@ def parse(name: str, args: Sequence[str]) -> Command:
         default = cls(preset.score, preset.preset, Path("runs") / preset.preset)
         options["default"] = replace(default, ddg=preset.ddg) if isinstance(default, DDGScore) else default
     elif cls is Deploy:
-        policy = Path(_option(args, "--policy") or Path("runs") / DEFAULT_PRESET / "export" / "policy.onnx")
+        policy = shipped(_option(args, "--policy") or f"runs/{DEFAULT_PRESET}/export/policy.onnx")
         options["default"] = Deploy(config=config_of(policy, _option(args, "--preset")), policy=policy)
     elif cls is Calibrate:
         options["default"] = Calibrate(get_preset(_option(args, "--preset") or DEFAULT_PRESET))
     elif cls is TeacherEval:
-        options["default"] = with_world_of(Path(args[0]) if args and args[0][0] != "-" else None)
+        options["default"] = with_world_of(shipped(args[0]) if args and args[0][0] != "-" else None)
     program, whole = f"ddgrasp {name}", HELP_ALL in args
     given = ["--help" if arg == HELP_ALL else arg for arg in args]
     read = partial(tyro.cli, cls, prog=program, args=given, config=(tyro.conf.FlagCreatePairsOff,), **options)
-    command = parsed(read, program, whole)
+    command = _found(parsed(read, program, whole))
     check_options(command)
     return command
+
+
+def _found(command: Any) -> Any:
+    """`command` with the places of what it reads that comes with this project (`shipped`)."""
+    given = {field.name: getattr(command, field.name) for field in fields(command) if field.name != "out"}
+    return replace(command, **{name: shipped(path) for name, path in given.items() if isinstance(path, Path)})
 
 
 def _scaled(preset: Config, scale: str | None) -> Config:

@@ -13,6 +13,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config, ScoreConfig, WorldConfig
 from ddgrasp.config.checks import Range, check_value, kinds
 from ddgrasp.errors import UserError
+from ddgrasp.shipped import PRETRAINED, shipped
 
 CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
 """File that a folder a stage starts from must hold, itself or in a folder named after the stage. Named here
@@ -110,12 +111,12 @@ def check_memory(config: Config, run_dir: Path) -> list[str]:
 
 def _check_start(stage: str, option: str, folder: str, others: str = "") -> None:
     """UserError unless `folder` is empty or holds the stage's checkpoint; `others` might be given instead."""
-    source, file = Path(folder), CHECKPOINTS[stage]
+    source, file = shipped(folder), CHECKPOINTS[stage]
     if not folder or any(path.is_file() for path in (source / file, source / stage / file)):
         return
-    pretrained = source.parts[:1] == ("pretrained",)
+    pretrained = Path(folder).parts[:1] == ("pretrained",)
     remedy = (
-        "run it from the repository root"
+        f"{PRETRAINED} has what comes with this project"
         if pretrained
         else f"give {others}a run or pretrained folder" + ("" if others else ", or nothing")
     )

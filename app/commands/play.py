@@ -14,6 +14,7 @@ import tyro
 
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
+from ddgrasp.shipped import PRETRAINED
 from deploy.controls import KEYS, Controls, Noise
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 WEB_PORT = 9090
 """Rerun's own, of its web viewer."""
-PRETRAINED_GENERATOR = Path(__file__).parents[2] / "pretrained" / "ddg"
+PRETRAINED_GENERATOR = PRETRAINED / "ddg"
 
 
 @dataclass(frozen=True)
@@ -184,6 +185,6 @@ def _has_display() -> bool:
 
 
 def _pretrained() -> Path:
-    from export.pretrained import pretrained_policy
+    from deploy.policy import POLICY_FILE
 
-    return pretrained_policy()
+    return PRETRAINED / "student" / POLICY_FILE

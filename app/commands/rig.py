@@ -54,7 +54,7 @@ class RigPictures:
     def run(self) -> None:
         """Writes the picture and prints where it is."""
         if find_spec("franky_sim") is None:
-            raise UserError("pictures of the FR3 rig need franky-sim: pip install -e '.[fr3]'.")
+            raise UserError("pictures of the FR3 rig need franky-sim: pip install 'ddgrasp[fr3]'.")
         from evaluation.rig_sheet import draw
 
         atomic_write_bytes(self.out, draw(self.object_name))

@@ -123,7 +123,8 @@ class Deploy:
         """Runs the loop until the time is over, Ctrl-C or a fault, and prints how it kept time."""
         from deploy.session import SessionOptions, deploy, describe
 
-        check_objects(self.config.world)
+        if self.robot == "sim":  # what else there is to grasp, no configuration knows
+            check_objects(self.config.world)
         options = SessionOptions(
             self.robot, self.camera, self.recording, self.object_name, self.seconds,
             dry_run=self.dry_run, yes=self.yes, host=self.host, out=self.out, calibration=self.calibration,

@@ -74,7 +74,7 @@ class StudyTable2(FromPreset):
         series = Series(self.rig, self.objects, self.trials, self.split, self.number)
         series.names()
         if self.rig == "fr3" and (missing := [name for name in _FR3_MODULES if find_spec(name) is None]):
-            raise UserError(f"--rig fr3 needs {' and '.join(missing)}: pip install -e '.[fr3]'.")
+            raise UserError(f"--rig fr3 needs {' and '.join(missing)}: pip install 'ddgrasp[fr3]'.")
         config = rows.shared_config(self.config)
         check_config_values(config)
         left_out = {} if self.rows else _impossible(config, names)

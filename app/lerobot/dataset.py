@@ -73,7 +73,7 @@ def load_lerobot() -> Any:
     except ImportError as error:
         raise UserError(
             f"LeRobot datasets need lerobot 0.6 or newer, on Python 3.12 or newer ({error}): "
-            "pip install -e '.[lerobot]'."
+            "pip install 'ddgrasp[lerobot]'."
         ) from error
     return library
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ddgrasp import policy_metadata
 from ddgrasp.config import Config
+from ddgrasp.contract import HOME_RAD
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes
 from deploy import kinematics
@@ -24,7 +25,6 @@ from deploy.devices.registry import IMAGERS, ROBOTS
 from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, Robot, RobotError
 from deploy.session import ask_person, for_devices, keep_time_of, terminable
 from deploy.setup import safety_filter
-from mjx_envs.scene import HOME_RAD
 from sensors.charuco_board import CharucoBoard, Corners
 
 HOPELESS = 4

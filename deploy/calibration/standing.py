@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
-from scipy.spatial.transform import Rotation
 
 from ddgrasp import contract
 from ddgrasp.config import Config, RandomConfig
@@ -95,6 +94,8 @@ def nominal_pose() -> Float64[np.ndarray, "4 4"]:
 
 def offset(T_base_cam: Float[np.ndarray, "4 4"], T_reference: Float[np.ndarray, "4 4"]) -> Offset:
     """From `T_reference` to `T_base_cam`, as `mjx_envs.draws.displaced` would move it."""
+    from scipy.spatial.transform import Rotation  # of the extra franka, as all that calibrates
+
     turn = Rotation.from_matrix(T_reference[:3, :3].T @ T_base_cam[:3, :3]).as_rotvec()
     return Offset(np.asarray(T_base_cam[:3, 3] - T_reference[:3, 3], float), np.asarray(turn, float))
 

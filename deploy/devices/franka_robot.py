@@ -1,4 +1,4 @@
-"""A Franka arm through franky (`pip install -e '.[franka]'`).
+"""A Franka arm through franky (`pip install 'ddgrasp[franka]'`).
 
 Written against franky-control 2.0 and tested against franky-sim, which speaks the arm's network protocol
 (rig/fr3); it has not been run on an arm by us. docs/hardware.md says how to begin. Keep the
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from ddgrasp import contract
 from ddgrasp.config.deploy import FrankaConfig
+from ddgrasp.contract import HOME_RAD
 from ddgrasp.errors import UserError
 from deploy import kinematics
 from deploy.devices import franka_faults
@@ -24,7 +25,6 @@ from deploy.devices.franka_probe import check_arm
 from deploy.devices.franka_spring import FrankaSpring
 from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotError, RobotState
-from mjx_envs.scene import HOME_RAD
 
 AT_START_RAD = 0.01
 """No joint further than this from the start pose: the arm is there."""
@@ -246,4 +246,4 @@ def load_franky() -> Any:
     try:
         return importlib.import_module("franky")
     except ImportError as error:
-        raise UserError(f"robot 'franka' needs franky ({error}): pip install -e '.[franka]'.") from error
+        raise UserError(f"robot 'franka' needs franky ({error}): pip install 'ddgrasp[franka]'.") from error

@@ -1,4 +1,4 @@
-"""A RealSense D4xx through pyrealsense2 (`pip install -e '.[realsense]'`).
+"""A RealSense D4xx through pyrealsense2 (`pip install 'ddgrasp[realsense]'`).
 
 Written against pyrealsense2 2.59's documented API and tried through librealsense's own playback of
 a synthetic stream; it has not been run on a camera by us.

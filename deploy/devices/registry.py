@@ -1,35 +1,37 @@
 """Robots and cameras by name, and which of them go together.
 
-A new device is a file beside this one with its class and a `make`, and a line here.
+A new device is a file beside this one with its class and a `make`, and a line here. The file is imported when
+its device is made: a robot's computer needs no simulator.
 """
 
 from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any
 
 from ddgrasp.errors import UserError, unknown_name
-from deploy.devices import (
-    fr3_camera,
-    fr3_imager,
-    franka_robot,
-    realsense_camera,
-    realsense_imager,
-    replay_camera,
-    rig_camera,
-    rig_robot,
-)
 from deploy.devices.options import SessionOptions, Setup
 from deploy.interfaces import Camera, Imager, Robot
 
-ROBOTS: Mapping[str, Callable[[Setup], Robot]] = {"sim": rig_robot.make, "franka": franka_robot.make}
+
+def _from(file: str, make: str = "make") -> Callable[..., Any]:
+    """`make` of the file beside this one, imported when it is called."""
+    return lambda *arguments: getattr(import_module(f"{__package__}.{file}"), make)(*arguments)
+
+
+ROBOTS: Mapping[str, Callable[[Setup], Robot]] = {
+    "sim": _from("rig_robot"),
+    "franka": _from("franka_robot"),
+}
 CAMERAS: Mapping[str, Callable[[Setup, Robot], Camera]] = {
-    "stereo": rig_camera.make,
-    "realsense": realsense_camera.make,
-    "replay": replay_camera.make,
-    "rig": fr3_camera.make,
-    "rig-ideal": fr3_camera.make_ideal,
+    "stereo": _from("rig_camera"),
+    "realsense": _from("realsense_camera"),
+    "replay": _from("replay_camera"),
+    "rig": _from("fr3_camera"),
+    "rig-ideal": _from("fr3_camera", "make_ideal"),
 }
 IMAGERS: Mapping[str, Callable[[Setup], Imager]] = {
-    "realsense": realsense_imager.make,
-    "rig": fr3_imager.make,
+    "realsense": _from("realsense_imager"),
+    "rig": _from("fr3_imager"),
 }
 """What calibration looks through, by the camera's name."""
 REFUSED: Mapping[tuple[str, str], str] = {

@@ -1,6 +1,6 @@
 """The grasping task in Gymnasium's registry: importing this package registers `ddgrasp/Pick-v0`.
 
-`gymnasium.make("mjx_envs.gym:ddgrasp/Pick-v0")` imports it by itself. Needs `pip install -e '.[gym]'`.
+`gymnasium.make("mjx_envs.gym:ddgrasp/Pick-v0")` imports it by itself. Needs `pip install 'ddgrasp[gym]'`.
 """
 
 import gymnasium

@@ -27,13 +27,13 @@ def require_gpu(what: str = "backend") -> None:
 
     if not mjx_warp.WARP_INSTALLED:
         raise UserError(
-            f"{what} 'warp' needs warp-lang, which is not installed: pip install -e '.[cuda,warp]'."
+            f"{what} 'warp' needs warp-lang, which is not installed: pip install 'ddgrasp[cuda,warp]'."
         )
     if not any(device.platform == "gpu" for device in jax.devices()):
         raise UserError(
             f"{what} 'warp' needs an NVIDIA GPU and JAX sees only {jax.devices()[0].platform}: choose "
-            f"{'cpu or jax' if what == 'backend' else 'jax'}, or on a machine with a GPU pip install -e "
-            "'.[cuda,warp]'."
+            f"{'cpu or jax' if what == 'backend' else 'jax'}, or on a machine with a GPU pip install "
+            "'ddgrasp[cuda,warp]'."
         )
 
 

@@ -49,7 +49,7 @@ class Fr3Rig:
         if not 0.0 < speed <= 1.0:
             raise UserError(f"--speed is {speed:g}; expected above 0 and at most 1, real time.")
         if find_spec("franky_sim") is None:
-            raise UserError("the FR3 rig needs franky-sim: pip install -e '.[fr3]'.")
+            raise UserError("the FR3 rig needs franky-sim: pip install 'ddgrasp[fr3]'.")
         check_ports(host)
         self.host = host
         given = {"host": host, "seed": seed, "speed": speed, "q_rad": list(q_rad), "with_board": with_board}

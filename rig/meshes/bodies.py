@@ -176,7 +176,7 @@ def _rest_turn(
 def _check_libraries() -> None:
     missing = [name for name in ("manifold3d", "networkx") if find_spec(name) is None]
     if missing:
-        raise UserError(f"Mesh objects need {' and '.join(missing)}: pip install -e '.[fr3]'.")
+        raise UserError(f"Mesh objects need {' and '.join(missing)}: pip install 'ddgrasp[fr3]'.")
 
 
 def _check_closed(name: str, part: Part) -> None:

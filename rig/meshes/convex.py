@@ -51,7 +51,7 @@ def _decompose(part: Part) -> list[Hull]:
         import coacd
     except ImportError:
         raise UserError(
-            f"{part.name!r} is not convex and CoACD is not installed: pip install -e '.[fr3]'."
+            f"{part.name!r} is not convex and CoACD is not installed: pip install 'ddgrasp[fr3]'."
         ) from None
     coacd.set_log_level("error")
     mesh = _simplified(part.mesh)

@@ -1,4 +1,4 @@
-"""RealSense D4xx frames through pyrealsense2 (`pip install -e '.[realsense]'`), depth unaligned, no filters.
+"""RealSense D4xx frames through pyrealsense2 (extra `realsense`), depth unaligned, no filters.
 
 Here the recorded file (`.bag`, or `.db3` as pyrealsense2 2.59 writes) and what it shares with a camera; the
 camera is in `realsense_live.py`. Run on files of synthetic frames that pyrealsense2 2.56 (`.bag`) and 2.59
@@ -63,7 +63,9 @@ def load_pyrealsense2() -> Any:
     try:
         return importlib.import_module("pyrealsense2")
     except ModuleNotFoundError as error:
-        raise UserError(f"RealSense needs pyrealsense2 ({error}): pip install -e '.[realsense]'.") from error
+        raise UserError(
+            f"RealSense needs pyrealsense2 ({error}): pip install 'ddgrasp[realsense]'."
+        ) from error
     except ImportError as error:
         raise UserError(
             f"pyrealsense2 cannot be loaded ({error}): install the library it names, for libusb on Debian or "
