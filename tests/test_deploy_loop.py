@@ -188,8 +188,8 @@ def test_real_clock_keeps_absolute_deadlines(tmp_path):
 
     report = loop.run(max_steps=30, on_step=on_step)
     elapsed, missed = starts[-1] - starts[0], report.timings.missed_deadlines
-    # 29 periods and the missed ones: 8 ms a step would have added 0.23 s.
-    assert elapsed == pytest.approx((29 + missed) * 0.02, abs=0.05)
+    # 29 periods, and at most one more for each that was missed: 8 ms a step would have added 0.23 s.
+    assert 29 * 0.02 - 0.05 < elapsed < (29 + missed) * 0.02 + 0.05
     assert np.median(report.timings.period_s) == pytest.approx(0.02, abs=0.004)
 
 

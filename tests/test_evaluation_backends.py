@@ -5,7 +5,7 @@ import pytest
 from ddgrasp import artifacts
 from ddgrasp.config import Config
 from evaluation import backends
-from evaluation.report.html import render_html
+from evaluation.report.run_page import render_html
 from evaluation.report.summary import build_report, summary_rows
 
 CONFIG = Config(preset="debug")

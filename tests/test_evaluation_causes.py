@@ -104,7 +104,10 @@ def test_a_bare_fr3_stands_on_the_development_rig_s_ground(policy, tmp_path, ope
     trial, seen = SERIES.plan()[0], {}
 
     def keep(name):
-        return lambda step, camera: seen.setdefault(name, step.frame.depth)
+        def watch(step, camera):
+            seen.setdefault(name, step.frame.depth)
+
+        return watch
 
     fr3 = Fr3Runner(config, policy, Fr3Bench("primitive", "ideal", bare=True, paired=True))
     try:

@@ -13,7 +13,7 @@ from ddgrasp import artifacts, contract
 from ddgrasp.config import Config, WorldConfig
 from ddgrasp.progress import Progress
 from evaluation import teacher_trials
-from evaluation.report.html import render_html
+from evaluation.report.run_page import render_html
 from evaluation.report.summary import build_report
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import nominal_camera
