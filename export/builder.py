@@ -1,6 +1,7 @@
 """A thin writer of ONNX nodes: every method adds one operator and returns the name of its output."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -24,18 +25,22 @@ class GraphBuilder:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[str, onnx.TensorProto] = {}
         self._names_of_constants: dict[tuple, str] = {}
+        self._number = count()
 
-    def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """One operator with one output."""
-        output = f"{kind.lower()}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
+    def op(self, kind: str, *inputs: str, spare: int = 0, **attributes: Any) -> str:
+        """One operator; its first output, after which it has `spare` others."""
+        output = f"{kind.lower()}_{next(self._number)}"
+        others = [f"{output}_spare_{i}" for i in range(spare)]
+        self.nodes.append(helper.make_node(kind, inputs, [output, *others], name=output, **attributes))
         return output
 
     def constant(
         self, value: Shaped[AnyArray, "..."] | Sequence[float] | float, dtype: type = np.float32
     ) -> str:
         """An initializer."""
-        array = np.ascontiguousarray(value, dtype)
+        return self._kept(np.ascontiguousarray(value, dtype))
+
+    def _kept(self, array: np.ndarray) -> str:
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._names_of_constants:
             name = f"constant_{len(self.constants)}"
@@ -46,6 +51,10 @@ class GraphBuilder:
     def integers(self, values: Sequence[int]) -> str:
         """An int64 initializer: shapes, axes, indices."""
         return self.constant(values, np.int64)
+
+    def scalar(self, value: int) -> str:
+        """An int64 initializer without axes: lengths, loop counts, one index."""
+        return self._kept(np.array(value, np.int64))
 
     def add(self, a: str, b: str) -> str:
         """a + b."""
@@ -106,15 +115,48 @@ class GraphBuilder:
         inputs = [x, self.constant(weights)] + ([] if bias is None else [self.constant(bias)])
         return self.op("Conv", *inputs, kernel_shape=weights.shape[2:], strides=[stride] * 2, pads=[pad] * 4)
 
+    def output(self, name: str, x: str) -> None:
+        """Gives `x` a name of the model's outputs."""
+        self.nodes.append(helper.make_node("Identity", [x], [name], name=name))
+
+    def loop(
+        self, trips: str, carried: Sequence[str], body: Callable[[str, list[str]], list[str]]
+    ) -> list[str]:
+        """Float tensors `carried` after `trips` (a scalar int64) repetitions of `body`.
+
+        Args:
+          body: writes the nodes of one repetition, given its number (a scalar int64) and what is carried into
+            it, and returns what is carried on; it may use everything written before the loop.
+        """
+        label = f"loop_{next(self._number)}"
+        number, going, going_on = (f"{label}_{part}" for part in ("number", "going", "going_on"))
+        taken = [f"{label}_in_{i}" for i in range(len(carried))]
+        results = [f"{label}_out_{i}" for i in range(len(carried))]
+        around, self.nodes = self.nodes, []
+        left = body(number, taken)
+        self.nodes.append(helper.make_node("Identity", [going], [going_on], name=going_on))
+        scalars = [tensor(number, [], TensorProto.INT64), tensor(going, [], TensorProto.BOOL)]
+        graph = helper.make_graph(
+            self.nodes,
+            f"{label}_body",
+            [*scalars, *(_any_shape(name) for name in taken)],
+            [tensor(going_on, [], TensorProto.BOOL), *(_any_shape(name) for name in left)],
+        )
+        self.nodes = around
+        self.nodes.append(helper.make_node("Loop", [trips, "", *carried], results, name=label, body=graph))
+        return results
+
     def model(
         self,
         inputs: Sequence[onnx.ValueInfoProto],
         outputs: Sequence[onnx.ValueInfoProto],
         metadata: dict[str, str],
+        *,
+        name: str = "policy",
     ) -> onnx.ModelProto:
         """The finished model, checked by onnx.checker with full shape inference."""
         graph = helper.make_graph(
-            self.nodes, "policy", list(inputs), list(outputs), initializer=list(self.constants.values())
+            self.nodes, name, list(inputs), list(outputs), initializer=list(self.constants.values())
         )
         model = helper.make_model(
             graph,
@@ -130,3 +172,7 @@ class GraphBuilder:
 def tensor(name: str, shape: Sequence[int | str], dtype: int = TensorProto.FLOAT) -> onnx.ValueInfoProto:
     """An input or output of the model."""
     return helper.make_tensor_value_info(name, dtype, shape)
+
+
+def _any_shape(name: str) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT, None)

@@ -40,14 +40,18 @@ def write_conv_norm(g: GraphBuilder, x: str, params: Params, stride: int) -> str
 
 
 def write_norm(g: GraphBuilder, x: str, params: Params | None) -> str:
-    """GroupNorm: InstanceNormalization over groups, then scale and bias per channel."""
+    """The encoder's GroupNorm, if it has one."""
     if params is None:
         return x
+    return write_group_norm(g, x, params, len(params["scale"]) // encoder.GROUP_CHANNELS, encoder.EPSILON)
+
+
+def write_group_norm(g: GraphBuilder, x: str, params: Params, groups: int, epsilon: float) -> str:
+    """GroupNorm: InstanceNormalization over groups, then scale and bias per channel."""
     channels = len(params["scale"])
-    groups = channels // encoder.GROUP_CHANNELS
     ones, zeros = g.constant(np.ones(groups)), g.constant(np.zeros(groups))
     grouped = g.reshape(x, [0, groups, -1])
-    grouped = g.op("InstanceNormalization", grouped, ones, zeros, epsilon=encoder.EPSILON)
+    grouped = g.op("InstanceNormalization", grouped, ones, zeros, epsilon=epsilon)
     normal = g.op("Reshape", grouped, g.op("Shape", x))
     scaled = g.mul(normal, g.constant(np.reshape(params["scale"], (channels, 1, 1))))
     return g.add(scaled, g.constant(np.reshape(params["bias"], (channels, 1, 1))))

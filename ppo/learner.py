@@ -73,6 +73,18 @@ def check_divisible(config: TeacherConfig, device_count: int) -> None:
         )
 
 
+def check_start(config: TeacherConfig, saved: dict) -> None:
+    """UserError unless the policy `saved` (`ppo.policy.load_state`) has the layers of `config.hidden`."""
+    layers = saved["layers"]
+    widths = tuple(len(layers[f"hidden_{i}"]["bias"]) for i in range(len(layers) - 1))
+    if widths != tuple(config.hidden):
+        there, wanted = (" ".join(map(str, layers)) for layers in (widths, config.hidden))
+        raise UserError(
+            f"The teacher in teacher.start ({config.start}) has layers {there}, teacher.hidden is {wanted}: "
+            f"add --teacher.hidden {there}."
+        )
+
+
 def shardings(mesh: Mesh) -> LearnerState:
     """Where each part of a learner lies on `mesh`: one sharding in the place of each field."""
     everywhere: Any = devices.replicated(mesh)
@@ -167,12 +179,9 @@ def _with_small_output(policy: Any) -> Any:
 
 
 def warm_start(state: LearnerState, saved: dict) -> LearnerState:
-    """`state` with the policy and normaliser of `ppo.policy.load_state`; the value network stays fresh."""
+    """`state` with the policy and normaliser of `ppo.policy.load_state`, of the same layers (`check_start`);
+    the value network stays fresh."""
     policy = {"params": saved["layers"]}
-    if jax.tree.map(jnp.shape, policy) != jax.tree.map(jnp.shape, state.params.policy):
-        raise UserError(
-            "The teacher of teacher.start has other layers than teacher.hidden asks for: use the same."
-        )
     normalizer = replace(state.normalizer, mean=saved["mean"], std=saved["std"])
     return with_policy(state, policy, normalizer)
 

@@ -21,6 +21,8 @@ def check(config: Config) -> None:
     """UserError if the teacher cannot be trained on these devices; takes a second and changes nothing."""
     if _loads(config):
         return
+    if config.teacher.starts_from_file:
+        learner.check_start(config.teacher, teacher_policy.load_state(config.teacher.start))
     mesh = devices.make_mesh()
     learner.check_divisible(config.teacher, mesh.size)
     memory.check(config, AutoReset(GraspEnv(training_world(config)), mesh))

@@ -11,7 +11,7 @@ from app.commands import COMMANDS, parse
 from ddgrasp.errors import UserError
 
 ROOT = Path(__file__).parents[1]
-FILES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "pretrained" / "README.md")
+FILES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "pretrained").rglob("README.md"))
 PAGES = sorted(str(page.relative_to(ROOT)) for page in (*FILES, *(ROOT / "docs").rglob("*.md")))
 _INCOMPLETE = ("required", "Missing value", "expected 1 argument", "not enough")
 """What the parser says of a command in running text that names only the options it is about."""

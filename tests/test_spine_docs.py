@@ -15,7 +15,7 @@ PAGES = (
     "README.md",
     "CONTRIBUTING.md",
     "CHANGELOG.md",
-    "pretrained/README.md",
+    *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "pretrained").rglob("README.md")),
     *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md")),
 )
 Function = ast.FunctionDef | ast.AsyncFunctionDef

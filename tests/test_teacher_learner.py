@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from brax.training.agents.ppo import networks as ppo_networks
 
+from app.commands import parse
 from ddgrasp.config import Config, EvalConfig, TeacherConfig, WorldConfig
 from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
 from ppo import learner
 from ppo import policy as teacher_policy
@@ -75,7 +77,7 @@ def test_saved_policy_acts_as_braxs_deterministic_policy(uninterrupted, tmp_path
     np.testing.assert_allclose(ours(obs), theirs(jnp.asarray(obs), jax.random.PRNGKey(0))[0], atol=1e-5)
 
 
-def test_warm_start_takes_the_policy_and_refuses_other_sizes(uninterrupted, tmp_path):
+def test_warm_start_takes_the_policy(uninterrupted, tmp_path):
     teacher_policy.save(
         tmp_path / teacher_policy.PARAMS_FILE, uninterrupted.normalizer, uninterrupted.params.policy
     )
@@ -85,9 +87,23 @@ def test_warm_start_takes_the_policy_and_refuses_other_sizes(uninterrupted, tmp_
         jax.tree.leaves(started.params.policy), jax.tree.leaves(uninterrupted.params.policy), strict=True
     ):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
-    saved["layers"]["hidden_0"]["kernel"] = np.zeros((40, 3), np.float32)
-    with pytest.raises(UserError, match="teacher.hidden"):
-        learner.warm_start(uninterrupted, saved)
+    learner.check_start(TEACHER, saved)
+
+
+def test_a_start_with_other_layers_is_refused_before_any_work(tmp_path):
+    teacher = {"start": "pretrained/teacher", "total-steps": "100000"}
+    options = [word for name, value in teacher.items() for word in (f"--teacher.{name}", value)]
+    options += ["--teacher.hidden", "256", "256", "128", "--out", str(tmp_path / "run")]
+    with pytest.raises(UserError, match=r"has layers 256 128, .* 256 256 128: add --teacher.hidden 256 128"):
+        parse("run", ["--preset", "debug", *options]).run()
+    assert not (tmp_path / "run").exists()
+
+
+def test_presets_that_go_on_from_a_policy_have_its_layers():
+    going_on = [preset.teacher for preset in PRESETS.values() if preset.teacher.starts_from_file]
+    assert going_on
+    for teacher in going_on:
+        learner.check_start(teacher, teacher_policy.load_state(teacher.start))
 
 
 def test_missing_teacher_and_indivisible_batch_are_named(tmp_path):

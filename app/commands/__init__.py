@@ -17,7 +17,7 @@ from app.commands.base import DEFAULT_PRESET, Command, FromPreset
 from app.commands.calibrate import Calibrate, CalibrateBoard
 from app.commands.checks import check_config_values, check_devices, check_memory, check_options
 from app.commands.dataset import DemosExport
-from app.commands.ddg import DDGDistil, DDGFit, DDGGenerate, DDGSample, DDGThresholds
+from app.commands.ddg import DDGDistil, DDGExport, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordFr3, RecordImport, RecordRealsense, SensorsCompare
 from app.commands.other import ObjectsList, ObjectsSheet, Report, WeightsConvert, WeightsList
 from app.commands.parsing import HELP_ALL, parsed
@@ -71,6 +71,7 @@ COMMANDS: dict[str, type] = {
     "ddg features": DDGFeatures,
     "ddg distil": DDGDistil,
     "ddg generate": DDGGenerate,
+    "ddg export": DDGExport,
     "ddg thresholds": DDGThresholds,
     "student train": StudentTrain,
     "student eval": StudentEval,

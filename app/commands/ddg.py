@@ -7,7 +7,8 @@ from app import pipeline
 from app.commands.base import OneStage
 from app.commands.checks import check_config_values, check_data
 from ddgrasp import artifacts
-from ddgrasp.config.checks import Count, Seed, Steps
+from ddgrasp.config.checks import Count, Seed, Steps, Text
+from ddgrasp.config.ddg import Sampler
 from ddgrasp.stages import get_stage
 
 
@@ -146,3 +147,41 @@ class DDGThresholds:
         progress = Progress(name="thresholds")
         rows = thresholds.analyse(self.model, self.data, self.out, progress, count=self.count, seed=self.seed)
         print(f"{thresholds.table(rows)}\n{self.out / thresholds.FILE}.png")
+
+
+@dataclass(frozen=True)
+class DDGExport:
+    """Write a fitted noise model as one ONNX file for any simulator: clean depth in, a camera's depth out."""
+
+    model: Path
+    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    out: Path = Path("generator.onnx")
+    """The file."""
+    data: Path | None = None
+    """Recordings it was fitted on: their camera, licence and range of depth go into the file."""
+    licence: Text = ""
+    """Licence of the generator, for the file; empty takes the recordings'."""
+    sampler: Sampler | None = None
+    """Another sampler than the model's; progressive, for one that was distilled."""
+    steps: Steps | None = None
+    """Network evaluations per map unless the file's input says otherwise; none takes the model's."""
+
+    def run(self) -> None:
+        """Writes the file and prints how it compares with JAX."""
+        from export.generator import export_generator
+
+        if self.data is not None:
+            check_data("--data", self.data)
+        measured = export_generator(
+            self.model,
+            self.out,
+            data=self.data,
+            licence=self.licence,
+            sampler=self.sampler or "",
+            steps=self.steps or 0,
+        )
+        print(
+            f"{self.out}: {self.out.stat().st_size / 1e6:.1f} MB; against JAX {measured.share:.3%} of "
+            f"the pixels grafted otherwise, inverse depth elsewhere within "
+            f"{measured.inverse_depth_per_m:.1e} 1/m"
+        )

@@ -21,6 +21,7 @@ OUTSIDE = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "pretrained/README.md": "pretrained.md",
+    "pretrained/ddg/README.md": "pretrained_ddg.md",
 }
 """Pages that lie outside docs/: file in the repository, page of the site."""
 _SOURCE = {page: file for file, page in OUTSIDE.items()}

@@ -1,0 +1,275 @@
+"""An exported generator in any simulator: clean depth in, what the camera would have reported out.
+
+    generator = DepthGenerator("generator.onnx")
+    reported_m = generator(depth_m)  # (N, H, W), (N, 1, H, W) or (N, H, W, 1); NumPy or PyTorch
+
+Imports NumPy and onnxruntime; PyTorch only where tensors come in, JAX never.
+"""
+
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnxruntime as ort
+
+from ddgrasp import generator_metadata as names
+from ddgrasp.errors import UserError
+
+ASPECT_TOLERANCE = 0.02
+FARTHEST_SANE_M = 200.0
+"""Depth beyond this is another unit."""
+_OUTPUTS = {names.OUTPUT_DEPTH: np.float32, names.OUTPUT_PREDICTED: np.float32, names.OUTPUT_MASK: np.bool_}
+
+Array = Any
+"""A NumPy array or a PyTorch tensor."""
+
+
+class Reported(NamedTuple):
+    """What the camera would have reported; kind and shape are those of the depth that came in."""
+
+    depth_m: Array
+    """Simulated depth with the camera's artefacts, 0 = hole."""
+    predicted_m: Array
+    """The generator's own map."""
+    mask: Array
+    """Where an artefact was grafted; everywhere else `depth_m` is the simulation's, bit for bit."""
+
+
+class DepthGenerator:
+    """A file of `ddgrasp ddg export`, ready to run."""
+
+    def __init__(self, path: Path | str, *, device: str = "cpu", threads: int = 0, seed: int = 0):
+        """Loads and checks the file.
+
+        Args:
+          path: the file.
+          device: cpu, cuda or cuda:1, where the network runs; cuda needs onnxruntime-gpu.
+          threads: of the CPU; 0 takes all cores.
+          seed: of the noise of calls that are given none.
+
+        Raises:
+          UserError: no such file, no generator, or a device that onnxruntime does not have.
+        """
+        self.path = Path(path)
+        self._kind, _, number = device.partition(":")
+        self._device_number = int(number or 0)
+        self._session = _open(self.path, self._kind, self._device_number, threads)
+        self.info = names.read(self._session.get_modelmeta().custom_metadata_map, str(self.path))
+        self._seed, self._normals = seed, {}
+
+    def __call__(self, depth_m: Array, noise: Array | None = None, *, steps: int | None = None) -> Array:
+        """`generate`, the grafted depth alone."""
+        return self.generate(depth_m, noise, steps=steps).depth_m
+
+    def generate(self, depth_m: Array, noise: Array | None = None, *, steps: int | None = None) -> Reported:
+        """Gives clean frames the camera's artefacts.
+
+        Args:
+          depth_m: (N, H, W), (N, 1, H, W) or (N, H, W, 1) floating-point planar metres, 0 = nothing in range;
+            any size with the generator's shape.
+          noise: (N, P, h, w) standard normal numbers, of an `EpisodeNoise` for frames that follow each other;
+            None draws them, frames then have nothing to do with each other.
+          steps: network evaluations, the file's own by default.
+
+        Raises:
+          UserError: depth of another type, rank, shape or unit, noise that does not fit, or steps that the
+            file does not have.
+        """
+        steps = self._checked_steps(steps)
+        frames = _frames(depth_m)
+        self._check(frames)
+        given = self._drawn(frames, steps) if noise is None else noise
+        wanted = (len(frames), self.info.planes(steps), self.info.height_px, self.info.width_px)
+        if tuple(given.shape) != wanted:
+            raise UserError(
+                f"Noise is {tuple(given.shape)}; {steps} evaluations of {len(frames)} frames take {wanted}: "
+                "let the generator's noise() make it."
+            )
+        run = self._run_numpy if isinstance(depth_m, np.ndarray) else self._run_torch
+        return Reported(*(made.reshape(depth_m.shape) for made in run(frames, given, steps)))
+
+    def noise(self, count: int, *, seed: int = 0, device: str = "") -> "EpisodeNoise":
+        """Noise of `count` cameras that run side by side, for a call per frame.
+
+        Args:
+          count: cameras, or environments.
+          seed: of the noise.
+          device: PyTorch's name of a device, for tensors there; empty makes NumPy arrays.
+        """
+        return EpisodeNoise(self.info, count, _Normals(seed, device))
+
+    # --- checks ------------------------------------------------------------------------------------
+
+    def _checked_steps(self, steps: int | None) -> int:
+        if steps is None:
+            return self.info.steps
+        least = self.info.steps if self.info.fixed_steps else 1
+        if not least <= steps <= self.info.most_steps:
+            raise UserError(f"steps is {steps}; {self.path} takes {least} to {self.info.most_steps}.")
+        return steps
+
+    def _check(self, frames: Array) -> None:
+        height, width = frames.shape[1:]
+        shape = self.info.width_px / self.info.height_px
+        if not (height and width and len(frames)) or abs(width / height / shape - 1) > ASPECT_TOLERANCE:
+            raise UserError(
+                f"Depth is {len(frames)} frames of {width}x{height}; {self.path} takes the shape of "
+                f"{self.info.width_px}x{self.info.height_px}: render with that aspect ratio, or crop."
+            )
+        low, high = float(frames.min()), float(frames.max())
+        if not (low >= 0 and high <= FARTHEST_SANE_M):  # neither is so for NaN
+            raise UserError(
+                f"Depth reaches from {low:g} to {high:g}; expected finite metres, 0 where nothing is in "
+                "range (put 0 for infinity and NaN; divide millimetres by 1000)."
+            )
+
+    # --- running -----------------------------------------------------------------------------------
+
+    def _drawn(self, frames: Array, steps: int) -> Array:
+        device = "" if isinstance(frames, np.ndarray) else str(frames.device)
+        if device not in self._normals:
+            self._normals[device] = _Normals(self._seed, device)
+        shape = (len(frames), self.info.planes(steps), self.info.height_px, self.info.width_px)
+        return self._normals[device].draw(shape)
+
+    def _feed(self, depth: Array, noise: Array, steps: int) -> dict[str, Array]:
+        given = {names.INPUT_DEPTH: depth, names.INPUT_NOISE: noise}
+        return given if self.info.fixed_steps else given | {names.INPUT_STEPS: np.array(steps, np.int64)}
+
+    def _run_numpy(self, frames: np.ndarray, noise: Array, steps: int) -> Sequence[np.ndarray]:
+        depth, normal = (np.ascontiguousarray(_host(values), np.float32) for values in (frames, noise))
+        made = self._session.run(list(_OUTPUTS), self._feed(depth, normal, steps))
+        return [np.asarray(one) for one in made]
+
+    def _run_torch(self, frames: Array, noise: Array, steps: int) -> Sequence[Array]:
+        """Inputs and outputs stay where the network runs; tensors elsewhere are copied there and back."""
+        torch = importlib.import_module("torch")
+        here = torch.device("cpu") if self._kind == "cpu" else torch.device(self._kind, self._device_number)
+        binding, kept = self._session.io_binding(), []
+        for name, value in self._feed(frames, noise, steps).items():
+            if name == names.INPUT_STEPS:
+                binding.bind_cpu_input(name, value)
+                continue
+            tensor = torch.as_tensor(value).to(device=here, dtype=torch.float32).contiguous()
+            kept.append(tensor)  # the binding knows only where it lies
+            where = (tuple(tensor.shape), tensor.data_ptr())
+            binding.bind_input(name, self._kind, self._device_number, np.float32, *where)
+        made = []
+        for name, kind in _OUTPUTS.items():
+            kind_there = torch.bool if kind is np.bool_ else torch.float32
+            made.append(torch.empty(tuple(frames.shape), dtype=kind_there, device=here))
+            where = (tuple(frames.shape), made[-1].data_ptr())
+            binding.bind_output(name, self._kind, self._device_number, kind, *where)
+        if here.type != "cpu":
+            torch.cuda.current_stream(here).synchronize()  # what writes the inputs has to have ended
+        self._session.run_with_iobinding(binding)
+        binding.synchronize_outputs()
+        return [tensor.to(frames.device) for tensor in made]
+
+
+class EpisodeNoise:
+    """Noise of cameras side by side: sqrt(r) of an episode's own + sqrt(1 - r) of each frame's.
+
+    r is what the generator was set to; by it holes stay where they are between frames, as on a camera.
+    """
+
+    def __init__(self, info: names.GeneratorMetadata, count: int, normals: "_Normals"):
+        self._info, self._count, self._normals = info, count, normals
+        self._shared: Array | None = None
+        self._steps = 0
+
+    def next(self, steps: int | None = None) -> Array:
+        """(count, P, h, w) for the next frame of every camera. `steps` stays the first one's."""
+        steps = steps or self._info.steps
+        if self._shared is None:
+            self._steps = steps
+            self._shared = self._normals.draw(self._shape(self._count))
+        if steps != self._steps:
+            raise UserError(f"steps is {steps}; this noise was begun with {self._steps}: make another one.")
+        share = self._correlations()
+        root, rest = (self._normals.array(np.sqrt(part)) for part in (share, 1 - share))
+        return root * self._shared + rest * self._normals.draw(self._shape(self._count))
+
+    def reset(self, cameras: Sequence[int] | None = None) -> None:
+        """Begins new episodes, of the given cameras or of all."""
+        if self._shared is None:
+            return
+        chosen = list(range(self._count)) if cameras is None else [int(number) for number in cameras]
+        if not all(0 <= number < self._count for number in chosen):
+            raise UserError(f"Cameras {chosen} are to be reset; there are 0 to {self._count - 1}.")
+        if chosen:
+            self._shared[chosen] = self._normals.draw(self._shape(len(chosen)))
+
+    def _shape(self, count: int) -> tuple[int, ...]:
+        return (count, self._info.planes(self._steps), self._info.height_px, self._info.width_px)
+
+    def _correlations(self) -> np.ndarray:
+        """(P, 1, 1): that of deviations where a plane is theirs, else that of holes."""
+        share = np.full(self._info.planes(self._steps), self._info.frame_correlation, np.float32)
+        if self._info.channels == 2:
+            share[2::2] = self._info.deviation_correlation
+        return share[:, None, None]
+
+
+class _Normals:
+    """Standard normal float32 numbers: NumPy's or, with the name of a device, PyTorch's there."""
+
+    def __init__(self, seed: int, device: str):
+        self._device = device
+        if device:
+            self._torch = importlib.import_module("torch")
+            self._source = self._torch.Generator(device=device).manual_seed(seed)
+        else:
+            self._rng = np.random.default_rng(seed)
+
+    def draw(self, shape: tuple[int, ...]) -> Array:
+        if self._device:
+            return self._torch.randn(shape, generator=self._source, device=self._device)
+        return self._rng.standard_normal(shape, dtype=np.float32)
+
+    def array(self, values: np.ndarray) -> Array:
+        return self._torch.as_tensor(values, device=self._device) if self._device else values
+
+
+def _frames(depth: Array) -> Array:
+    """(N, H, W) of what came in; UserError for another rank or integers."""
+    shape: tuple[int, ...] = tuple(getattr(depth, "shape", ()))
+    if isinstance(depth, np.ndarray):
+        floating = depth.dtype.kind == "f"
+    else:
+        floating = hasattr(depth, "is_floating_point") and depth.is_floating_point()
+    if floating and len(shape) == 4 and 1 in (shape[1], shape[3]):
+        return depth.reshape(shape[0], *(shape[2:] if shape[1] == 1 else shape[1:3]))
+    if not floating or len(shape) != 3:
+        raise UserError(
+            f"Depth is {getattr(depth, 'dtype', type(depth).__name__)} {shape}; expected (N, H, W), "
+            "(N, 1, H, W) or (N, H, W, 1) floating-point metres, NumPy or PyTorch (divide millimetres by "
+            "1000)."
+        )
+    return depth
+
+
+def _host(values: Array) -> np.ndarray:
+    return values if isinstance(values, np.ndarray) else values.detach().cpu().numpy()
+
+
+def _open(path: Path, kind: str, number: int, threads: int) -> ort.InferenceSession:
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; {names.REMEDY}.")
+    providers: list[Any] = ["CPUExecutionProvider"]
+    if kind == "cuda":
+        providers.insert(0, ("CUDAExecutionProvider", {"device_id": number}))
+    elif kind != "cpu":
+        raise UserError(f"device is {kind!r}; expected cpu, cuda or cuda:1.")
+    if kind == "cuda" and "CUDAExecutionProvider" not in ort.get_available_providers():
+        raise UserError("device is cuda, which this onnxruntime does not have: install onnxruntime-gpu.")
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return ort.InferenceSession(str(path), options, providers=providers)
+    except Exception as error:  # onnxruntime raises classes of its own, without a common base
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{path}: onnxruntime cannot load it ({reason}); {names.REMEDY}.") from error

@@ -1,0 +1,227 @@
+"""The exported generator behind one call: NumPy and PyTorch, what it refuses, noise that lasts an episode."""
+
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ddgrasp import generator_metadata as names
+from ddgrasp.errors import UserError
+from deploy.depth_noise import DepthGenerator
+from tutorial_support import code
+
+ROOT = Path(__file__).parents[1]
+FILE = ROOT / "pretrained" / "ddg" / "generator.onnx"
+
+
+@pytest.fixture(scope="module")
+def generator() -> DepthGenerator:
+    return DepthGenerator(FILE, threads=1)
+
+
+@pytest.fixture(scope="module")
+def scene(generator: DepthGenerator) -> np.ndarray:
+    """(2, H, W): a floor with a box before it, and nothing in one corner."""
+    height, width = generator.info.height_px, generator.info.width_px
+    depth_m = np.tile(np.linspace(1.6, 0.8, height, dtype=np.float32)[:, None], (2, 1, width))
+    depth_m[:, height // 3 : 2 * height // 3, width // 3 : width // 2] = 0.7
+    depth_m[:, :10, :20] = 0
+    return depth_m
+
+
+def test_a_cameras_holes_lie_where_a_camera_loses_pixels(generator, scene):
+    made = generator.generate(scene)
+    holes = made.depth_m == 0
+    assert 0.03 < holes[:, 12:].mean() < 0.3 and made.mask.dtype == bool
+    np.testing.assert_array_equal(made.depth_m[~made.mask], scene[~made.mask])
+    np.testing.assert_array_equal(made.depth_m[made.mask], made.predicted_m[made.mask])
+    assert not made.depth_m[:, :10, :20].any()
+    height, width = scene.shape[1:]
+    beside = holes[:, height // 3 : 2 * height // 3, width // 3 - 8 : width // 3].mean()
+    assert beside > 3 * holes[:, -height // 5 :].mean()  # the shadow of the box, and open floor
+
+
+def test_layout_of_the_input_is_kept(generator, scene):
+    noise = generator.noise(2).next()
+    plain = generator(scene, noise)
+    for axis in (1, 3):
+        np.testing.assert_array_equal(
+            generator(np.expand_dims(scene, axis), noise), np.expand_dims(plain, axis)
+        )
+    np.testing.assert_allclose(generator(scene.astype(np.float64), noise), plain)
+    larger = scene.repeat(2, axis=1).repeat(2, axis=2)
+    assert generator(larger, noise).shape == larger.shape
+
+
+def test_frames_do_not_see_each_other(generator, scene):
+    """A batch gives what its frames give one by one, up to rounding at thresholds."""
+    noise = generator.noise(2).next()
+    scene = scene * np.array([1, 0.8], np.float32)[:, None, None]
+    together = generator.generate(scene, noise)
+    alone = [generator.generate(scene[i : i + 1], noise[i : i + 1]) for i in range(2)]
+    assert np.mean(together.mask != np.concatenate([made.mask for made in alone])) < 1e-3
+
+
+def test_evaluations_can_be_asked_for(generator, scene):
+    assert generator.info.steps == 4 and not generator.info.fixed_steps
+    noise = generator.noise(2)
+    now = noise.next()
+    np.testing.assert_array_equal(generator(scene, now), generator(scene, now, steps=4))
+    assert not np.array_equal(generator(scene, now), generator(scene, noise.next()))
+    same = DepthGenerator(FILE, threads=1, seed=5)(scene), DepthGenerator(FILE, threads=1, seed=5)(scene)
+    np.testing.assert_array_equal(*same)
+    assert not np.array_equal(generator(scene, steps=1), generator(scene, steps=8))
+
+
+# --- noise -----------------------------------------------------------------------------------------
+
+
+def test_noise_of_an_episode_lasts_and_ends_with_it(generator):
+    noise = generator.noise(2, seed=3)
+    first, second = noise.next(), noise.next()
+    noise.reset([1])
+    third = noise.next()
+
+    def alike(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
+
+    assert first.shape == (2, 3, 180, 320) and abs(first.std() - 1) < 0.01
+    for plane, share in ((0, 0.8), (1, 0.8), (2, 0.0)):  # the prior's, holes', deviations'
+        assert alike(first[0, plane], second[0, plane]) == pytest.approx(share, abs=0.02)
+    assert alike(second[0, 1], third[0, 1]) == pytest.approx(0.8, abs=0.02)
+    assert abs(alike(second[1, 1], third[1, 1])) < 0.02
+    assert abs(alike(first[0, 1], first[1, 1])) < 0.02
+    with pytest.raises(UserError, match=r"Cameras \[2\] are to be reset; there are 0 to 1"):
+        noise.reset([2])
+    with pytest.raises(UserError, match="steps is 2; this noise was begun with 4"):
+        noise.next(2)
+
+
+# --- what is refused -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("depth", "said"),
+    [
+        (np.ones((1, 180, 320), np.uint16), "Depth is uint16 .* floating-point metres.*divide millimetres"),
+        (np.ones((180, 320), np.float32), r"Depth is float32 \(180, 320\); expected \(N, H, W\)"),
+        (np.ones((1, 240, 320), np.float32), "1 frames of 320x240; .* takes the shape of 320x180"),
+        (np.ones((0, 180, 320), np.float32), "0 frames of 320x180"),
+        (np.full((1, 180, 320), 900.0, np.float32), "from 900 to 900; expected finite metres"),
+        (np.full((1, 180, 320), np.inf, np.float32), "put 0 for infinity and NaN"),
+        (np.full((1, 180, 320), np.nan, np.float32), "put 0 for infinity and NaN"),
+        (np.full((1, 180, 320), -1.0, np.float32), "from -1 to -1; expected finite metres"),
+        ([1.0], r"Depth is list \(\); expected"),
+    ],
+)
+def test_wrong_depth_is_one_line(generator, depth, said):
+    with pytest.raises(UserError, match=said) as refused:
+        generator(depth)
+    assert "\n" not in str(refused.value)
+
+
+def test_wrong_noise_and_steps_are_refused(generator, scene):
+    with pytest.raises(
+        UserError, match=r"Noise is \(1, 3, 180, 320\); 4 evaluations of 2 frames take \(2, 3"
+    ):
+        generator(scene, generator.noise(1).next())
+    with pytest.raises(UserError, match="steps is 51; .* takes 1 to 50"):
+        generator(scene, steps=51)
+
+
+def test_files_that_are_no_generators_are_refused(tmp_path):
+    with pytest.raises(UserError, match="no such file; make one with `ddgrasp ddg export`"):
+        DepthGenerator(tmp_path / "generator.onnx")
+    (tmp_path / "generator.onnx").write_bytes(b"no")
+    with pytest.raises(UserError, match="onnxruntime cannot load it"):
+        DepthGenerator(tmp_path / "generator.onnx")
+    with pytest.raises(UserError, match="is no generator of this project"):
+        names.read({}, "x")
+    with pytest.raises(UserError, match="damaged metadata"):
+        names.read({names.METADATA_KEY: "{"}, "x")
+    with pytest.raises(UserError, match="device is 'tpu'; expected cpu"):
+        DepthGenerator(FILE, device="tpu")
+
+
+def test_neither_jax_nor_pytorch_is_loaded():
+    code = (
+        "import sys, numpy as np\n"
+        "from deploy.depth_noise import DepthGenerator\n"
+        f"DepthGenerator({str(FILE)!r}, threads=1)(np.ones((1, 180, 320), np.float32))\n"
+        "print(sorted({'jax', 'flax', 'torch', 'onnx', 'cv2', 'mujoco'} & set(sys.modules)))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "[]"
+
+
+# --- PyTorch ---------------------------------------------------------------------------------------
+
+
+def test_tensors_give_what_arrays_give(generator, scene):
+    torch = pytest.importorskip("torch")
+    noise = generator.noise(2).next()
+    wanted = generator.generate(scene, noise)
+    made = generator.generate(torch.from_numpy(scene)[..., None], torch.from_numpy(noise))
+    assert made.depth_m.shape == (*scene.shape, 1) and made.mask.dtype == torch.bool
+    for tensor, array in zip(made, wanted, strict=True):
+        np.testing.assert_array_equal(tensor[..., 0].numpy(), array)
+    half = generator(torch.from_numpy(scene).half(), noise)  # NumPy noise will do
+    assert half.dtype == torch.float32
+    drawn = generator.noise(2, seed=1, device="cpu")
+    drawn.next()
+    drawn.reset([0])
+    assert generator(torch.from_numpy(scene), drawn.next()).shape == scene.shape
+    assert generator(torch.from_numpy(scene)).shape == scene.shape
+    with pytest.raises(UserError, match=r"Depth is torch.int16 \(2, 180, 320\)"):
+        generator(torch.ones(2, 180, 320, dtype=torch.int16))
+
+
+# --- the tutorial ----------------------------------------------------------------------------------
+
+
+def run_blocks(*numbers: int) -> dict:
+    """Names that the tutorial's Python blocks leave, one after the other."""
+    left: dict = {}
+    for number in numbers:
+        exec(code("one_file.md")[number].replace("pretrained/ddg/generator.onnx", str(FILE)), left)
+    return left
+
+
+def test_the_tutorials_numpy_runs():
+    left = run_blocks(0, 1)
+    clean_m, reported_m, mask = left["clean_m"], left["reported_m"], left["reported_m"] == 0
+    assert reported_m.shape == clean_m.shape and 0.03 < mask.mean() < 0.3
+    assert left["first_m"].shape == left["second_m"].shape == clean_m.shape
+
+
+def test_the_tutorials_pytorch_runs():
+    torch = pytest.importorskip("torch")
+    left = run_blocks(0, 2)
+    assert isinstance(left["reported"], torch.Tensor) and left["reported"].shape == left["clean_m"].shape
+
+
+def test_the_tutorials_isaac_lab_takes_its_cameras_tensors(generator, scene):
+    torch = pytest.importorskip("torch")
+    depth = torch.from_numpy(np.where(scene > 0, scene, np.inf))[..., None]
+    camera = SimpleNamespace(data=SimpleNamespace(output={"distance_to_image_plane": depth}))
+    noise = run_blocks(4)["CameraNoise"](str(FILE), "cpu", 2)
+    made = noise(camera)
+    assert made.shape == depth.shape and made.isfinite().all() and not made[:, :10, :20].any()
+    before = noise.noise.next()
+    noise.reset(torch.tensor([1]))
+    after = noise.noise.next()
+    alike = [float(np.corrcoef(before[i, 1].ravel(), after[i, 1].ravel())[0, 1]) for i in range(2)]
+    assert alike[0] > 0.7 and abs(alike[1]) < 0.05
+
+
+def test_the_tutorials_maniskill_runs():
+    """Where ManiSkill is installed and can render."""
+    pytest.importorskip("mani_skill")
+    left = run_blocks(3)
+    (picture,) = left["obs"]["sensor_data"].values()
+    depth = picture["depth"]
+    assert tuple(depth.shape) == (1, 180, 320, 1) and str(depth.dtype) == "torch.float32"
+    assert 0.01 < float((depth == 0).float().mean()) < 0.9

@@ -1,0 +1,172 @@
+"""The generator's ONNX file computes what JAX computes, whatever its prior, sampler and representation."""
+
+from dataclasses import replace
+
+import cv2
+import jax
+import numpy as np
+import onnxruntime as ort
+import pytest
+
+from ddg_jax.prior import make_prior
+from ddg_jax.sample import Generator, generate
+from ddg_jax.train import init_params
+from ddgrasp import generator_metadata
+from ddgrasp.artifacts import finish
+from ddgrasp.config import (
+    Config,
+    DDGConfig,
+    DDGDepthConfig,
+    DDGTrainingConfig,
+    GraftConfig,
+    PriorConfig,
+    SamplingConfig,
+    UNetConfig,
+)
+from ddgrasp.errors import UserError
+from export import generator as exported
+from export import prior_graph
+from export.builder import GraphBuilder, tensor
+from export.generator_graph import build_model
+from export.parity import open_session
+from sensors.statistics import holes
+
+SMALL = DDGConfig(
+    depth=DDGDepthConfig(height_px=27, width_px=48),
+    unet=UNetConfig(space_to_depth=2, widths=(8, 16), blocks=(1, 1), attention_heads=2),
+    graft=GraftConfig(noise_threshold=0.1),
+)
+CAMERA = replace(
+    SMALL,
+    depth=replace(SMALL.depth, surface="piecewise"),
+    prior=PriorConfig(source="metric_inverse_depth"),
+    training=DDGTrainingConfig(hole_loss="cross_entropy"),
+    sampling=SamplingConfig(sampler="ddim", steps=3, eta=1.0),
+)
+OPTIONS = {
+    "the rig's: DPM-Solver, filtered, normalised": SMALL,
+    "a camera's: DDIM with fresh noise, log odds, metric": CAMERA,
+    "the paper's: depth itself, DDPM, no attention, no blur, a window": replace(
+        SMALL,
+        depth=replace(SMALL.depth, representation="depth"),
+        graft=GraftConfig(noise_threshold=-0.2, window_px=1.25),
+        prior=PriorConfig(blur_px=0.0),
+        unet=replace(SMALL.unet, attention_heads=0),
+        sampling=SamplingConfig(sampler="ddpm", steps=5, spacing="trailing"),
+    ),
+    "distilled": replace(SMALL, sampling=SamplingConfig(sampler="progressive", steps=2)),
+}
+
+
+def made(config: DDGConfig) -> Generator:
+    """A generator whose parameters have no special values such as zero, which could hide a mistake."""
+    rng = np.random.default_rng(0)
+    params = jax.tree.map(
+        lambda a: np.asarray(a + rng.normal(0, 0.05, a.shape), np.float32),
+        init_params(config, jax.random.key(0)),
+    )
+    return Generator(config, params, make_prior(config))
+
+
+def finished(generator: Generator, directory) -> None:
+    """The generator as a stage's directory."""
+    generator.save(directory)
+    if generator.config.sampling.sampler == "progressive":
+        (directory / "params.msgpack").rename(directory / "distilled_2.msgpack")
+    finish(directory, "ddg", Config(preset="debug", ddg=generator.config), seconds=1, metrics={})
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_the_file_draws_what_jax_draws(name, tmp_path):
+    generator = made(OPTIONS[name])
+    finished(generator, tmp_path)
+    measured = exported.export_generator(tmp_path, tmp_path / "generator.onnx")
+    assert measured.share <= exported.MOST_SHARE and measured.median_m < 1e-4
+    session = open_session(tmp_path / "generator.onnx")
+    info = generator_metadata.read(session.get_modelmeta().custom_metadata_map, "it")
+    assert (info.height_px, info.width_px, info.steps) == (27, 48, generator.config.sampling.steps)
+    inputs = {one.name for one in session.get_inputs()}
+    assert inputs == {"depth", "noise"} | (set() if info.fixed_steps else {"steps"})
+
+
+def test_any_size_of_that_shape_and_number_of_evaluations():
+    generator, key = made(CAMERA), jax.random.key(4)
+    metadata = generator_metadata.GeneratorMetadata(1, "", 27, 48, 2, "ddim", 3, 50, True, 0.8, 0.0, "m")
+    session = open_session(build_model(generator.params, CAMERA, metadata).SerializeToString())
+    depth_m = exported.scenes(np.random.default_rng(1), 2, (71, 126))
+    noise = exported.jax_noise(CAMERA, key, 2, 5)
+    assert noise.shape == (2, metadata.planes(5), 27, 48)
+    reported, predicted, mask = exported.run(session, depth_m, noise, 5)
+    wanted = generate(key, generator, depth_m, episode=np.arange(2), steps=5)
+    assert np.mean(mask != wanted.mask) < 1e-3 and 0.02 < mask.mean() < 0.98
+    drawn = (predicted > 0) & (wanted.predicted_m > 0)
+    np.testing.assert_allclose(predicted[drawn], wanted.predicted_m[drawn], atol=1e-3)
+    np.testing.assert_array_equal(reported[~mask], depth_m[~mask])
+
+
+# --- filters ---------------------------------------------------------------------------------------
+
+
+def filtered(write, picture: np.ndarray) -> np.ndarray:
+    """What nodes make of (H, W)."""
+    g = GraphBuilder()
+    g.output("out", write(g, "picture"))
+    shape = [1, 1, *picture.shape]
+    model = g.model([tensor("picture", shape)], [tensor("out", shape)], {})
+    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    return np.asarray(session.run(None, {"picture": picture[None, None]})[0])[0, 0]
+
+
+def test_filters_are_opencvs():
+    size = (31, 44)
+    rng = np.random.default_rng(0)
+    steps = np.where(np.arange(size[1]) < 20, 0.8, 1.3)
+    picture = (steps + rng.normal(0, 0.01, size)).astype(np.float32)
+    picture[5:8, 30:33] = 0
+    median = filtered(lambda g, x: prior_graph.write_median(g, x, size), picture)
+    np.testing.assert_array_equal(median, cv2.medianBlur(picture, holes.MEDIAN_PX))
+    smooth = filtered(
+        lambda g, x: prior_graph.write_bilateral(g, prior_graph.write_median(g, x, size), size), picture
+    )
+    np.testing.assert_allclose(smooth, holes.smooth_surface(picture), atol=3e-6)
+    for sigma in (0.8, 1.0, 1.25):
+        blurred = filtered(lambda g, x, sigma=sigma: prior_graph.write_blur(g, x, sigma), picture)
+        np.testing.assert_allclose(blurred, cv2.GaussianBlur(picture, (0, 0), sigma), atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [3, 5, 7])
+def test_the_median_of_any_window(n):
+    """Numbers without ties, in every order that a window slides through."""
+    picture = np.random.default_rng(n).permutation(20 * 23).reshape(20, 23).astype(np.float32)
+    window = np.lib.stride_tricks.sliding_window_view(np.pad(picture, n // 2, mode="edge"), (n, n))
+    before, holes.MEDIAN_PX = holes.MEDIAN_PX, n
+    try:
+        found = filtered(lambda g, x: prior_graph.write_median(g, x, (20, 23)), picture)
+    finally:
+        holes.MEDIAN_PX = before
+    np.testing.assert_array_equal(found, np.median(window, axis=(-2, -1)))
+
+
+# --- what is refused -------------------------------------------------------------------------------
+
+
+def test_a_prior_by_colour_is_refused():
+    by_colour = replace(SMALL, prior=PriorConfig(source="depth_anything_v2", in_sim="rgb"))
+    with pytest.raises(UserError, match="on rgb, which the ONNX file cannot hold"):
+        prior_graph.check_prior(by_colour)
+
+
+def test_a_file_that_differs_is_not_written(tmp_path, monkeypatch):
+    finished(made(CAMERA), tmp_path)
+    monkeypatch.setattr(exported, "MOST_SHARE", -1.0)
+    with pytest.raises(UserError, match="differs from JAX.*nothing was written"):
+        exported.export_generator(tmp_path, tmp_path / "generator.onnx")
+    assert not (tmp_path / "generator.onnx").exists()
+
+
+def test_more_evaluations_than_a_file_holds_are_refused(tmp_path):
+    finished(made(CAMERA), tmp_path)
+    with pytest.raises(
+        UserError, match="takes 51 evaluations; a file holds tables for up to 50: give --steps"
+    ):
+        exported.export_generator(tmp_path, tmp_path / "generator.onnx", steps=51)
