@@ -100,7 +100,7 @@ def _write_fresh(g: GraphBuilder, number: str, channels: int) -> str:
     return g.op("Slice", names.INPUT_NOISE, first, g.add(first, per_step), one)
 
 
-def _write_clean(g: GraphBuilder, out: str, x: str, row: Row[str], config: DDGConfig) -> str:
+def _write_clean(g: GraphBuilder, out: str, x: str, row: Row, config: DDGConfig) -> str:
     """`train.predict_clean`: the network's output, or the expected validity and the other channels."""
     if config.training.hole_loss == SQUARED:
         return out

@@ -6,7 +6,7 @@ x_0 is the clean map that the network sees in x. All samplers are linear in thes
 equations (learning/diffusion.py) are evaluated once, on ones and zeros, and a graph needs a row of numbers.
 """
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
@@ -19,11 +19,12 @@ MOST_STEPS = 50
 """Network evaluations that a file can be asked for."""
 
 
-Values = TypeVar("Values")
+Values = Any
+"""An array of a value a step, or the name of a value in a graph."""
 
 
-class Row(NamedTuple, Generic[Values]):
-    """Columns of the tables: arrays of a value a step, or names of a step's values in a graph."""
+class Row(NamedTuple):
+    """Columns of the tables."""
 
     step: Values
     """k, the diffusion step."""
@@ -65,7 +66,7 @@ def sampler_tables(config: DDGConfig) -> Float32[np.ndarray, "counts most column
     return tables
 
 
-def _rows(config: DDGConfig, k: np.ndarray, previous: np.ndarray, before: np.ndarray) -> Row[np.ndarray]:
+def _rows(config: DDGConfig, k: np.ndarray, previous: np.ndarray, before: np.ndarray) -> Row:
     made, sampler = config_schedule(config), config.sampling.sampler
     one, none = np.ones(len(k), np.float32), np.zeros(len(k), np.float32)
     alpha_bar = np.asarray(diffusion.alpha_bar_at(made, k, one))
