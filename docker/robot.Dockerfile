@@ -1,7 +1,7 @@
 # A robot's computer: an ONNX file, a Franka arm, a RealSense; no JAX, no simulator. The host has a realtime kernel.
 #   docker build -f docker/robot.Dockerfile -t ddgrasp-robot .
 #   docker run -it --network host --cap-add SYS_NICE --ulimit rtprio=99 --ulimit memlock=-1 --device /dev/bus/usb \
-#     -v "$PWD/runs:/work/runs" ddgrasp-robot deploy --robot franka --camera realsense --host 172.16.0.2 \
+#     -v "$PWD/runs:/data/runs" ddgrasp-robot deploy --robot franka --camera realsense --host 172.16.0.2 \
 #     --policy pretrained/student/policy.onnx --dry-run
 FROM python:3.12-slim-bookworm AS wheel
 ARG VERSION=
@@ -17,6 +17,6 @@ RUN apt-get update && apt-get install --yes --no-install-recommends libusb-1.0-0
 RUN --mount=type=bind,from=wheel,source=/wheels,target=/wheels \
     --mount=type=bind,source=requirements.lock,target=/requirements.lock \
     pip install --no-cache-dir --constraint /requirements.lock "$(echo /wheels/*.whl)[franka,realsense]"
-WORKDIR /work
+WORKDIR /data
 ENTRYPOINT ["ddgrasp"]
 CMD ["--help"]

@@ -1,6 +1,6 @@
 # Training on NVIDIA. The host has a driver for CUDA 13 and NVIDIA's container toolkit; CUDA comes with JAX.
 #   docker build -f docker/train.Dockerfile -t ddgrasp-train .
-#   docker run --gpus all -v "$PWD/runs:/work/runs" ddgrasp-train run --preset paper
+#   docker run --gpus all -v "$PWD/runs:/data/runs" ddgrasp-train run --preset paper
 FROM python:3.12-slim-bookworm AS wheel
 ARG VERSION=
 WORKDIR /source
@@ -13,7 +13,7 @@ SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 RUN --mount=type=bind,from=wheel,source=/wheels,target=/wheels \
     --mount=type=bind,source=requirements.lock,target=/requirements.lock \
     pip install --no-cache-dir --constraint /requirements.lock "$(echo /wheels/*.whl)[cuda,warp]"
-ENV NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility DDGRASP_CACHE=/work/runs/.cache
-WORKDIR /work
+ENV NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility DDGRASP_CACHE=/data/runs/.cache
+WORKDIR /data
 ENTRYPOINT ["ddgrasp"]
 CMD ["--help"]
