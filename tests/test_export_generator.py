@@ -11,7 +11,7 @@ import pytest
 from ddg_jax.prior import make_prior
 from ddg_jax.sample import Generator, generate
 from ddg_jax.train import init_params
-from ddgrasp import generator_metadata
+from ddgrasp import artifacts, generator_metadata
 from ddgrasp.artifacts import finish
 from ddgrasp.config import (
     Config,
@@ -29,6 +29,7 @@ from export import prior_graph
 from export.builder import GraphBuilder, tensor
 from export.generator_graph import build_model
 from export.parity import open_session
+from sensors.recordings.recording import RecordingWriter
 from sensors.statistics import holes
 
 SMALL = DDGConfig(
@@ -170,3 +171,26 @@ def test_more_evaluations_than_a_file_holds_are_refused(tmp_path):
         UserError, match="takes 51 evaluations; a file holds tables for up to 50: give --steps"
     ):
         exported.export_generator(tmp_path, tmp_path / "generator.onnx", steps=51)
+
+
+def test_the_file_names_the_recordings_camera(tmp_path):
+    generator = made(CAMERA)
+    finished(generator, tmp_path / "ddg")
+    room = tmp_path / "room"
+    with RecordingWriter(room, {"sensor": "D435", "fx_px": 40.0, "licence": "MIT"}) as writer:
+        depth_mm = np.linspace(700, 1500, 48 * 64).reshape(48, 64).astype(np.uint16)
+        writer.add(np.zeros((48, 64, 3), np.uint8), depth_mm)
+    artifact = artifacts.read_artifact(tmp_path / "ddg")
+    described = exported.describe(artifact, CAMERA, room)
+    assert (described.licence, described.manifest_hash) == ("MIT", artifact.hash)
+    camera = described.camera
+    assert (camera["name"], camera["width_px"], camera["height_px"], camera["fx_px"]) == (
+        "D435",
+        64,
+        48,
+        40.0,
+    )
+    assert 0.7 <= camera["near_m"] < 0.75 and 1.35 < camera["far_m"] <= 1.5
+    assert exported.describe(artifact, CAMERA, room, "CC0").licence == "CC0"
+    assert exported.describe(artifact, CAMERA).camera == {}  # not a run's own recordings
+    assert described.planes(3) == 1 + 2 * 3 and described.stochastic
