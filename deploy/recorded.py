@@ -45,15 +45,14 @@ class RecordingBench:
         kept: list[DeploymentRecord] = []
         with ExitStack() as frames:
 
-            def look(step: Step, camera: Filmed) -> None:
+            def look(step: Step, camera: Filmed) -> bool | None:
                 if step.index == 0:  # also where a trial is run again
                     frames.close()
                     profile = self._config.world.profile
                     kept[:] = [DeploymentRecord(camera, profile, f"{about['camera']}, D455 profile", 1)]
                     frames.enter_context(kept[0].into(folder))
                 kept[0].look(step)
-                if watch is not None:
-                    watch(step, camera)
+                return None if watch is None else watch(step, camera)
 
             result, film = self._bench.run(trial, look)
         for record in kept:

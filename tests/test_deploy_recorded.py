@@ -63,3 +63,10 @@ def test_recording_changes_nothing_in_a_trial(tmp_path, policy):
     np.testing.assert_array_equal(states["first"], states["again"])
     recording = Recording.open(tmp_path / "kept" / "0003-cube")
     assert len(recording) == 4 and recording.consecutive and not recording.skipped
+
+
+def test_a_recorded_trial_ends_when_its_watcher_says_so(tmp_path, policy):
+    bench = RecordedBench(Rig, tmp_path / "kept", {"robot": "rig", "camera": "stereo"})(CONFIG, policy)
+    result, _ = bench.run(Trial(3, "cube"), lambda step, camera: step.index == 1)
+    bench.close()
+    assert result.steps == len(Recording.open(tmp_path / "kept" / "0003-cube")) == 2
