@@ -189,7 +189,7 @@ def _pictures(config: Config, count: int) -> tuple[Any, Any, Any]:
     profile = config.world.profile
     size = (count, contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
     chunk = shape(count, config.student.head.chunk, contract.ACTION_SIZE)
-    return shape(*size, dtype=jnp.uint16), shape(count, contract.STATE_SIZE), chunk
+    return shape(*size, dtype=jnp.uint16), shape(count, contract.POLICY_STATE_SIZE), chunk
 
 
 def _student_params(config: Config) -> dict:

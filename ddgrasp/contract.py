@@ -8,7 +8,7 @@ Change a value here and `CONTRACT_VERSION` with it: artifacts of another version
 import math
 from dataclasses import dataclass, replace
 
-from ddgrasp.layout import ACTION, OBSERVATION, STATE
+from ddgrasp.layout import ACTION, OBSERVATION, POLICY_STATE, STATE
 
 CONTRACT_VERSION = 1
 
@@ -59,6 +59,8 @@ JOINT_UPPER_RAD = PANDA.joint_upper_rad
 JOINT_VELOCITY_LIMIT_RAD_S = PANDA.joint_velocity_rad_s
 JOINT_ACCELERATION_LIMIT_RAD_S2 = PANDA.joint_acceleration_rad_s2
 GRIPPER_MAX_WIDTH_M = PANDA.hand_width_m
+GRIPPER_SPEED_M_S = 0.1
+"""Of the opening: 50 mm/s for each finger of a Franka Hand (its datasheet)."""
 
 OBSERVATION_PARTS = {
     "joint_position": 9, "joint_velocity": 9, "hand_pose": 7,
@@ -69,7 +71,9 @@ OBSERVATION_PARTS = {
 OBSERVATION_SIZE = OBSERVATION.size
 """40."""
 STATE_SIZE = STATE.size
-"""Student: seven arm joint positions (rad) and the gripper's opening width (m)."""
+"""A robot's: seven arm joint positions (rad) and the gripper's opening width (m)."""
+POLICY_STATE_SIZE = POLICY_STATE.size
+"""A student's: the same, and the width's change since the control step before (m)."""
 ACTION_SIZE = ACTION.size
 """a[:7] in [-1, 1] scaled joint deltas, a[7] gripper: > 0 closes, <= 0 opens."""
 ACTION_SCALE_RAD = 0.1
@@ -171,7 +175,7 @@ CAMERA_LOOK_AT_M = (0.48, 0.0, 0.05)
 ONNX_INPUT_DEPTH = "depth"
 """(B, 3, H, W), oldest frame first; float32 metres or uint16 millimetres, as the metadata says."""
 ONNX_INPUT_STATE = "state"
-"""(B, 8) float32."""
+"""(B, 9) float32, see POLICY_STATE_SIZE."""
 ONNX_INPUT_NOISE = "noise"
 """(B, chunk, 8) float32, standard normal: the initial sample of the reverse diffusion."""
 ONNX_OUTPUT_ACTION = "action"

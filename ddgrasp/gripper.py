@@ -1,14 +1,15 @@
-"""A closing that is not taken back half-way: what a policy without memory needs before a slow hand.
+"""What a policy without memory needs before a slow hand: closings that last, and how its opening changes.
 
 The fingers of a Franka Hand take 0.8 s from open to shut. The state that a student sees is their distance,
 which does not say whether they are closing or opening, so a student that closes a little early opens again,
-and so on: fingers that never shut. The teacher sees their speed. NumPy alone: the robot side uses it too.
+and so on: fingers that never shut. Nor does it say whether they are on their way or stopped by what they
+hold. The teacher sees their speed. NumPy alone: the robot side uses it too.
 """
 
 import numpy as np
 from jaxtyping import Float
 
-from ddgrasp.layout import ACTION, closes
+from ddgrasp.layout import ACTION, STATE, closes
 
 CLOSE = 1.0
 """The gripper's command while a closing goes on."""
@@ -39,3 +40,21 @@ class ClosingLatch:
             (closing & ~closes(action))[..., None], CLOSE, latched[..., ACTION.gripper]
         )
         return latched
+
+
+class WidthChange:
+    """Adds the change of the opening since the call before; call it with the state of every control step."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Start of an episode: the next state has no change."""
+        self._before: np.ndarray | None = None
+
+    def __call__(self, state: Float[np.ndarray, "*batch 8"]) -> Float[np.ndarray, "*batch 9"]:
+        """`state` (..., 8) with the change (m) behind it: `layout.POLICY_STATE`."""
+        width = state[..., STATE.width]
+        change = np.zeros_like(width) if self._before is None else width - self._before
+        self._before = np.array(width)
+        return np.concatenate([state, change], axis=-1)

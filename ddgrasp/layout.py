@@ -51,7 +51,10 @@ OBSERVATION = Layout(
 """What the teacher sees; `contract.OBSERVATION_PARTS` has the same in coarser parts. Positions in metres,
 quaternions (w, x, y, z), world frame; the category is the logarithm of its id."""
 STATE = Layout(arm=7, width=1)
-"""What the student knows of the robot: joints (rad) and the gripper's opening (m)."""
+"""What the robot tells of itself: joints (rad) and the gripper's opening (m)."""
+POLICY_STATE = Layout(arm=7, width=1, width_change=1)
+"""What a student is told of the robot: that, and how much the opening has changed since the control step
+before (m), which is how a hand that closes differs from one that is stopped by what it holds."""
 ACTION = Layout(arm=7, gripper=1)
 """Joint steps in [-1, 1] and the gripper's command, see `closes`."""
 

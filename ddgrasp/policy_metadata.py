@@ -11,7 +11,7 @@ from ddgrasp.config import DEPTH_DTYPES, Config, ExportConfig, StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
 
-STATE_LAYOUT = "q7 rad + gripper width m"
+STATE_LAYOUT = "q7 rad + gripper width m + its change since the control step before m"
 REMEDY = "make one with `ddgrasp export`"
 
 
@@ -154,7 +154,7 @@ def validate_shapes(
     action = [metadata.chunk, contract.ACTION_SIZE]
     expected = {
         contract.ONNX_INPUT_DEPTH: [metadata.depth_frames, metadata.depth_height, metadata.depth_width],
-        contract.ONNX_INPUT_STATE: [contract.STATE_SIZE],
+        contract.ONNX_INPUT_STATE: [contract.POLICY_STATE_SIZE],
         contract.ONNX_INPUT_NOISE: action,
         contract.ONNX_OUTPUT_ACTION: action,
     }

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 from ddgrasp import artifacts, contract
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.errors import UserError
-from ddgrasp.gripper import ClosingLatch
+from ddgrasp.gripper import ClosingLatch, WidthChange
 from deploy.interfaces import Depth
 
 POLICY_FILE = "policy.onnx"
@@ -69,9 +69,10 @@ class OnnxPolicy:
             )
         self.execute_steps = steps
         self._latch = ClosingLatch(self.info.closing_steps)
+        self._width_change = WidthChange()
         self._noise_kind = noise
         self.watch: Callable[[Depth, np.ndarray], None] | None = None
-        """Is told the frames (3, H, W) and the state (8,) of every call of `act`."""
+        """Is told the frames (3, H, W) and the state (9,) that the network gets in every call of `act`."""
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
@@ -82,6 +83,7 @@ class OnnxPolicy:
 
     def forget(self) -> None:
         """Drop buffered frames and the rest of the chunk: the next frame fills the buffer alone."""
+        self._width_change.reset()
         self._frames: deque[np.ndarray] = deque(maxlen=contract.DEPTH_FRAMES)
         self._actions: deque[np.ndarray] = deque()
 
@@ -125,16 +127,17 @@ class OnnxPolicy:
         self._frames.append(depth)
         while len(self._frames) < contract.DEPTH_FRAMES:
             self._frames.append(depth)
+        known = self._width_change(state)
         if self.watch is not None:
-            self.watch(np.stack(self._frames), state)
+            self.watch(np.stack(self._frames), known)
         if not self._actions:
-            self._actions.extend(self._infer(state)[: self.execute_steps])
+            self._actions.extend(self._infer(known)[: self.execute_steps])
         return self._latch(self._actions.popleft())
 
     def warm_up(self) -> None:
         """Run the network once, so that the first period does not pay for memory."""
         self._frames.extend([self._blank()] * contract.DEPTH_FRAMES)
-        self._run(np.zeros(contract.STATE_SIZE, np.float32), np.zeros(self._noise_shape, np.float32))
+        self._run(np.zeros(contract.POLICY_STATE_SIZE, np.float32), np.zeros(self._noise_shape, np.float32))
         self.forget()
 
     @property

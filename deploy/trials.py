@@ -79,7 +79,7 @@ Watch = Callable[[Step, Filmed], bool | None]
 
 
 WatchPolicy = Callable[[Depth, np.ndarray, np.ndarray], None]
-"""Is told the frames (3, H, W) and the state (8,) that a policy is given, and what is true then (40,)."""
+"""Is told the frames (3, H, W) and the state (9,) that a policy is given, and what is true then (40,)."""
 
 
 class Bench(Protocol):

@@ -36,7 +36,7 @@ class Seen:
     """What one trial's policy was given and what was true then, a row a control step."""
 
     depth: list[UInt16[np.ndarray, "3 H W"]] = field(default_factory=list)
-    state: list[Float[np.ndarray, "8"]] = field(default_factory=list)
+    state: list[Float[np.ndarray, "9"]] = field(default_factory=list)
     observation: list[Float[np.ndarray, "40"]] = field(default_factory=list)
 
 

@@ -18,7 +18,7 @@ def write_condition(
     student: StudentConfig,
     profile: CameraProfile,
 ) -> str:
-    """Features (B, F), picture and raw state (B, 8) to the condition (B, D)."""
+    """Features (B, F), picture and raw state (B, 9) to the condition (B, D)."""
     span = denoiser.STATE_UPPER - denoiser.STATE_LOWER
     joints = g.op(
         "Div", g.mul(g.op("Sub", state, g.constant(denoiser.STATE_LOWER)), g.constant(2.0)), g.constant(span)

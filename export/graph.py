@@ -56,7 +56,7 @@ def build_model(
     return g.model(
         [
             tensor(contract.ONNX_INPUT_DEPTH, frames, depth_type),
-            tensor(contract.ONNX_INPUT_STATE, ["batch", contract.STATE_SIZE]),
+            tensor(contract.ONNX_INPUT_STATE, ["batch", contract.POLICY_STATE_SIZE]),
             tensor(contract.ONNX_INPUT_NOISE, chunk),
         ],
         [tensor(contract.ONNX_OUTPUT_ACTION, chunk)],

@@ -12,7 +12,7 @@ from student_jax import hand_view
 
 
 def write_grip(g: GraphBuilder, state: str) -> str:
-    """(B, 3) the point between the finger pads (m) from the raw state (B, 8): `policy.grip_position`."""
+    """(B, 3) the point between the finger pads (m) from the raw state (B, 9): `policy.grip_position`."""
     point = g.op(
         "Expand", g.constant(hand_view.grip_tip()[None]), g.op("Shape", g.columns(state, slice(0, 3)))
     )

@@ -32,8 +32,8 @@ class Inputs:
 
     depth: UInt16[np.ndarray, "B 3 H W"] | Float32[np.ndarray, "B 3 H W"]
     """(B, 3, H, W) uint16 millimetres or float32 metres."""
-    state: Float32[np.ndarray, "B 8"]
-    """(B, 8) float32."""
+    state: Float32[np.ndarray, "B 9"]
+    """(B, 9) float32."""
     noise: Float32[np.ndarray, "B chunk 8"]
     """(B, chunk, 8) float32."""
 
@@ -106,7 +106,7 @@ def random_inputs(
         if depth_dtype == "float32_m":
             spoilt = rng.random(frames_m.shape) < 0.01
             frames_m[spoilt] = rng.choice(np.array(NOT_FINITE, np.float32), int(spoilt.sum()))
-    state = rng.uniform(denoiser.STATE_LOWER, denoiser.STATE_UPPER, (batch, contract.STATE_SIZE))
+    state = rng.uniform(denoiser.STATE_LOWER, denoiser.STATE_UPPER, (batch, contract.POLICY_STATE_SIZE))
     noise = rng.standard_normal((batch, student.head.chunk, contract.ACTION_SIZE))
     return Inputs(raw_depth(frames_m, depth_dtype), state.astype(np.float32), noise.astype(np.float32))
 

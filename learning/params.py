@@ -4,6 +4,7 @@ They hold what a finished network is used by; `learning/checkpoints.py` holds wh
 """
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,11 @@ def save_params(path: Path | str, pytree: Any) -> None:
     atomic_write_bytes(path, _MAGIC + hashlib.sha256(payload).digest() + payload)
 
 
-def load_params(path: Path | str, target: Any = None) -> Any:
-    """What `save_params` wrote: nested dicts of NumPy arrays, or shaped like `target` if one is given.
+def load_params(
+    path: Path | str, target: Any = None, upgrade: Callable[[Any], Any] = lambda params: params
+) -> Any:
+    """What `save_params` wrote: nested dicts of NumPy arrays, or shaped like `target` if one is given, after
+    `upgrade` has made them what this version expects.
 
     Raises UserError if the file is absent, not ours, damaged, or does not fit `target`.
     """
@@ -46,7 +50,7 @@ def load_params(path: Path | str, target: Any = None) -> Any:
     if target is None:
         return state
     try:
-        restored = serialization.from_state_dict(target, state)
+        restored = serialization.from_state_dict(target, upgrade(state))
         if difference := _shape_difference(restored, target):
             raise ValueError(difference)
     except (ValueError, KeyError) as error:

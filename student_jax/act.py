@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt16
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.depth import to_metres
-from ddgrasp.gripper import ClosingLatch
+from ddgrasp.gripper import ClosingLatch, WidthChange
 from demos.rollout import Scene
 from demos.spool import Spool
 from student_jax.depth_source import DepthSource
@@ -66,7 +66,7 @@ class StudentActor:
         self._config, self._corrupt, self._rng, self._teacher_share = config, corrupt, rng, teacher_share
         self._noise_scale = float(noise == "normal")
         self._chunk = np.zeros(0)
-        self._latch = ClosingLatch(config.head.closing_steps)
+        self._latch, self._width_change = ClosingLatch(config.head.closing_steps), WidthChange()
         self._stack: deque[np.ndarray] = deque(maxlen=contract.DEPTH_FRAMES)
         self.seen = Spool(keep)
         """What the student saw, (B, H, W) uint16 millimetres a step."""
@@ -76,14 +76,13 @@ class StudentActor:
         depth_mm = self._corrupt(scene)
         self.seen.add(depth_mm)
         self._stack.append(depth_mm)
+        state = self._width_change(scene.state)
         position = scene.step % self._config.head.execute_steps
         if position == 0:
             frames = [self._stack[0]] * (contract.DEPTH_FRAMES - len(self._stack)) + [*self._stack]
-            shape = (len(scene.state), self._config.head.chunk, contract.ACTION_SIZE)
+            shape = (len(state), self._config.head.chunk, contract.ACTION_SIZE)
             noise = self._noise_scale * self._rng.standard_normal(shape)
-            self._chunk = np.asarray(
-                self._act(np.stack(frames, axis=1), scene.state, noise.astype(np.float32))
-            )
+            self._chunk = np.asarray(self._act(np.stack(frames, axis=1), state, noise.astype(np.float32)))
         action = self._chunk[:, position]
         taught = self._rng.random(len(action)) < self._teacher_share
         return self._latch(np.where(taught[:, None], scene.expert, action))
@@ -99,7 +98,7 @@ def perceive(
     profile: contract.CameraProfile,
     params: Any,
     depth_mm: UInt16[np.ndarray, "B 3 H W"],
-    state: Float[np.ndarray, "B 8"],
+    state: Float[np.ndarray, "B 9"],
 ) -> Aux:
     """What the network reports of the frames that a policy is given: where to grasp, and whether it holds."""
     return jax.tree.map(np.asarray, _perceive(config, profile, params, depth_mm, state))

@@ -8,6 +8,7 @@ keyed by seed, phase and step, so a resumed plan goes the way an uninterrupted o
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from student_jax import frames_io, head, pretrained_encoder, train
 from student_jax.act import SourceCamera, StudentActor
 from student_jax.data import Window
 from student_jax.depth_source import DepthSource
-from student_jax.policy import PARAMS_FILE, init_params
+from student_jax.policy import PARAMS_FILE, init_params, told_the_change
 
 PLAN = "plan.json"
 CHECKPOINTS = "checkpoints"
@@ -101,7 +102,8 @@ class Trainer:
         if self._student.init_from:
             source = shipped(self._student.init_from)
             source = source if (source / PARAMS_FILE).exists() else source / "student"
-            self.params = load_params(source / PARAMS_FILE, self.params)
+            upgrade = partial(told_the_change, self._student)
+            self.params = load_params(source / PARAMS_FILE, self.params, upgrade)
         else:
             self.params["encoder"] = pretrained_encoder.load_into(self.params["encoder"], self._student)
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt16
 
 from ddgrasp import contract
-from ddgrasp.layout import ACTION, OBSERVATION, closes
+from ddgrasp.layout import ACTION, OBSERVATION, STATE, closes
 from student_jax.policy import Aux, position_from_world
 
 YAW_MULTIPLE = 2
@@ -84,7 +84,8 @@ class Frames:
 
     depth_mm: DepthRows | None
     """Depth of every step as the student sees it, holes 0; None without pictures."""
-    state: Float32[np.ndarray, "N 8"]
+    state: Float32[np.ndarray, "N 9"]
+    """`layout.POLICY_STATE`."""
     action: Float32[np.ndarray, "N 8"]
     """The teacher's labels."""
     observation: Float32[np.ndarray, "N 40"]
@@ -155,13 +156,19 @@ def make_frames(
     lengths = [len(s) for s in states]
     return Frames(
         depth_mm=DepthInMemory(np.concatenate(depth_mm)) if len(depth_mm) else None,
-        state=np.concatenate(states).astype(np.float32),
+        state=np.concatenate([with_change(episode) for episode in states]).astype(np.float32),
         action=np.clip(np.concatenate(actions), -1, 1).astype(np.float32),
         observation=np.concatenate(observations).astype(np.float32),
         held=np.concatenate(held).astype(np.float32),
         episode=np.repeat(np.arange(len(lengths)), lengths),
         step=np.concatenate([np.arange(n) for n in lengths]),
     )
+
+
+def with_change(states: Float[np.ndarray, "T 8"]) -> Float[np.ndarray, "T 9"]:
+    """An episode's states as a student is told them, see `layout.POLICY_STATE`."""
+    width = states[:, STATE.width]
+    return np.concatenate([states, np.diff(width, axis=0, prepend=width[:1])], axis=1)
 
 
 def sharpen_gripper(action: Float[np.ndarray, "*b 8"]) -> Float[np.ndarray, "*b 8"]:

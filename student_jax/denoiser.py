@@ -14,12 +14,13 @@ from ddgrasp.config import StudentConfig
 from learning.layers import sinusoids, time_frequencies
 
 LAYER_NORM_EPSILON = 1e-5
-STATE_LOWER = np.array([*contract.JOINT_LOWER_RAD, 0.0], np.float32)
-STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M], np.float32)
+_CHANGE_M = contract.GRIPPER_SPEED_M_S * contract.CONTROL_DT_S
+STATE_LOWER = np.array([*contract.JOINT_LOWER_RAD, 0.0, -_CHANGE_M], np.float32)
+STATE_UPPER = np.array([*contract.JOINT_UPPER_RAD, contract.GRIPPER_MAX_WIDTH_M, _CHANGE_M], np.float32)
 
 
-def normalise_state(state: Float[AnyArray, "B 8"]) -> Float[jax.Array, "B 8"]:
-    """(B, 8) seven joints (rad) and gripper width (m) to [-1, 1] between their limits."""
+def normalise_state(state: Float[AnyArray, "B 9"]) -> Float[jax.Array, "B 9"]:
+    """(B, 9) seven joints (rad), gripper width and its change (m) to [-1, 1] between their limits."""
     return 2.0 * (state - STATE_LOWER) / (STATE_UPPER - STATE_LOWER) - 1.0
 
 
@@ -36,8 +37,8 @@ class StateStream(nn.Module):
     config: StudentConfig
 
     @nn.compact
-    def __call__(self, state: Float[AnyArray, "B 8"]) -> Float[jax.Array, "B D"]:
-        """(B, 8) -> (B, state_features)."""
+    def __call__(self, state: Float[AnyArray, "B 9"]) -> Float[jax.Array, "B D"]:
+        """(B, 9) -> (B, state_features)."""
         x = nn.relu(nn.Dense(self.config.head.state_features, name="first")(normalise_state(state)))
         return nn.relu(nn.Dense(self.config.head.state_features, name="second")(x))
 

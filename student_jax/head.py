@@ -27,8 +27,8 @@ _SEED = 45_000
 _ENCODE_BATCH = 64
 _COLUMNS = ("state", "action", "observation", "held")
 
-Samples = tuple[Seen, Float[np.ndarray, "B 8"], Float[np.ndarray, "B chunk 8"]]
-"""What perception reports, joint state, action chunk."""
+Samples = tuple[Seen, Float[np.ndarray, "B 9"], Float[np.ndarray, "B chunk 8"]]
+"""What perception reports, the robot's state, action chunk."""
 
 
 def fit_on_poses(

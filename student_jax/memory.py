@@ -41,7 +41,7 @@ def training_bytes(config: Config) -> int:
     batch = train.Batch(
         depth_mm=_shape(*size, dtype=jnp.uint16),
         crop_rc=_shape(count, 2, dtype=jnp.int32),
-        state=_shape(count, contract.STATE_SIZE),
+        state=_shape(count, contract.POLICY_STATE_SIZE),
         action=_shape(count, student.head.chunk, contract.ACTION_SIZE),
         aux=Aux(_shape(count, 3), _shape(count, 2), _shape(count)),
     )

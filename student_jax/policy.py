@@ -20,7 +20,7 @@ from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
-from ddgrasp.layout import STATE, Layout
+from ddgrasp.layout import POLICY_STATE, Layout
 from learning import diffusion
 from mjx_envs import kinematics
 from student_jax.denoiser import Denoiser, StateStream, normalise_state
@@ -93,17 +93,17 @@ class StudentPolicy(nn.Module):
     def encode(
         self,
         depth_m: Float[AnyArray, "B 3 H W"],
-        state: Float[AnyArray, "B 8"],
+        state: Float[AnyArray, "B 9"],
         crop_rc: Int[AnyArray, "B 2"] | None = None,
     ) -> Seen:
-        """(B, 3, H, W) metres, (B, 8), (B, 2) or None for the centred crop."""
+        """(B, 3, H, W) metres, (B, 9), (B, 2) or None for the centred crop."""
         picture = prepare_depth(depth_m, crop_rc, self.profile, self.config)
         return self.encode_picture(picture, state, crop_rc)
 
     def encode_picture(
         self,
         picture: Float[AnyArray, "B h w C"],
-        state: Float[AnyArray, "B 8"],
+        state: Float[AnyArray, "B 9"],
         crop_rc: Int[AnyArray, "B 2"] | None = None,
     ) -> Seen:
         """As `encode`, from the output of `prepare_depth`."""
@@ -124,7 +124,7 @@ class StudentPolicy(nn.Module):
     def _aux(self, *parts: AnyArray) -> jax.Array:
         return self.aux_output(nn.relu(self.aux_hidden(jnp.concatenate(parts, axis=-1))))
 
-    def condition(self, seen: Seen, state: Float[AnyArray, "B 8"]) -> Float[jax.Array, "B D"]:
+    def condition(self, seen: Seen, state: Float[AnyArray, "B 9"]) -> Float[jax.Array, "B D"]:
         """(B, D) what the denoiser is told."""
         parts: list[Numbers] = [self.state_stream(state)]
         if self.config.head.features_to_head:
@@ -147,7 +147,7 @@ class StudentPolicy(nn.Module):
     def __call__(
         self,
         depth_m: Float[AnyArray, "B 3 H W"],
-        state: Float[AnyArray, "B 8"],
+        state: Float[AnyArray, "B 9"],
         noisy_action: Float[AnyArray, "B chunk 8"],
         k: Int[AnyArray, " B"],
         crop_rc: Int[AnyArray, "B 2"] | None = None,
@@ -157,9 +157,9 @@ class StudentPolicy(nn.Module):
         return self.denoise(noisy_action, k, self.condition(seen, state)), seen.aux
 
 
-def grip_position(state: Float[AnyArray, "B 8"]) -> Float[jax.Array, "B 3"]:
-    """(B, 3) the point between the finger pads (m, robot base) from the joint state (B, 8)."""
-    return kinematics.grip_pose(state[:, STATE.arm], jnp)[0]
+def grip_position(state: Float[AnyArray, "B 9"]) -> Float[jax.Array, "B 3"]:
+    """(B, 3) the point between the finger pads (m, robot base) from the state (B, 9)."""
+    return kinematics.grip_pose(state[:, POLICY_STATE.arm], jnp)[0]
 
 
 def feature_count(config: StudentConfig) -> int:
@@ -176,9 +176,24 @@ def init_params(key: Key[jax.Array, ""], config: StudentConfig, profile: CameraP
     """Fresh parameters (a dict of float32 arrays)."""
     depth = jnp.zeros((1, contract.DEPTH_FRAMES, profile.height_px, profile.width_px))
     action = jnp.zeros((1, config.head.chunk, contract.ACTION_SIZE))
-    state, k = jnp.zeros((1, contract.STATE_SIZE)), jnp.zeros((1,), jnp.int32)
+    state, k = jnp.zeros((1, contract.POLICY_STATE_SIZE)), jnp.zeros((1,), jnp.int32)
     init = jax.jit(StudentPolicy(config, profile).init)  # one program; op by op it takes many times longer
     return dict(init(key, depth, state, action, k)["params"])
+
+
+def told_the_change(config: StudentConfig, params: dict) -> dict:
+    """`params`, or those of a student from before it was told how its hand's width changes: told, and not yet
+    listening to it.
+    """
+    stream, hidden = params["state_stream"], params["aux_hidden"]
+    if len(stream["first"]["kernel"]) == contract.POLICY_STATE_SIZE:
+        return params
+    first = np.insert(stream["first"]["kernel"], contract.STATE_SIZE, 0.0, axis=0)
+    aux = np.insert(hidden["kernel"], feature_count(config) + contract.STATE_SIZE, 0.0, axis=0)
+    return params | {
+        "state_stream": stream | {"first": stream["first"] | {"kernel": first}},
+        "aux_hidden": hidden | {"kernel": aux},
+    }
 
 
 def param_shapes(config: StudentConfig, profile: CameraProfile) -> dict:
@@ -194,7 +209,7 @@ def count_params(params: dict) -> int:
 def sample_from_seen(
     params: dict,
     seen: Seen,
-    state: Float[AnyArray, "B 8"],
+    state: Float[AnyArray, "B 9"],
     noise: Float[AnyArray, "B chunk 8"],
     config: StudentConfig,
     profile: CameraProfile,
@@ -216,14 +231,14 @@ def sample_from_seen(
 def sample_actions(
     params: dict,
     depth_m: Float[AnyArray, "B 3 H W"],
-    state: Float[AnyArray, "B 8"],
+    state: Float[AnyArray, "B 9"],
     noise: Float[AnyArray, "B chunk 8"],
     config: StudentConfig,
     profile: CameraProfile,
     steps: int = 0,
     crop_rc: Int[AnyArray, "B 2"] | None = None,
 ) -> Float[jax.Array, "B chunk 8"]:
-    """The whole policy: (B, 3, H, W) metres, (B, 8), (B, chunk, 8) noise -> (B, chunk, 8) in [-1, 1]."""
+    """The whole policy: (B, 3, H, W) metres, (B, 9), (B, chunk, 8) noise -> (B, chunk, 8) in [-1, 1]."""
     policy = StudentPolicy(config, profile)
     seen = policy.apply({"params": params}, depth_m, state, crop_rc, method="encode")
     return sample_from_seen(params, cast(Seen, seen), state, noise, config, profile, steps)

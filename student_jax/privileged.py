@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
-from ddgrasp.gripper import ClosingLatch
+from ddgrasp.gripper import ClosingLatch, WidthChange
 from ddgrasp.layout import ACTION, OBSERVATION
 from demos.rollout import Scene
 from student_jax import train
@@ -82,15 +82,16 @@ class PoseActor:
         self._head, self._config, self._profile = head, config, profile
         self._rng, self._share = rng, 1.0 if head is None else teacher_share
         self._bias = rng.standard_normal((count, 5))
-        self._latch = ClosingLatch(config.head.closing_steps)
+        self._latch, self._width_change = ClosingLatch(config.head.closing_steps), WidthChange()
 
     def __call__(self, scene: Scene) -> Float[np.ndarray, "B 8"]:
         """(B, 8) actions for the scene."""
         rng, action = self._rng, np.array(scene.expert)
+        state = self._width_change(scene.state)
         if self._head is not None:
             seen = noisy_seen(scene.observation, scene.held, self._bias, rng, self._config)
             noise = np.zeros((len(action), self._config.head.chunk, action.shape[1]), np.float32)
-            chosen = train.act_on_seen(self._config, self._profile, self._head, seen, scene.state, noise)
+            chosen = train.act_on_seen(self._config, self._profile, self._head, seen, state, noise)
             taught = rng.random((len(action), 1)) < self._share
             action = np.where(taught, action, np.asarray(chosen)[:, 0])
         pushed = rng.random((len(action), 1)) < NOISE_SHARE

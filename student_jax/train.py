@@ -47,7 +47,7 @@ class Batch:
     crop_rc: Array
     """(B, 2) int32."""
     state: Array
-    """(B, 8) joint positions and gripper width."""
+    """(B, 9): `layout.POLICY_STATE`."""
     action: Array
     """(B, chunk, 8)."""
     aux: Aux
@@ -106,7 +106,7 @@ def diffusion_loss(
     policy: StudentPolicy,
     params: dict,
     seen: Seen,
-    state: Float[Array, "B 8"],
+    state: Float[Array, "B 9"],
     action: Float[Array, "B chunk 8"],
     key: Key[Array, ""],
 ) -> Float[Array, ""]:
@@ -170,7 +170,7 @@ def encode(
     profile: CameraProfile,
     params: dict,
     depth_mm: UInt16[AnyArray, "B 3 H W"],
-    state: Float[AnyArray, "B 8"],
+    state: Float[AnyArray, "B 9"],
     crop_rc: Int[AnyArray, "B 2"],
     key: Key[Array, ""] | None = None,
 ) -> Any:
@@ -184,7 +184,7 @@ def encode(
 @partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
 def head_step(
     config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, seen: Seen,
-    joints: Float[Array, "B 8"], action: Float[Array, "B chunk 8"],
+    joints: Float[Array, "B 9"], action: Float[Array, "B chunk 8"],
 ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:  # fmt: skip
     """One optimiser step on the head's parameters alone; `state.params` is `head_of` all."""
     key = step_key(state)
@@ -203,7 +203,7 @@ def act_on_seen(
     profile: CameraProfile,
     params: dict,
     seen: Seen,
-    joints: Float[AnyArray, "B 8"],
+    joints: Float[AnyArray, "B 9"],
     noise: Float[AnyArray, "B chunk 8"],
 ) -> Float[Array, "B chunk 8"]:
     """(B, chunk, 8) actions from what perception reports; needs `head_of` the parameters alone."""

@@ -44,13 +44,13 @@ def write_policy(
     """An affine policy: action = d @ depth_gain + state @ state_gain + bias + noise_gain * noise.
 
     d (3,) is the top left pixel of the three frames in the input's own unit; depth_gain (3, chunk, 8),
-    state_gain (8, chunk, 8), bias (chunk, 8).
+    state_gain (9, chunk, 8), bias (chunk, 8).
     """
     info = describe() if info is None else info
     chunk = info.chunk
     weights = {
         "Wd": np.zeros((3, chunk, 8)) if depth_gain is None else depth_gain,
-        "Ws": np.zeros((8, chunk, 8)) if state_gain is None else state_gain,
+        "Ws": np.zeros((9, chunk, 8)) if state_gain is None else state_gain,
     }
     constants = {name: np.reshape(w, (len(w), -1)).astype(np.float32) for name, w in weights.items()}
     constants["bias"] = np.broadcast_to(0.0 if bias is None else bias, (chunk, 8)).astype(np.float32)
@@ -74,7 +74,7 @@ def write_policy(
     depth_type = TensorProto.UINT16 if info.depth_dtype == "uint16_mm" else TensorProto.FLOAT
     inputs = [
         helper.make_tensor_value_info("depth", depth_type, ["B", 3, info.depth_height, info.depth_width]),
-        helper.make_tensor_value_info("state", TensorProto.FLOAT, ["B", 8]),
+        helper.make_tensor_value_info("state", TensorProto.FLOAT, ["B", 9]),
         helper.make_tensor_value_info("noise", TensorProto.FLOAT, ["B", chunk, 8]),
     ]
     output = helper.make_tensor_value_info("action", TensorProto.FLOAT, ["B", chunk, 8])

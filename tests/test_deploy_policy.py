@@ -27,11 +27,23 @@ def test_first_frame_fills_the_buffer_then_oldest_leaves_first(tmp_path):
 
 
 def test_state_reaches_the_network_in_order(tmp_path):
-    gain = np.zeros((8, 4, 8))
+    gain = np.zeros((9, 4, 8))
     gain[np.arange(8), 0, np.arange(8)] = 2.0
     policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", state_gain=gain))
     state = np.arange(8, dtype=np.float32)
     np.testing.assert_array_equal(policy.act(depth_mm(), state), 2 * state)
+
+
+def test_the_network_is_told_how_the_opening_changes_also_while_a_chunk_is_played(tmp_path):
+    gain = np.zeros((9, 4, 8))
+    gain[8, :, 0] = 1.0
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", state_gain=gain), execute_steps=2)
+    widths, told = (8.0, 7.0, 5.0, 5.0, 4.5), []
+    for width in widths:
+        told.append(float(policy.act(depth_mm(), np.array([0, 0, 0, 0, 0, 0, 0, width], np.float32))[0]))
+    assert told == [0.0, 0.0, -2.0, -2.0, -0.5]
+    policy.forget()
+    assert policy.act(depth_mm(), np.full(8, 3, np.float32))[0] == 0.0
 
 
 def test_chunk_is_played_for_execute_steps_and_frames_keep_coming(tmp_path):

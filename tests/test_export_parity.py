@@ -78,7 +78,7 @@ def jittered(params: dict, seed: int = 0) -> dict:
 def trained_head(params: dict, config: StudentConfig) -> dict:
     """Denoiser trained on moderate actions: an untrained one saturates at +-1, where all policies agree."""
     net = policy.StudentPolicy(config, PROFILE)
-    frames, state = jnp.zeros((1, 3, 90, 160)), jnp.zeros((1, 8))
+    frames, state = jnp.zeros((1, 3, 90, 160)), jnp.zeros((1, 9))
 
     def condition():
         seen = net.apply({"params": params}, frames, state, method="encode")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ddgrasp.gripper import CLOSE, ClosingLatch
+from ddgrasp.gripper import CLOSE, ClosingLatch, WidthChange
 
 
 def _actions(*commands: float) -> np.ndarray:
@@ -43,3 +43,14 @@ def test_each_of_a_batch_has_its_own_and_arms_are_left_alone():
     np.testing.assert_array_equal(made[:, :7], asked[:, :7])
     assert asked[0, 7] == -1  # the caller's array stays as it was
     np.testing.assert_array_equal(latch(_actions(-1, -1))[:, 7], [-1, CLOSE])
+
+
+def test_the_change_of_the_opening_is_the_last_number_of_each_state():
+    told, states = WidthChange(), np.zeros((3, 2, 8), np.float32)
+    states[:, :, 7] = [[0.08, 0.08], [0.07, 0.08], [0.07, 0.05]]
+    np.testing.assert_allclose(
+        [told(state)[:, 8] for state in states], [[0, 0], [-0.01, 0], [0, -0.03]], atol=1e-7
+    )
+    np.testing.assert_array_equal(told(states[0])[:, :8], states[0])
+    told.reset()
+    assert told(states[0, 0]).tolist() == [*states[0, 0].tolist(), 0.0]

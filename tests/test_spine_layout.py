@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ddgrasp import contract
-from ddgrasp.layout import ACTION, CONTROLS, OBSERVATION, QPOS, QVEL, STATE, Layout, closes
+from ddgrasp.layout import ACTION, CONTROLS, OBSERVATION, POLICY_STATE, QPOS, QVEL, STATE, Layout, closes
 from mjx_envs import grasp_math, kinematics, scene
 from student_jax import denoiser
 from student_jax.policy import AUX, AUX_BESIDE
@@ -18,6 +18,7 @@ LAYOUTS = {
     "controls": (CONTROLS, scene.NU),
     "observation": (OBSERVATION, contract.OBSERVATION_SIZE),
     "state": (STATE, contract.STATE_SIZE),
+    "policy state": (POLICY_STATE, contract.POLICY_STATE_SIZE),
     "action": (ACTION, contract.ACTION_SIZE),
     "aux": (AUX, 6),
     "aux with the hand view": (AUX_BESIDE, 10),
@@ -47,8 +48,8 @@ def test_the_contracts_parts_are_made_of_whole_ones():
     assert set(ends) <= {part.stop for _, part in OBSERVATION.items()}
     assert ends[-1] == contract.OBSERVATION_SIZE == 40
     assert (contract.STATE_SIZE, contract.ACTION_SIZE, contract.CONTRACT_VERSION) == (8, 8, 1)
-    assert len(denoiser.STATE_LOWER) == STATE.size
-    assert denoiser.STATE_UPPER[STATE.width] == np.float32(contract.GRIPPER_MAX_WIDTH_M)
+    assert len(denoiser.STATE_LOWER) == POLICY_STATE.size
+    assert denoiser.STATE_UPPER[POLICY_STATE.width] == np.float32(contract.GRIPPER_MAX_WIDTH_M)
 
 
 @pytest.mark.parametrize("xp", [np, jnp])

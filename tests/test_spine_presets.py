@@ -75,7 +75,7 @@ def test_the_student_its_training_steps_and_its_sampler(name):
 
     def batch_of(count: int) -> tuple[jax.ShapeDtypeStruct, ...]:
         frames = shape(count, contract.DEPTH_FRAMES, profile.height_px, profile.width_px, dtype=jnp.uint16)
-        return frames, shape(count, contract.STATE_SIZE), shape(count, chunk, contract.ACTION_SIZE)
+        return frames, shape(count, contract.POLICY_STATE_SIZE), shape(count, chunk, contract.ACTION_SIZE)
 
     depth, state, action = batch_of(student.training.batch_size)
     seen = jax.eval_shape(partial(student_train.encode, student, profile), params, depth, state, None)

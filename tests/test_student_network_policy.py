@@ -109,13 +109,27 @@ def test_resnet18_has_the_published_number_of_parameters():
 
 def test_state_limits_map_to_minus_one_and_one():
     state = jnp.stack([denoiser.STATE_LOWER, denoiser.STATE_UPPER])
-    np.testing.assert_allclose(denoiser.normalise_state(state), [[-1.0] * 8, [1.0] * 8], atol=1e-6)
+    np.testing.assert_allclose(denoiser.normalise_state(state), [[-1.0] * 9, [1.0] * 9], atol=1e-6)
+
+
+def test_a_student_of_before_acts_as_it_did_until_it_listens_to_the_widths_change():
+    params = jax.tree.map(np.asarray, policy.init_params(jax.random.key(0), SMALL, PROFILE))
+    aux = policy.feature_count(SMALL) + contract.STATE_SIZE
+    before = jax.tree.map(np.asarray, params)
+    before["state_stream"]["first"]["kernel"] = np.delete(params["state_stream"]["first"]["kernel"], 8, 0)
+    before["aux_hidden"]["kernel"] = np.delete(params["aux_hidden"]["kernel"], aux, 0)
+    made = policy.told_the_change(SMALL, before)
+    np.testing.assert_array_equal(made["aux_hidden"]["kernel"][aux], 0.0)
+    made["aux_hidden"]["kernel"][aux] = params["aux_hidden"]["kernel"][aux]
+    made["state_stream"]["first"]["kernel"][8] = params["state_stream"]["first"]["kernel"][8]
+    jax.tree.map(np.testing.assert_array_equal, made, params)
+    assert policy.told_the_change(SMALL, params) is params
 
 
 def test_the_condition_is_joints_then_pose_then_offset_from_the_hand():
     params = policy.init_params(jax.random.key(0), SMALL, PROFILE)
     net = policy.StudentPolicy(SMALL, PROFILE)
-    state = jnp.asarray([[*scene.HOME_RAD, 0.05]])
+    state = jnp.asarray([[*scene.HOME_RAD, 0.05, -0.01]])
     hand, _ = kinematics.grip_pose(np.array(scene.HOME_RAD))
     place = policy.position_from_world(jnp.asarray(hand + [0.0, 0.1, -0.05]))
     aux = policy.Aux(place[None], jnp.array([[0.6, 0.8]]), jnp.array([2.0]))
@@ -141,7 +155,7 @@ def test_the_hand_view_decides_how_much_the_hand_counts():
     """With the gate open the position is hand + 5 cm * offset, with it closed the raw output."""
     params = policy.init_params(jax.random.key(0), SMALL, PROFILE)
     output = {"kernel": jnp.zeros_like(params["aux_output"]["kernel"])}
-    state = jnp.asarray([[*scene.HOME_RAD, 0.05]])
+    state = jnp.asarray([[*scene.HOME_RAD, 0.05, -0.01]])
     hand, _ = kinematics.grip_pose(np.array(scene.HOME_RAD))
     picture = jnp.zeros((1, SMALL.picture.height_px, SMALL.picture.width_px, 6))
     net = policy.StudentPolicy(SMALL, PROFILE)
@@ -243,7 +257,7 @@ def test_the_encoder_learns_where_an_object_is_within_seconds():
     @jax.jit
     def step(params, moments, frames, crop, place):
         def loss(p):
-            seen = net.apply({"params": p}, frames, jnp.zeros((32, 8)), crop, method="encode")
+            seen = net.apply({"params": p}, frames, jnp.zeros((32, 9)), crop, method="encode")
             error = seen.aux.position - policy.position_from_world(place)
             return jnp.mean(error**2), jnp.linalg.norm(error, axis=-1).mean() * encoder.POSITION_SCALE_M
 

@@ -205,7 +205,7 @@ def test_the_head_learns_actions_from_poses():
         seen = noisy_seen(observation, np.zeros(count, bool), np.zeros((count, 5)), rng, CONFIG)
         label = np.zeros((count, CONFIG.head.chunk, 8), np.float32)
         label[:, :, 0] = grasp[:, 1:2] * 5
-        return seen, np.zeros((count, 8), np.float32), label
+        return seen, np.zeros((count, 9), np.float32), label
 
     for _ in range(300):
         state, _ = train.head_step(CONFIG, PROFILE, 300, state, *samples(64))
@@ -269,7 +269,7 @@ def test_without_disparity_noise_perception_is_told_of_pixels_as_they_come(stren
     config = dataclasses.replace(CONFIG, training=training)
     params = init_params(jax.random.key(0), config, PROFILE)
     depth_mm = np.full((1, 3, PROFILE.height_px, PROFILE.width_px), 700, np.uint16)
-    given = config, PROFILE, params, depth_mm, np.zeros((1, 8), np.float32), np.zeros((1, 2), np.int32)
+    given = config, PROFILE, params, depth_mm, np.zeros((1, 9), np.float32), np.zeros((1, 2), np.int32)
     plain, noisy = train.encode(*given), train.encode(*given, jax.random.key(1))
     same = [np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (plain, noisy)), strict=True)]
     assert all(same) == exact
