@@ -1,4 +1,4 @@
-"""An exported policy: three raw depth frames and eight joint values in, one action out."""
+"""An exported policy: three raw depth frames and the robot's state in, one action out."""
 
 from collections import deque
 from collections.abc import Callable
