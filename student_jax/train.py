@@ -122,6 +122,10 @@ def diffusion_loss(
     return jnp.mean((eps - predicted) ** 2)
 
 
+def _ripples(config: StudentConfig) -> bool:
+    return bool(config.training.disparity_noise_px or config.training.edge_noise_px)
+
+
 def aux_losses(seen: Aux, target: Aux) -> dict[str, Float[Array, ""]]:
     """Position (Huber, network units), yaw (squared), held (cross-entropy)."""
     return {
@@ -140,7 +144,7 @@ def train_step(
     policy = StudentPolicy(config, profile)
     key, k_noise = jax.random.split(step_key(state))
     depth_m = to_metres(batch.depth_mm)
-    if config.training.disparity_noise_px:
+    if _ripples(config):
         depth_m = disparity_noise(k_noise, depth_m, profile, config)
     if config.training.unseen_share:
         grasp_m = position_to_world(batch.aux.position)
@@ -176,7 +180,7 @@ def encode(
 ) -> Any:
     """`policy.Seen` of a batch; with `key`, under the disparity noise of training, if it has any."""
     depth_m = to_metres(depth_mm)
-    if key is not None and config.training.disparity_noise_px:
+    if key is not None and _ripples(config):
         depth_m = disparity_noise(key, depth_m, profile, config)
     return StudentPolicy(config, profile).apply({"params": params}, depth_m, state, crop_rc, method="encode")
 

@@ -275,6 +275,28 @@ def test_without_disparity_noise_perception_is_told_of_pixels_as_they_come(stren
     assert all(same) == exact
 
 
+def test_noise_at_edges_is_where_things_stand_out_of_the_table_and_nowhere_else():
+    noise = dataclasses.replace(CONFIG.training, disparity_noise_px=0.0, edge_noise_px=1.0)
+    config = dataclasses.replace(CONFIG, training=noise)
+    depth = np.array(table_depth(PROFILE, 2.5), np.float32)
+    height, width = depth.shape
+    row, column = height // 2 // 4 * 4, width // 2 // 4 * 4
+    depth[row : row + 4, column : column + 4] -= 0.05
+    depth[:8, :8] = 0.0
+    stack = jnp.asarray(depth)[None, None].repeat(64, 0).repeat(3, 1)
+    made = np.asarray(disparity_noise(jax.random.key(0), stack, PROFILE, config))
+    np.testing.assert_array_equal(made[:, :, :8, :8], 0.0)
+    changed = np.mean(np.abs(made - depth) > 1e-4, axis=(0, 1))
+    beside = np.zeros(depth.shape, bool)
+    beside[row - 4 : row + 8, column - 4 : column + 8] = True
+    assert changed[beside].min() > 0.9 and changed[~beside].max() < 0.1  # a few wrong matches
+    error = made[:, :, row, column] - depth[row, column]
+    assert 0.3 < np.corrcoef(error[:, 0], error[:, 2])[0, 1] < 0.9
+    without = dataclasses.replace(config, training=dataclasses.replace(noise, edge_noise_px=0.0))
+    plain = np.asarray(disparity_noise(jax.random.key(0), stack, PROFILE, without))
+    assert np.mean(np.abs(plain - depth)[:, :, beside] > 1e-4) < 0.02
+
+
 def test_an_object_that_is_not_seen_is_a_hole_as_large_as_it_is():
     """A 4 cm block on an empty table, drawn by hand through the nominal camera that stands 5 mm too low."""
     training = dataclasses.replace(CONFIG.training, unseen_share=1.0)

@@ -191,6 +191,9 @@ class StudentTrainingConfig(Section, name="student.training"):
     disparity_noise_px: Annotated[float, Range(0, 100)] = 0.25
     """Largest standard deviation of the noise on valid pixels in training, pixels of disparity at the
     picture's scale (the rig: about 0.07), and with it a few wrong matches; 0 keeps pixels as they come."""
+    edge_noise_px: Annotated[float, Range(0, 100)] = 0.0
+    """Largest standard deviation of the noise that is added on objects and around the hand, where a matching
+    window mixes near and far, pixels of disparity at the picture's scale (the rig: about 0.3)."""
     unseen_share: Share = 0.0
     """Share of the samples on pictures whose object the camera does not see: a hole where it lies, as dark
     and thin things leave (student_jax/augment.py)."""

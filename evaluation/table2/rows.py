@@ -28,7 +28,8 @@ class Row:
     """What its policy sees on the rig."""
     ripple: bool = False
     """Whether training has the noise made by hand: surfaces that ripple (`student.training.
-    disparity_noise_px`), objects that are not seen (`unseen_share`, as much as the recipe has)."""
+    disparity_noise_px`), edges that do more (`edge_noise_px`), objects that are not seen (`unseen_share`):
+    the last two as much as the recipe has."""
     paper_generator: bool = False
     """Whether the generator is the paper's: depth itself, uniform weights."""
 
@@ -132,7 +133,7 @@ def row_config(shared: Config, row: Row) -> Config:
         )
     training = shared.student.training
     if not row.ripple:
-        training = replace(training, disparity_noise_px=0.0, unseen_share=0.0)
+        training = replace(training, disparity_noise_px=0.0, edge_noise_px=0.0, unseen_share=0.0)
     student = replace(shared.student, depth_source=row.source, training=training)
     ddg = paper_generator(shared.ddg) if row.paper_generator else shared.ddg
     return replace(shared, student=student, ddg=ddg)
