@@ -80,7 +80,7 @@ def _edge_noise(
     profile: CameraProfile,
     config: StudentConfig,
 ) -> Float[jax.Array, "B F H W"]:
-    """Disparity errors at edges, one a cell of EDGE_CELL_PX, half of their variance the same in all frames."""
+    """Disparity errors at edges, one a cell of EDGE_CELL_PX, half of it the same in all frames."""
     batch, _, height, width = disparity_px.shape
     table = profile.fx_px * profile.baseline_m / table_depth(profile, config.picture.max_depth_m)
     relief = jnp.where(valid, disparity_px - table, 0.0)
