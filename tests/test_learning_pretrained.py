@@ -23,14 +23,14 @@ def test_the_students_action():
     depth_m = rng.uniform(0.4, 1.2, (2, 3, profile.height_px, profile.width_px)).astype(np.float32)
     depth_m[rng.random(depth_m.shape) < 0.05] = 0
     joints = rng.uniform(-0.5, 0.5, (2, 7)) + np.array([0, 0, 0, -1.8, 0, 2, 0.7])
-    state = np.concatenate([joints, np.full((2, 1), 0.05)], axis=1).astype(np.float32)
+    state = np.concatenate([joints, np.full((2, 2), [0.05, -0.01])], axis=1).astype(np.float32)
     noise = rng.standard_normal((2, student.head.chunk, 8)).astype(np.float32)
 
     @jax.jit
     def act(params, depth_m, state, noise):
         return policy.sample_actions(params, depth_m, state, noise, student, profile)
 
-    expected = [0.522147, -0.009731, 0.08557, -0.94536, -0.410868, 0.691728, 0.694712, -0.919155]
+    expected = [0.44019, 0.124762, 0.134625, -0.904205, -0.366346, 0.640932, 0.803949, -0.929007]
     np.testing.assert_allclose(act(params, depth_m, state, noise)[0, 0], expected, atol=2e-5)
 
 
