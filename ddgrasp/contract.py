@@ -60,7 +60,7 @@ JOINT_VELOCITY_LIMIT_RAD_S = PANDA.joint_velocity_rad_s
 JOINT_ACCELERATION_LIMIT_RAD_S2 = PANDA.joint_acceleration_rad_s2
 GRIPPER_MAX_WIDTH_M = PANDA.hand_width_m
 GRIPPER_SPEED_M_S = 0.1
-"""Of the opening: 50 mm/s for each finger of a Franka Hand (its datasheet)."""
+"""How fast the opening changes: 50 mm/s for each finger of a Franka Hand (its datasheet)."""
 
 OBSERVATION_PARTS = {
     "joint_position": 9, "joint_velocity": 9, "hand_pose": 7,

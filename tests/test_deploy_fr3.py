@@ -167,7 +167,7 @@ def test_a_close_can_be_aborted(rig):
         narrowest = min(narrowest, width_m)
         clock.sleep_until(clock.now() + 0.02)
     robot.stop()
-    assert width_m >= 0.075 and 0.02 < narrowest < 0.06, "it opened without having closed first"
+    assert width_m >= 0.075 and 0.002 < narrowest < 0.06, "it opened without having closed first, or shut"
 
 
 def test_second_client_is_refused_in_one_line_and_disturbs_nobody(tmp_path, rig):

@@ -70,7 +70,7 @@ def test_files_of_others_and_damaged_ones():
 
 def test_graph_shapes_must_be_those_promised():
     shapes = {
-        "depth": ["batch", 3, 180, 320], "state": ["batch", 8],
+        "depth": ["batch", 3, 180, 320], "state": ["batch", 9],
         "noise": ["batch", GOOD.chunk, 8], "action": ["batch", GOOD.chunk, 8],
     }  # fmt: skip
     metadata.validate_shapes(GOOD, shapes)
