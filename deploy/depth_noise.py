@@ -16,6 +16,7 @@ import onnxruntime as ort
 
 from ddgrasp import generator_metadata as names
 from ddgrasp.errors import UserError
+from ddgrasp.shipped import shipped
 
 ASPECT_TOLERANCE = 0.02
 FARTHEST_SANE_M = 200.0
@@ -52,7 +53,7 @@ class DepthGenerator:
         Raises:
           UserError: no such file, no generator, or a device that onnxruntime does not have.
         """
-        self.path = Path(path)
+        self.path = shipped(path)
         self._kind, _, number = device.partition(":")
         self._device_number = int(number or 0)
         self._session = _open(self.path, self._kind, self._device_number, threads)

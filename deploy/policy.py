@@ -13,6 +13,7 @@ from ddgrasp import artifacts, contract
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.errors import UserError
 from ddgrasp.gripper import ClosingLatch, WidthChange
+from ddgrasp.shipped import shipped
 from deploy.interfaces import Depth
 
 POLICY_FILE = "policy.onnx"
@@ -56,7 +57,7 @@ class OnnxPolicy:
         """
         if noise not in NOISES:
             raise UserError(f"noise is {noise!r}; expected one of {', '.join(NOISES)}.")
-        self.path = Path(path)
+        self.path = shipped(path)
         self._session = _open(self.path)
         self.info = _metadata(self._session, self.path)
         self.depth_input = DEPTH_INPUTS[self.info.depth_dtype]
@@ -122,8 +123,14 @@ class OnnxPolicy:
             return "all-invalid depth: no pixel above 0"
         return ""
 
-    def act(self, depth: Depth, state: Float[np.ndarray, "8"]) -> Float32[np.ndarray, "8"]:
-        """(8,) action for the newest frame (H, W) and the state (8,). Call once per control period."""
+    def act(self, depth: Depth, state: Float[np.ndarray, " _"]) -> Float32[np.ndarray, "8"]:
+        """(8,) action for the newest frame (H, W) and the state (8,). Call once per control period.
+
+        UserError for a frame of another size or type, and for a state that is not eight finite numbers; the
+        frames of before stay.
+        """
+        if problem := self.check_fit(depth) or _wrong_state(state):
+            raise UserError(f"{problem}.")
         self._frames.append(depth)
         while len(self._frames) < contract.DEPTH_FRAMES:
             self._frames.append(depth)
@@ -163,6 +170,15 @@ class OnnxPolicy:
         }
         (action,) = self._session.run([contract.ONNX_OUTPUT_ACTION], inputs)
         return np.asarray(action)[0]
+
+
+def _wrong_state(state: Float[np.ndarray, "..."]) -> str:
+    """Why a robot's state cannot be used, empty if it can."""
+    if np.shape(state) != (contract.STATE_SIZE,):
+        return (
+            f"wrong state: size {np.shape(state)}, expected ({contract.STATE_SIZE},): joints, gripper's width"
+        )
+    return "" if np.isfinite(state).all() else f"wrong state: {np.asarray(state).tolist()} is not finite"
 
 
 def _open(path: Path) -> ort.InferenceSession:

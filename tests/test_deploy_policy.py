@@ -190,3 +190,15 @@ def test_warm_up_leaves_no_trace(tmp_path):
     cold, warm = (OnnxPolicy(path, noise="normal", seed=1) for _ in range(2))
     warm.warm_up()
     np.testing.assert_array_equal(warm.act(depth_mm(), STATE), cold.act(depth_mm(), STATE))
+
+
+def test_what_cannot_be_used_is_refused_and_the_next_frame_goes_on(tmp_path):
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx"))
+    for depth, state, message in (
+        (depth_mm()[:-1], STATE, "wrong depth: size"),
+        (depth_mm(), STATE[:7], r"wrong state: size \(7,\), expected \(8,\)"),
+        (depth_mm(), np.full(8, np.nan, np.float32), "wrong state: .* is not finite"),
+    ):
+        with pytest.raises(UserError, match=message):
+            policy.act(depth, state)
+        policy.act(depth_mm(), STATE)

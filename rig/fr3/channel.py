@@ -43,7 +43,12 @@ class Channel:
             raise ChannelLost(f"the FR3 rig does not answer ({error})") from error
         if not line:
             raise ChannelLost("the FR3 rig has gone")
-        return json.loads(line)
+        try:
+            return json.loads(line)
+        except json.JSONDecodeError:
+            raise UserError(
+                "What answers there is no FR3 rig: name its address, on this machine --host 127.0.0.1."
+            ) from None
 
     def close(self) -> None:
         """Ends the connection."""
