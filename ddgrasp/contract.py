@@ -2,7 +2,8 @@
 
 This module imports the standard library alone, so that the robot side can use it. Which number of a vector
 is what: `ddgrasp.layout`.
-Change a value here and `CONTRACT_VERSION` with it: artifacts of another version are refused.
+Change a value here and `CONTRACT_VERSION` with it: artifacts of another version are refused. What a policy
+file alone takes is named in its metadata (`policy_metadata.STATE_LAYOUT`), which refuses such files alone.
 """
 
 import math

@@ -59,8 +59,7 @@ def disparity_noise(
     batch, frames, height, width = depth_m.shape
     k_strength, k_shared, k_own, k_where, k_wrong = jax.random.split(key, 5)
     coarse = (batch, frames, -(-height // CORRELATION_PX), -(-width // CORRELATION_PX))
-    shared = jax.random.normal(k_shared, (batch, 1, *coarse[2:]))
-    field = (shared + jax.random.normal(k_own, coarse)) / jnp.sqrt(2.0)
+    field = _half_shared(k_shared, k_own, coarse)
     strength = config.training.disparity_noise_px * jax.random.uniform(k_strength, (batch, 1, 1, 1))
     wrong = jax.random.bernoulli(k_where, SPURIOUS_SHARE, coarse)
     field = strength * field + wrong * jax.random.uniform(k_wrong, coarse, minval=-1.0) * SPURIOUS_PX
@@ -91,10 +90,17 @@ def _edge_noise(
     highest, lowest = (_around(sign * (sign * cells).max((3, 5)), sign) for sign in (1.0, -1.0))
     edge = jnp.clip((highest - lowest) / EDGE_RELIEF_PX, 0.0, 1.0)
     k_strength, k_shared, k_own = jax.random.split(key, 3)
-    shared = jax.random.normal(k_shared, (batch, 1, rows, columns))
-    noise = (shared + jax.random.normal(k_own, edge.shape)) / jnp.sqrt(2.0)
+    noise = _half_shared(k_shared, k_own, edge.shape)
     strength = config.training.edge_noise_px * jax.random.uniform(k_strength, (batch, 1, 1, 1))
     return _enlarged(strength * edge * noise, EDGE_CELL_PX, height, width)
+
+
+def _half_shared(
+    k_shared: Key[jax.Array, ""], k_own: Key[jax.Array, ""], shape: tuple[int, ...]
+) -> Float[jax.Array, "B F h w"]:
+    """Standard normal numbers, half of their variance the same in all frames of a stack."""
+    shared = jax.random.normal(k_shared, (shape[0], 1, *shape[2:]))
+    return (shared + jax.random.normal(k_own, shape)) / jnp.sqrt(2.0)
 
 
 def _around(cells: Float[jax.Array, "B F h w"], sign: float) -> Float[jax.Array, "B F h w"]:

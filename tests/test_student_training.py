@@ -18,6 +18,7 @@ from ddgrasp.config import (
     StudentTrainingConfig,
 )
 from ddgrasp.errors import UserError
+from ddgrasp.gripper import WidthChange
 from ddgrasp.layout import OBSERVATION, closes
 from ddgrasp.progress import Progress
 from demos.rollout import Scene
@@ -26,7 +27,7 @@ from student_jax import train
 from student_jax.act import StudentActor, keep_clean
 from student_jax.augment import disparity_noise, unseen_objects
 from student_jax.dagger import CHECKPOINTS, Trainer
-from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gripper
+from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gripper, with_change
 from student_jax.frames_io import useful_steps
 from student_jax.policy import Aux, init_params, position_to_world
 from student_jax.preprocess import table_depth
@@ -221,6 +222,12 @@ def test_pose_errors_shrink_near_the_object():
     error = np.asarray(position_to_world(seen.aux.position))
     np.testing.assert_allclose(error, [[0.002] * 3, [0.010] * 3], atol=1e-6)
     assert np.abs(seen.aux.held_logit).tolist() == [6.0, 6.0]
+
+
+def test_training_and_whoever_acts_are_told_the_same_change_of_width():
+    states = np.random.default_rng(0).random((6, 8)).astype(np.float32)
+    acting = WidthChange()
+    np.testing.assert_array_equal(with_change(states), [acting(state) for state in states])
 
 
 def test_neither_actor_takes_a_closing_back():
