@@ -73,6 +73,7 @@ def _star_sides(ring_m: float, radius_m: float, half_m: float) -> tuple[Plate, .
 
 
 _FRUIT = "friction: golden apple on rubber 0.42 to 0.48 (Ooi Abdullah and Ch'ng 2022)"
+_MADE_UP = "all of it ours"
 _GREEN, _BROWN = (0.25, 0.45, 0.15), (0.35, 0.25, 0.15)
 
 OBJECTS: dict[str, ObjectSpec] = {
@@ -169,8 +170,52 @@ OBJECTS: dict[str, ObjectSpec] = {
 }  # fmt: skip
 
 
+SHAPES: dict[str, ObjectSpec] = {
+    spec.name: spec
+    for spec in (
+        ObjectSpec(
+            "tower", 13, mass_kg=0.100, friction=0.6, rgb=(0.60, 0.60, 0.62), rest_height_m=0.040,
+            grasp_symmetry=4, grasp_offset_m=(0.0, 0.0, 0.015), box=Box((0.020, 0.020, 0.040)),
+            other_pose=RestPose("y", rest_height_m=0.020, grasp_symmetry=2),
+            source="40 x 40 x 80 mm, stands or lies; " + _MADE_UP,
+        ),
+        ObjectSpec(
+            "slab", 14, mass_kg=0.080, friction=0.6, rgb=(0.35, 0.45, 0.55), rest_height_m=0.014,
+            grasp_symmetry=2, box=Box((0.045, 0.020, 0.014)),
+            source="90 x 40 x 28 mm; " + _MADE_UP,
+        ),
+        ObjectSpec(
+            "stick", 15, mass_kg=0.050, friction=0.6, rgb=(0.55, 0.35, 0.20), rest_height_m=0.014,
+            grasp_symmetry=2, capsules=(_along_x(0.050, 0.014),), box=Box((0.040, 0.007, 0.0139)),
+            source="128 mm long, 28 mm thick, does not roll; " + _MADE_UP,
+        ),
+        ObjectSpec(
+            "puck", 16, mass_kg=0.070, friction=0.6, rgb=(0.15, 0.15, 0.18), rest_height_m=0.015,
+            grasp_symmetry=0, capsules=_disc(across_m=0.058, height_m=0.030),
+            source="58 mm across, 30 mm high; " + _MADE_UP,
+        ),
+        ObjectSpec(
+            "ring", 17, mass_kg=0.035, friction=0.7, rgb=(0.30, 0.22, 0.20), rest_height_m=0.011,
+            grasp_symmetry=8, capsules=_torus(ring_m=0.018, radius_m=0.011),
+            source="58 mm across, 22 mm thick, with a hole; " + _MADE_UP,
+        ),
+        ObjectSpec(
+            "tin", 18, mass_kg=0.180, friction=0.5, rgb=(0.20, 0.40, 0.65), rest_height_m=0.035,
+            grasp_symmetry=0, grasp_offset_m=(0.0, 0.0, 0.010), box=Box((0.0191, 0.0191, 0.035)),
+            capsules=_staves(radius_m=0.027, half_m=0.027, edge_m=0.008),
+            cylinders=(Cylinder(0.027, 0.035),),
+            other_pose=RestPose("y", rest_height_m=0.027, grasp_symmetry=2),
+            source="54 x 70 mm, stands or lies; " + _MADE_UP,
+        ),
+    )
+}  # fmt: skip
+"""Plain shapes to train on besides (`--world.objects`), so that a student knows more than six: none is one
+of the twelve, and none is tried."""
+
+
 def get_object(name: str) -> ObjectSpec:
-    """The object of that name; UserError with the nearest right name otherwise."""
-    if name not in OBJECTS:
-        raise unknown_name("object", name, OBJECTS)
-    return OBJECTS[name]
+    """The object or shape of that name; UserError with the nearest right name otherwise."""
+    known = OBJECTS | SHAPES
+    if name not in known:
+        raise unknown_name("object", name, known)
+    return known[name]

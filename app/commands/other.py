@@ -130,19 +130,19 @@ def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 @dataclass(frozen=True)
 class ObjectsList:
-    """Name the objects: category, size, mass, friction, where the numbers come from."""
+    """Name objects, and plain shapes to train on besides: category, size, mass, friction, sources."""
 
     meshes: bool = False
     """Those of the test rig, which are meshes, instead of those of training."""
 
     def run(self) -> None:
         """Prints a line per object."""
-        from mjx_envs.objects import OBJECTS
+        from mjx_envs.objects import OBJECTS, SHAPES
 
         if self.meshes:
             _list_meshes()
             return
-        for spec in OBJECTS.values():
+        for spec in (*OBJECTS.values(), *SHAPES.values()):
             size = " x ".join(f"{1000 * extent:.0f}" for extent in spec.extents_m())
             numbers = f"{size:>14} mm {1000 * spec.mass_kg:>4.0f} g  friction {spec.friction}"
             print(f"{spec.category_id:>2} {spec.name:<10} {numbers}  {spec.source}")
