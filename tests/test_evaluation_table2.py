@@ -109,6 +109,32 @@ def test_ripple_and_the_paper_s_generator_are_one_difference_each():
         rows.row_config(still, ROWS["ddg_ripple"])
 
 
+def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
+    def student(name: str, init_from: str = "", **training) -> str:
+        config = replace(LAPTOP.student, depth_source="ideal", init_from=init_from)
+        config = replace(
+            config, training=replace(config.training, **(dict.fromkeys(rows.HAND_MADE, 0.0) | training))
+        )
+        whole, folder = replace(LAPTOP, student=config), tmp_path / name / "student"
+        folder.mkdir(parents=True)
+        artifacts.finish(folder, "student", whole, seconds=1.0, metrics={})
+        return str(tmp_path / name)
+
+    def shared(start: str) -> str:
+        return rows.shared_config(
+            replace(LAPTOP, student=replace(LAPTOP.student, init_from=start))
+        ).student.init_from
+
+    clean = student("clean")
+    assert shared(clean) == clean
+    with pytest.raises(
+        UserError, match=r"trained with student.training.unseen_share 0.25: a student that has"
+    ):
+        shared(student("holes", unseen_share=0.25))
+    with pytest.raises(UserError, match="trained with student.init_from 'pretrained/student'"):
+        shared(student("later", init_from="pretrained/student"))
+
+
 def test_rows_are_chosen_by_name_or_by_table():
     assert rows.chosen((), ("main",)) == TABLES["main"].rows
     assert rows.chosen(("ddg", "sim_gt"), ("main",)) == ("sim_gt", "ddg")

@@ -7,14 +7,18 @@ policy sees it. Rows that train alike share a student.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from ddgrasp import artifacts
 from ddgrasp.config import DEPTH, DPM_SOLVER, SQUARED, UNIFORM, Config, DDGConfig
 from ddgrasp.config.student import Source
 from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.shipped import shipped
 from evaluation.treatments import RECORDED, TreatmentName
 
 PAPER_THRESHOLD = -0.2
 """Below it a pixel of a generated depth map is a hole: surfaces are 0 to 1 there, holes -1."""
 PAPER_EVALUATIONS = 10
+HAND_MADE = ("disparity_noise_px", "edge_noise_px", "unseen_share")
+"""Fields of `student.training` that add noise made by hand; 0 turns each off."""
 
 
 @dataclass(frozen=True)
@@ -110,14 +114,28 @@ def chosen(rows: Sequence[str], tables: Sequence[str]) -> tuple[str, ...]:
 def shared_config(config: Config) -> Config:
     """What teacher, demos, recordings and generator of all rows are made with: colour for rows that need it.
 
-    Raises UserError if the students would start from one that has already seen some row's depth.
+    Raises UserError if the students would start from one that has seen other depth than clean depth.
     """
     if start := config.student.init_from:
-        raise UserError(
-            f"student.init_from is {start!r}: a student that has seen one row's depth is no start for the "
-            'others; give --student.init-from "", or preset laptop.'
-        )
+        _check_clean(start)
     return replace(config, demos=replace(config.demos, rgb=True))
+
+
+def _check_clean(start: str) -> None:
+    """UserError unless the student there was trained on clean depth alone, from nothing."""
+    folder = shipped(start)
+    folder = folder if artifacts.is_finished(folder) else folder / "student"
+    student = artifacts.read_manifest(folder).config["student"]
+    training = student["training"]
+    seen = {"student.depth_source": student["depth_source"], "student.init_from": student["init_from"]}
+    seen |= {f"student.training.{name}": training[name] for name in HAND_MADE}
+    if other := {name: value for name, value in seen.items() if value not in ("ideal", "", 0.0)}:
+        how = ", ".join(f"{name} {value!r}" for name, value in other.items())
+        raise UserError(
+            f"student.init_from is {start!r}, trained with {how}: a student that has seen one row's "
+            "depth is no start for the others; give one trained on clean depth alone, "
+            '--student.init-from "", or preset laptop.'
+        )
 
 
 def row_config(shared: Config, row: Row) -> Config:
@@ -133,7 +151,7 @@ def row_config(shared: Config, row: Row) -> Config:
         )
     training = shared.student.training
     if not row.ripple:
-        training = replace(training, disparity_noise_px=0.0, edge_noise_px=0.0, unseen_share=0.0)
+        training = replace(training, **dict.fromkeys(HAND_MADE, 0.0))
     student = replace(shared.student, depth_source=row.source, training=training)
     ddg = paper_generator(shared.ddg) if row.paper_generator else shared.ddg
     return replace(shared, student=student, ddg=ddg)
