@@ -54,8 +54,7 @@ class DepthGenerator:
           UserError: no such file, no generator, or a device that onnxruntime does not have.
         """
         self.path = shipped(path)
-        self._kind, _, number = device.partition(":")
-        self._device_number = int(number or 0)
+        self._kind, self._device_number = _device(device)
         self._session = _open(self.path, self._kind, self._device_number, threads)
         self.info = names.read(self._session.get_modelmeta().custom_metadata_map, str(self.path))
         self._seed, self._normals = seed, {}
@@ -83,10 +82,11 @@ class DepthGenerator:
         self._check(frames)
         given = self._drawn(frames, steps) if noise is None else noise
         wanted = (len(frames), self.info.planes(steps), self.info.height_px, self.info.width_px)
-        if tuple(given.shape) != wanted:
+        shape = tuple(getattr(given, "shape", ()))
+        if shape != wanted:
             raise UserError(
-                f"Noise is {tuple(given.shape)}; {steps} evaluations of {len(frames)} frames take {wanted}: "
-                "let the generator's noise() make it."
+                f"Noise is {type(given).__name__} {shape}; {steps} evaluations of {len(frames)} frames take "
+                f"{wanted}: let the generator's noise() make it."
             )
         run = self._run_numpy if isinstance(depth_m, np.ndarray) else self._run_torch
         return Reported(*(made.reshape(depth_m.shape) for made in run(frames, given, steps)))
@@ -256,14 +256,20 @@ def _host(values: Array) -> np.ndarray:
     return values if isinstance(values, np.ndarray) else values.detach().cpu().numpy()
 
 
+def _device(name: str) -> tuple[str, int]:
+    """(cpu or cuda, number) of `cpu`, `cuda`, `cuda:1`; UserError for another name."""
+    kind, _, number = name.partition(":")
+    if kind not in ("cpu", "cuda") or (number and not number.isdecimal()):
+        raise UserError(f"device is {name!r}; expected cpu, cuda or cuda:1.")
+    return kind, int(number or 0)
+
+
 def _open(path: Path, kind: str, number: int, threads: int) -> ort.InferenceSession:
     if not path.is_file():
         raise UserError(f"{path}: no such file; {names.REMEDY}.")
     providers: list[Any] = ["CPUExecutionProvider"]
     if kind == "cuda":
         providers.insert(0, ("CUDAExecutionProvider", {"device_id": number}))
-    elif kind != "cpu":
-        raise UserError(f"device is {kind!r}; expected cpu, cuda or cuda:1.")
     if kind == "cuda" and "CUDAExecutionProvider" not in ort.get_available_providers():
         raise UserError("device is cuda, which this onnxruntime does not have: install onnxruntime-gpu.")
     options = ort.SessionOptions()

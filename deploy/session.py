@@ -72,7 +72,8 @@ def _run(
     with kept.into(folder):
         report = loop.run(steps, kept.look)
     unattended = options.yes or report.interrupted or bool(report.fault)
-    success = None if options.dry_run else verdict(camera, _unasked if unattended else ask_success)
+    finished = not (options.dry_run or report.interrupted)
+    success = verdict(camera, _unasked if unattended else ask_success) if finished else None
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
     if name := options.object_name or (config.world.objects[0] if options.robot == "sim" else ""):
         about["object"] = name

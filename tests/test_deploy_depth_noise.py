@@ -125,9 +125,11 @@ def test_wrong_depth_is_one_line(generator, depth, said):
 
 def test_wrong_noise_and_steps_are_refused(generator, scene):
     with pytest.raises(
-        UserError, match=r"Noise is \(1, 3, 180, 320\); 4 evaluations of 2 frames take \(2, 3"
+        UserError, match=r"Noise is ndarray \(1, 3, 180, 320\); 4 evaluations of 2 frames take \(2, 3"
     ):
         generator(scene, generator.noise(1).next())
+    with pytest.raises(UserError, match=r"Noise is list \(\); 4 evaluations of 2 frames take \(2, 3"):
+        generator(scene, [0.0])
     with pytest.raises(UserError, match="steps is 51; .* takes 1 to 50"):
         generator(scene, steps=51)
 
@@ -142,8 +144,9 @@ def test_files_that_are_no_generators_are_refused(tmp_path):
         names.read({}, "x")
     with pytest.raises(UserError, match="damaged metadata"):
         names.read({names.METADATA_KEY: "{"}, "x")
-    with pytest.raises(UserError, match="device is 'tpu'; expected cpu"):
-        DepthGenerator(FILE, device="tpu")
+    for device in ("tpu", "cuda:one"):
+        with pytest.raises(UserError, match=f"device is '{device}'; expected cpu"):
+            DepthGenerator(FILE, device=device)
 
 
 def test_neither_jax_nor_pytorch_is_loaded():

@@ -12,6 +12,7 @@ from deploy import session
 from deploy.devices.options import SessionOptions
 from deploy.interfaces import Frame
 from deploy_support import KinematicRobot, constant_bias, describe, write_policy
+from evaluation.report import deployments
 from sensors.recordings.recording import Recording, find_recordings
 
 DEPTH_MM = np.full((180, 320), 700, np.uint16)
@@ -79,10 +80,14 @@ def test_two_in_a_second_are_two_recordings_of_one_folder(run, tmp_path):
     assert {recording.path for recording in find_recordings(tmp_path / "kept")} == folders
 
 
-def test_an_interrupted_one_is_kept_as_far_as_it_went(run):
+def test_an_interrupted_one_is_kept_as_far_as_it_went_and_not_judged(run, monkeypatch):
+    monkeypatch.setattr(ColourCamera, "success", lambda self: False, raising=False)  # a rig knows
     report, folder = run(lambda clock: ColourCamera(clock, fails_at=4), seconds=60.0)
     assert report.interrupted and len(Recording.open(folder)) == 3
-    assert json.loads((folder / "report.json").read_text())["interrupted"]
+    kept = json.loads((folder / "report.json").read_text())
+    assert kept["interrupted"] and kept["success"] is None
+    assert [deployment.ended for deployment in deployments.find(folder)] == ["interrupted"]
+    assert json.loads((run()[1] / "report.json").read_text())["success"] is False
 
 
 @pytest.mark.parametrize(("answer", "success"), [("y", True), ("No", False), ("", None), ("perhaps", None)])

@@ -33,7 +33,9 @@ class Deployment:
         """In a few words."""
         if self.report["fault"]:
             return f"fault: {self.report['fault']}"
-        return "dry run" if self.report.get("dry_run") else _ENDED[self.report["success"]]
+        if self.report.get("dry_run"):
+            return "dry run"
+        return "interrupted" if self.report["interrupted"] else _ENDED[self.report["success"]]
 
 
 def find(folder: Path) -> list[Deployment]:
