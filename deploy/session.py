@@ -19,7 +19,7 @@ from ddgrasp.files import atomic_write_bytes
 from deploy import dry_run
 from deploy.calibration.standing import standing
 from deploy.clock import RealClock, RobotClock
-from deploy.devices.options import SessionOptions, Setup
+from deploy.devices.options import RIG_CAMERAS, RIG_HOST, SessionOptions, Setup
 from deploy.devices.registry import check_devices, make_devices
 from deploy.dry_run import DryRun
 from deploy.interfaces import Clock, Robot, TimedRobot
@@ -47,15 +47,15 @@ def deploy(
 def _run(
     config: Config, policy_path: Path, options: SessionOptions, say: Callable[[str], None]
 ) -> LoopReport:
-    place = standing(config, options)
-    if place.line:
-        say(place.line)
     policy = OnnxPolicy(
         policy_path,
         noise=config.deploy.noise,
         seed=config.seed,
         execute_steps=config.deploy.execute_steps or None,
     )
+    place = standing(config, options)
+    if place.line:
+        say(place.line)
     clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
     confirm = _agreed if options.yes else ask_person
     robot, camera = make_devices(Setup(config, options, policy.info, clock, confirm, say))
@@ -115,11 +115,14 @@ def _agreed(question: str) -> None:
 
 
 def for_devices(config: Config, options: SessionOptions) -> Config:
-    """The command line's host; before the FR3 rig, a process of this machine, its own time and any kernel."""
+    """The command line's host; before the FR3 rig, a process of this machine, its own time and any kernel.
+
+    The rig's camera never goes with the configured arm: without a host named it is the rig at `RIG_HOST`.
+    """
     section = config.deploy
-    if options.host:
-        section = replace(section, franka=replace(section.franka, host=options.host))
-    if options.camera in ("rig", "rig-ideal"):
+    if host := options.host or (RIG_HOST if options.camera in RIG_CAMERAS else ""):
+        section = replace(section, franka=replace(section.franka, host=host))
+    if options.camera in RIG_CAMERAS:
         section = replace(section, clock="robot", franka=replace(section.franka, kernel="any"))
     return replace(config, deploy=section)
 

@@ -24,7 +24,7 @@ from deploy.devices.replay_camera import ReplayCamera
 from deploy.loop import ControlLoop, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.safety import SafetyFilter, SafetyLimits
-from deploy.session import SessionOptions, deploy
+from deploy.session import SessionOptions, deploy, for_devices
 from deploy_support import (
     HOME_RAD,
     KinematicRobot,
@@ -186,6 +186,27 @@ def test_drivers_that_never_started_can_be_stopped():
 def test_wrong_combination_gets_one_line(options, message):
     with pytest.raises(UserError, match=message):
         deploy(get_preset("debug"), Path("absent.onnx"), options)
+
+
+def test_the_rig_s_camera_never_goes_with_the_configured_arm():
+    config = get_preset("debug")
+    arm = config.deploy.franka.host
+    for camera, asked, host in (
+        ("realsense", "", arm),
+        ("realsense", "10.0.0.7", "10.0.0.7"),
+        ("rig", "", "127.0.0.1"),
+        ("rig-ideal", "", "127.0.0.1"),
+        ("rig", "127.0.0.2", "127.0.0.2"),
+    ):
+        used = for_devices(config, SessionOptions("franka", camera, host=asked)).deploy
+        assert used.franka.host == host and (used.clock == "robot") == camera.startswith("rig")
+
+
+def test_a_file_that_is_absent_is_said_before_anything_else():
+    said: list[str] = []
+    with pytest.raises(UserError, match="absent.onnx"):
+        deploy(get_preset("debug"), Path("absent.onnx"), SessionOptions("franka", "realsense"), said.append)
+    assert said == []
 
 
 def test_every_pair_is_refused_or_can_be_made(recording):

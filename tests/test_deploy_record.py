@@ -133,5 +133,7 @@ def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
     for words in (f"{judged.name}: lifted and held", f"{other.name}: not judged", "width=device-width"):
         assert words in text
     assert find_recordings(judged.parent), "the page beside them does not disturb a fit"
+    (other / "report.json").write_text(json.dumps({**values, "success": None, "dry_run": True}))
     parse("report", [str(other)]).run()
-    assert "none was judged" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "none was judged" in said and "in 0 steps. Beside them 1 dry run." in said

@@ -51,7 +51,7 @@ class Calibrate:
     robot: Literal["franka"] = "franka"
     """franka."""
     host: str = ""
-    """Address of the robot's control unit; empty takes deploy.franka.host."""
+    """Address of the robot's control unit; empty takes deploy.franka.host, or 127.0.0.1 with camera rig."""
     board: BoardOptions = BoardOptions()
     poses: Annotated[int, Range(6, 100)] = 20
     """Views to take."""

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from ddgrasp.config.checks import Range, Seed
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
+from deploy.devices.options import RIG_HOST
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class RigFr3:
     """What lies on the table; `ddgrasp objects list --meshes` names them."""
     shapes: Literal["mesh", "primitive"] = "mesh"
     """mesh, or the development rig's primitives."""
-    host: str = "127.0.0.1"
+    host: str = RIG_HOST
     """Address of this machine to listen on: ports 1337 to 1339."""
     seed: Seed = 0
     """Where object and clutter stand."""

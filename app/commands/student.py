@@ -101,7 +101,7 @@ class Deploy:
     robot: Robot = "sim"
     """sim (the pseudo-real rig) or franka."""
     host: str = ""
-    """Address of robot franka's control unit; empty takes deploy.franka.host."""
+    """Address of franka's control unit; empty takes deploy.franka.host, or 127.0.0.1 with camera rig."""
     camera: Camera = "stereo"
     """stereo (the rig's own), realsense, replay (a recording), or rig (the FR3 rig at --host)."""
     recording: Path | None = None

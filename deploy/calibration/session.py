@@ -40,7 +40,7 @@ class CalibrationOptions:
     camera: str
     """realsense or rig."""
     host: str = ""
-    """Address of the robot's control unit; empty takes deploy.franka.host."""
+    """Address of the robot's control unit; empty takes deploy.franka.host, or 127.0.0.1 with camera rig."""
     board: CharucoBoard = field(default_factory=CharucoBoard)
     poses: int = 20
     speed_rad_s: float = 0.3

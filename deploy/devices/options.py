@@ -8,6 +8,11 @@ from ddgrasp.config import Config
 from ddgrasp.policy_metadata import PolicyMetadata
 from deploy.interfaces import Clock
 
+RIG_CAMERAS = ("rig", "rig-ideal")
+"""Cameras of the FR3 rig."""
+RIG_HOST = "127.0.0.1"
+"""Where `ddgrasp rig fr3` serves by default."""
+
 
 @dataclass(frozen=True)
 class SessionOptions:
@@ -29,7 +34,7 @@ class SessionOptions:
     yes: bool = False
     """Move without asking first."""
     host: str = ""
-    """Address of the robot's control unit; empty takes deploy.franka.host."""
+    """Address of the robot's control unit; empty takes deploy.franka.host, or `RIG_HOST` with its cameras."""
     out: Path = Path("runs/deployments")
     """Folder that every run leaves its report in."""
     calibration: Path | None = None

@@ -66,13 +66,17 @@ def render(deployments: Sequence[Deployment]) -> str:
 
 
 def verdict(deployments: Sequence[Deployment]) -> str:
-    """How many of those that somebody judged succeeded, what ended by a fault, deadlines missed."""
+    """How many of those that somebody judged succeeded, what ended by a fault, deadlines missed; without dry
+    runs."""
     judged = [d.report["success"] for d in deployments if d.report["success"] is not None]
     rate = wilson.describe(wilson.success(sum(judged), len(judged))) if judged else "none was judged"
-    faults = sum(bool(d.report["fault"]) for d in deployments)
-    missed = sum(d.report["missed_deadlines"] for d in deployments)
-    steps = sum(d.report["steps"] for d in deployments)
-    return f"Success {rate}. Ended by a fault: {faults}. Missed deadlines: {missed} in {steps} steps."
+    driven = [d.report for d in deployments if not d.report.get("dry_run")]
+    faults = sum(bool(report["fault"]) for report in driven)
+    missed = sum(report["missed_deadlines"] for report in driven)
+    steps = sum(report["steps"] for report in driven)
+    dry = len(deployments) - len(driven)
+    beside = f" Beside them {dry} dry run{'s' * (dry > 1)}." if dry else ""
+    return f"Success {rate}. Ended by a fault: {faults}. Missed deadlines: {missed} in {steps} steps.{beside}"
 
 
 def _row(deployment: Deployment) -> list[str]:
