@@ -33,7 +33,7 @@ class StudentEval:
     """Seed of the episodes."""
 
     def run(self) -> None:
-        """Prints success on clean and on generated depth, with Wilson intervals."""
+        """Prints success on clean and on generated depth, with Wilson intervals, and perception's error."""
         from ddgrasp.progress import Progress
         from evaluation import wilson
         from learning.params import load_params
@@ -51,7 +51,8 @@ class StudentEval:
         result = closed_loop(config, teacher, source, params, Progress(name="student eval"))
         for name, counts in result.items():
             success = counts["success"]
-            print(f"{name:<14} {wilson.describe(wilson.success(success['successes'], success['n']))}")
+            rate = wilson.describe(wilson.success(success["successes"], success["n"]))
+            print(f"{name:<14} {rate}; grasp perceived to {counts['position_error_mm']:.1f} mm (median)")
 
 
 @dataclass(frozen=True)

@@ -174,7 +174,11 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
         return lines + [_on_backend(row) for row in metrics.get("backends", [])]
     if stage == "student":
         named = (("student_clean", "clean depth"), ("student_ddg", "generated depth"))
-        return [f"{text}: success {rate}" for key, text in named if (rate := _success(report, key))]
+        return [
+            f"{text}: success {rate}{_perceived(report[key])}"
+            for key, text in named
+            if (rate := _success(report, key))
+        ]
     if stage == "ddg" and {"recorded", "generated"} <= metrics.keys():
         shares = [metrics[key]["invalid_fraction"] for key in ("recorded", "generated")]
         return [f"invalid pixels: recorded {shares[0]:.1%}, generated {shares[1]:.1%} (held-out frames)"]
@@ -192,6 +196,12 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
         for name, value in metrics.items()
         if isinstance(value, (int, float)) and not isinstance(value, bool)
     ][:3]
+
+
+def _perceived(student: Mapping[str, Any]) -> str:
+    """Perception's error in new scenes; nothing in reports from before it was measured."""
+    error_mm = student.get("position_error_mm")
+    return "" if error_mm is None else f", grasp perceived to {error_mm:.1f} mm"
 
 
 def _on_backend(row: Mapping[str, Any]) -> str:
