@@ -49,8 +49,8 @@ KEPT = (
     "world.episode_steps", "world.reward.bonus_max_count", "teacher.unroll_steps", "teacher.epochs",
     "teacher.eval_every", "teacher.checkpoint_every", "record.frames", "ddg.diffusion.steps",
     "ddg.training.checkpoint_every", "ddg.training.distil_from", "student.training.noise_draws",
-    "student.training.demo_held_steps", "student.head.diffusion_steps", "student.head.ddim_steps",
-    "export.ddim_steps", "deploy.film_every",
+    "student.training.demo_held_steps", "student.training.demo_stretch_steps", "student.head.diffusion_steps",
+    "student.head.ddim_steps", "export.ddim_steps", "deploy.film_every",
 )  # fmt: skip
 """Counts that stay: lengths of an episode, intervals, steps of the forward process."""
 

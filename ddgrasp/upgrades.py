@@ -8,11 +8,11 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 6
+VERSION = 7
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
-edges."""
+edges. 6: demos are trained on from their beginning."""
 
 VERSION_FIELD = "manifest_version"
 
@@ -120,6 +120,9 @@ _ADDED_AFTER_4 = {"student.head.closing_steps": 0, "student.training.unseen_shar
 _ADDED_AFTER_5 = {"student.training.edge_noise_px": 0.0}
 """Fields that version 5 lacked, with what it did."""
 
+_ADDED_AFTER_6 = {"student.training.demo_stretch_steps": 0}
+"""Fields that version 6 lacked, with what it did."""
+
 _CLONE_ROUNDS = 8
 """What stands in a configuration that does not clone: version 2 wrote 0."""
 
@@ -147,6 +150,8 @@ def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
         _add(made, _ADDED_AFTER_4)
     if version < 6:
         _add(made, _ADDED_AFTER_5)
+    if version < 7:
+        _add(made, _ADDED_AFTER_6)
     return made
 
 
@@ -154,6 +159,8 @@ def downgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     """The JSON of a configuration of this version with the fields of an earlier one: what its hashes were
     over. Values of fields that it lacked are lost."""
     made = copy.deepcopy(dict(config))
+    if version < 7:
+        _drop(made, _ADDED_AFTER_6)
     if version < 6:
         _drop(made, _ADDED_AFTER_5)
     if version < 5:

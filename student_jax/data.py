@@ -96,18 +96,21 @@ class Frames:
     """Which episode a step is of."""
     step: Int[np.ndarray, " N"]
     """Index within the episode."""
+    drawn: Bool[np.ndarray, " N"]
+    """Whether a step is a sample; others lie there for the picture stacks of the next ones."""
     _cumulative: tuple[float, np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.state)
 
     def draw(self, rng: np.random.Generator, count: int, held_weight: float) -> Int[np.ndarray, " {count}"]:
-        """(count,) indices at random; a step with the object in the hand counts `held_weight`.
+        """(count,) indices at random of `drawn`; a step with the object in the hand counts `held_weight`.
 
         Most of an episode holds the lifted object, and there is little to learn from that.
         """
         if self._cumulative is None or self._cumulative[0] != held_weight:
-            self._cumulative = held_weight, np.cumsum(np.where(self.held > 0, held_weight, 1.0))
+            weight = np.where(self.held > 0, held_weight, 1.0) * self.drawn
+            self._cumulative = held_weight, np.cumsum(weight)
         total = self._cumulative[1]
         return np.searchsorted(total, rng.random(count) * total[-1], side="right")
 
@@ -162,6 +165,7 @@ def make_frames(
         held=np.concatenate(held).astype(np.float32),
         episode=np.repeat(np.arange(len(lengths)), lengths),
         step=np.concatenate([np.arange(n) for n in lengths]),
+        drawn=np.ones(sum(lengths), bool),
     )
 
 

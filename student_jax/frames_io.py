@@ -1,5 +1,6 @@
 """Demos and DAgger episodes as the student sees them, on disk, so that a resumed stage finds them."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ddg_jax.generate import Clip
+from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
 from demos.rollout import Episodes
@@ -18,6 +20,10 @@ from student_jax.depth_source import DepthSource, check_colour
 CACHE = "frames.zarr"
 _COLUMNS = ("state", "action", "observation", "held")
 _FIELDS = ("depth_mm", *_COLUMNS)
+_DRAWN = "drawn"
+LEAD_IN = contract.DEPTH_FRAMES - 1
+"""Steps before a stretch's first that its stack of pictures shows."""
+_STRETCH_SEED = 47_000
 
 
 def add_noisy_demos(
@@ -27,27 +33,35 @@ def add_noisy_demos(
     """Copies the demos into `frames` with the source's artefacts on their depth, going on from what is there.
 
     A share of `config.student.training.clean_share` keeps clean depth. Steps long after the grasp are left
-    out, and so is what lies outside of the `window` if one is given. UserError if the source needs colour
-    that the demos lack.
+    out, those beside a demo's stretch if one is configured, and what lies outside of the `window` if one is
+    given. UserError if the source needs colour that the demos lack.
     """
     check_colour(source, demos)
-    ends = [0, *demos.ends.tolist()]
-    held = np.split(demos.steps("held"), ends[1:-1])
-    lengths = [useful_steps(episode, config.student.training.demo_held_steps) for episode in held]
-    keep_clean = np.random.default_rng(config.seed).random(len(demos)) < config.student.training.clean_share
+    training = config.student.training
+    begins = [0, *demos.ends.tolist()]
+    useful = [
+        useful_steps(held, training.demo_held_steps) for held in np.split(demos.steps("held"), begins[1:-1])
+    ]
+    stretches = [stretch(n, training.demo_stretch_steps, (config.seed, i)) for i, n in enumerate(useful)]
+    keep_clean = np.random.default_rng(config.seed).random(len(demos)) < training.clean_share
     chosen = np.flatnonzero(~keep_clean)
 
+    def rows_of(i: int) -> tuple[int, int]:
+        return begins[i] + stretches[i].start, begins[i] + stretches[i].stop
+
     def read(i: int) -> Clip:
-        rows = ends[chosen[i]], ends[chosen[i]] + lengths[chosen[i]]
+        rows = rows_of(chosen[i])
         rgb = demos.steps("rgb", *rows) if source.needs_rgb else None
         return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb)
 
     done = int(np.sum(~keep_clean[: len(frames)]))
-    noisy = source.episodes([lengths[i] for i in chosen], read, done)
+    noisy = source.episodes([len(stretches[i]) for i in chosen], read, done)
     with progress.task("artefacts on the demos", len(demos)) as task:
         task.start_at(len(frames))
         for i in range(len(frames), len(demos)):
-            steps = {name: demos.steps(name, ends[i], ends[i] + lengths[i]) for name in _FIELDS}
+            steps = {name: demos.steps(name, *rows_of(i)) for name in _FIELDS}
+            count = len(stretches[i])
+            steps[_DRAWN] = np.arange(count) >= count - (training.demo_stretch_steps or count)
             if not keep_clean[i]:
                 steps["depth_mm"] = next(noisy)
             if window is not None:
@@ -62,6 +76,15 @@ def useful_steps(held: Bool[np.ndarray, " T"], held_steps: int) -> int:
     return int(enough[0]) + 1 if len(enough) else len(held)
 
 
+def stretch(useful: int, steps: int, seed: Sequence[int]) -> range:
+    """The steps kept of a demo's `useful` first ones: `steps` in a row from a random one on, and up to
+    `LEAD_IN` before them for their pictures; all for 0."""
+    if not 0 < steps < useful:
+        return range(useful)
+    first = int(np.random.default_rng([*seed, _STRETCH_SEED]).integers(useful - steps + 1))
+    return range(first - min(first, LEAD_IN), first + steps)
+
+
 def add_rollouts(frames: EpisodeStore, episodes: Episodes, seen: Spool, window: Window) -> None:
     """Adds DAgger episodes with the depth that the student saw in `window`."""
     for i, length in enumerate(episodes.length):
@@ -73,6 +96,7 @@ def add_rollouts(frames: EpisodeStore, episodes: Episodes, seen: Spool, window: 
                 "action": episodes.action[i, :n].astype(np.float32),
                 "observation": episodes.observation[i, :n].astype(np.float32),
                 "held": episodes.held[i, :n],
+                _DRAWN: np.ones(n, bool),
             },
             {"from_demo": np.bool_(False)},
         )
@@ -86,4 +110,5 @@ def load(path: Path, window: Window | None = None) -> Frames:
     depth = store.reader("depth_mm")
     if window is not None and depth.shape[1:] == window.shape:
         depth = DepthInWindow(depth, window)
-    return replace(make_frames([], *columns), depth_mm=depth)
+    frames = replace(make_frames([], *columns), depth_mm=depth)
+    return replace(frames, drawn=store.steps(_DRAWN)) if _DRAWN in store.fields else frames

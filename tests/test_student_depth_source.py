@@ -117,6 +117,33 @@ def test_ideal_depth_is_the_demos(demos, tmp_path):
     np.testing.assert_array_equal(seen, demos.steps("depth_mm"))
 
 
+def test_a_stretch_s_samples_are_those_of_the_whole_demo(demos, tmp_path):
+    whole_settings = with_source("ideal")
+    training = replace(whole_settings.student.training, demo_stretch_steps=4)
+    cut_settings = replace(whole_settings, student=replace(whole_settings.student, training=training))
+    loaded = {}
+    for name, settings in (("whole", whole_settings), ("cut", cut_settings)):
+        source = make_source(settings, tmp_path / "no generator needed")
+        training_depth(settings, source, demos, tmp_path / name, have=2)
+        loaded[name] = frames_io.load(tmp_path / name / "frames.zarr")
+    whole, cut = loaded["whole"], loaded["cut"]
+    assert whole.drawn.all() and np.bincount(cut.episode[cut.drawn]).tolist() == [4, 4, 3]
+    assert set(cut.draw(np.random.default_rng(0), 200, 0.4)) == set(np.flatnonzero(cut.drawn))
+    of_step = {tuple(row): i for i, row in enumerate(whole.observation)}
+    at = np.flatnonzero(cut.drawn)
+    same = np.array([of_step[tuple(row)] for row in cut.observation[at]])
+    np.testing.assert_array_equal(cut.depth_stack(at), whole.depth_stack(same))
+    np.testing.assert_array_equal(cut.state[at], whole.state[same])
+    assert np.all(np.diff(same[cut.episode[at] == 1]) == 1)
+
+
+def test_a_stretch_begins_anywhere_and_brings_the_frames_before_it():
+    assert frames_io.stretch(9, 0, (0, 0)) == frames_io.stretch(9, 9, (0, 0)) == range(9)
+    kept = [frames_io.stretch(9, 3, (0, number)) for number in range(200)]
+    assert {steps.stop for steps in kept} == {3, 4, 5, 6, 7, 8, 9}
+    assert all(steps.start == max(0, steps.stop - 3 - frames_io.LEAD_IN) for steps in kept)
+
+
 def test_dextrah_loses_and_replaces_the_expected_shares(demos, tmp_path):
     settings = with_source("dextrah")
     seen = training_depth(settings, make_source(settings, tmp_path), demos, tmp_path, have=2)

@@ -184,6 +184,9 @@ class StudentTrainingConfig(Section, name="student.training"):
     """How often a step with the object in the hand is drawn, relative to one before the grasp."""
     demo_held_steps: Annotated[int, Range(0, 10_000)] = 20
     """Steps of a demo kept from the grasp on: the lift and a little of the hold."""
+    demo_stretch_steps: Annotated[int, Range(0, 10_000)] = 0
+    """Steps in a row kept of each demo, from a random one on; 0 keeps all. A demo is one placement of object
+    and camera: with short stretches as many pictures for the generator show more of them."""
     clean_share: Share = 0.2
     """Share of the episodes that keep clean depth."""
     crop_shift_px: Annotated[int, Range(0, 1000)] = 6
