@@ -258,6 +258,14 @@ def test_a_table_without_its_network_is_made_without_that_row_which_is_said(tmp_
     assert study.config.demos.rgb and study.series.trials == 50
 
 
+def test_without_colour_there_are_the_rows_that_need_none(tmp_path):
+    study = command("--out", str(tmp_path), "--demos.no-rgb").planned()
+    assert set(study.left_out) == {"monocular", "upper_bound"}
+    assert "demos.rgb is false" in study.left_out["upper_bound"]
+    with pytest.raises(UserError, match="'stereo' needs colour in the demos, and demos.rgb is false"):
+        command("--out", str(tmp_path), "--demos.no-rgb", "--rows", "upper_bound").planned()
+
+
 def test_a_study_is_continued_only_with_its_own_configuration(tmp_path):
     from app import table2
 

@@ -135,12 +135,13 @@ def _check_row(config: Config, name: str) -> None:
 
 
 def _impossible(config: Config, names: tuple[str, ...]) -> dict[str, str]:
-    """Rows whose network has no weights here, and why: a table is made without them."""
+    """Rows whose network has no weights here, or whose camera no colour, and why: a table is made without."""
+    from ddg_jax.sensor import BY_COLOUR
     from evaluation.table2.rows import ROWS
 
     why = {}
     for name in names:
-        if ROWS[name].depth == "monocular":
+        if ROWS[name].source in ("monocular", *BY_COLOUR):
             try:
                 _check_row(config, name)
             except UserError as error:

@@ -112,13 +112,13 @@ def chosen(rows: Sequence[str], tables: Sequence[str]) -> tuple[str, ...]:
 
 
 def shared_config(config: Config) -> Config:
-    """What teacher, demos, recordings and generator of all rows are made with: colour for rows that need it.
+    """What teacher, demos, recordings and generator of all rows are made with.
 
     Raises UserError if the students would start from one that has seen other depth than clean depth.
     """
     if start := config.student.init_from:
         _check_clean(start)
-    return replace(config, demos=replace(config.demos, rgb=True))
+    return config
 
 
 def _check_clean(start: str) -> None:
