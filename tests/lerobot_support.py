@@ -38,6 +38,20 @@ def write_demos(run: Path, *, with_rgb: bool = True, largest_mm: int = 4095) -> 
     return written
 
 
+def write_noisy(run: Path) -> list[np.ndarray]:
+    """Makes the finished stage `noisy` of the run's demonstrations; returns the depth of each episode."""
+    rng = np.random.default_rng(1)
+    store = EpisodeStore(run / "noisy" / "depth.zarr", create=True)
+    written = [rng.integers(0, 4096, (length, *SIZE)).astype(np.uint16) for length in LENGTHS]
+    for depth_mm in written:
+        store.append({"depth_mm": depth_mm}, {"invalid_fraction": np.float64(0.03)})
+    artifacts.finish(
+        run / "noisy", "noisy", get_preset("debug"), seconds=1.0, metrics={"invalid_fraction": 0.03},
+        parents=[artifacts.read_artifact(run / "demos")],
+    )  # fmt: skip
+    return written
+
+
 def write_deployment(
     folder: Path, *, success: bool | None = True, frames: int = 4, held: tuple[int, ...] = (), **about: str
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from ddgrasp import contract
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
-from lerobot_support import LENGTHS, OBJECTS, SIZE, write_demos, write_deployment
+from lerobot_support import LENGTHS, OBJECTS, SIZE, write_demos, write_deployment, write_noisy
 
 NAMES = get_preset("debug").world.objects
 QUIET = Progress(quiet=True)
@@ -41,6 +41,35 @@ def test_demonstrations_are_the_store_s_episodes(tmp_path):
         depth_mm, rgb = zip(*episode.pictures(), strict=True)
         np.testing.assert_array_equal(depth_mm, arrays["depth_mm"])
         np.testing.assert_array_equal(rgb, arrays["rgb"])
+
+
+def test_generated_depth_in_the_place_of_clean_depth(tmp_path):
+    run = tmp_path / "run"
+    written = write_demos(run)
+    depth = write_noisy(run)
+    source = open_source(run, noisy=run)
+    assert "3.0% of the pixels have none" in source.about["Camera"] and "clean" not in source.about["Camera"]
+    for read, clean, noisy in zip(source.episodes, written, depth, strict=True):
+        depth_mm, rgb = zip(*read().pictures(), strict=True)
+        np.testing.assert_array_equal(depth_mm, noisy)
+        np.testing.assert_array_equal(rgb, clean["rgb"])
+    chosen = open_source(run, [NAMES[0]], run / "noisy").episodes
+    np.testing.assert_array_equal([picture for picture, _ in chosen[0]().pictures()], depth[1])
+
+
+def test_depth_of_other_demonstrations_is_refused(tmp_path):
+    write_demos(tmp_path / "run")
+    write_noisy(tmp_path / "run")
+    write_demos(tmp_path / "other")
+    manifest = tmp_path / "other" / "demos" / "manifest.json"
+    manifest.write_text(manifest.read_text() + "\n")  # made in the same second they would be the same
+    with pytest.raises(UserError, match=r"run.noisy is not depth of the demonstrations in .*other.demos: "):
+        open_source(tmp_path / "other", noisy=tmp_path / "run")
+    with pytest.raises(UserError, match="nowhere.noisy holds no finished artifact"):
+        open_source(tmp_path / "run", noisy=tmp_path / "nowhere")
+    write_deployment(tmp_path / "arm" / "first")
+    with pytest.raises(UserError, match="--noisy goes with demonstrations, and .*arm has none"):
+        open_source(tmp_path / "arm", noisy=tmp_path / "run")
 
 
 def test_a_selection_by_object_and_number(tmp_path):

@@ -22,6 +22,8 @@ class DemosExport:
     """At most so many, from the first on; 0 takes all."""
     objects: tuple[str, ...] = ()
     """Only episodes with these; none takes all."""
+    noisy: Path | None = None
+    """What `ddgrasp ddg generate` made of these demonstrations: its depth in the place of clean depth."""
     storage: Literal["video", "images"] = "video"
     """video (small; depth without loss up to 4.095 m) or images (a file for each step, all without loss)."""
     task: str = ""
@@ -36,7 +38,7 @@ class DemosExport:
         from ddgrasp.progress import Progress
 
         check_free(self.out)
-        source = limited(open_source(self.source, self.objects), self.episodes)
+        source = limited(open_source(self.source, self.objects, self.noisy), self.episodes)
         load_lerobot()
         progress = Progress(name="demos export")
         for line in source.left_out:

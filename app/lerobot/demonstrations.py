@@ -1,4 +1,4 @@
-"""Demonstrations of a run (`demos/episodes.zarr`) as episodes."""
+"""Demonstrations of a run (`demos/episodes.zarr`) as episodes, with clean depth or a generator's."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -14,6 +14,9 @@ from demos.store import EpisodeStore
 
 STORE, STAGE = "episodes.zarr", "demos"
 """As `demos.stage` names them, which imports JAX."""
+NOISY_STORE, NOISY_STAGE = "depth.zarr", "noisy"
+"""As `ddg_jax.generate` names them."""
+CLEAN_DEPTH = "its depth is clean: no holes, no noise"
 
 
 def find(path: Path) -> Path | None:
@@ -22,11 +25,15 @@ def find(path: Path) -> Path | None:
     return next((place for place in places if (place / STORE / "zarr.json").exists()), None)
 
 
-def read(folder: Path, objects: Sequence[str] = ()) -> Source:
+def read(folder: Path, objects: Sequence[str] = (), noisy: Path | None = None) -> Source:
     """The episodes of the stage in `folder`, of the named `objects` alone if there are any.
 
+    Args:
+      noisy: what `ddgrasp ddg generate` made of them: its depth in the place of clean depth.
+
     Raises:
-      UserError: the stage is not finished, its store is damaged, or an object is none of its own.
+      UserError: the stage is not finished, its store is damaged, an object is none of its own, or `noisy` was
+        made of other demonstrations.
     """
     manifest = artifacts.read_manifest(folder)
     config = artifacts.config_from_json(manifest.config)
@@ -35,6 +42,7 @@ def read(folder: Path, objects: Sequence[str] = ()) -> Source:
         if name not in names:
             raise unknown_name("object", name, names)
     store = EpisodeStore(folder / STORE)
+    depth, depth_is = (store, CLEAN_DEPTH) if noisy is None else _open_noisy(noisy, folder)
     indices = store.episodes("object_index").tolist()
     taken = [i for i, index in enumerate(indices) if not objects or names[index] in objects]
     if not taken:
@@ -44,24 +52,41 @@ def read(folder: Path, objects: Sequence[str] = ()) -> Source:
     about = {
         "Robot": "Franka Emika Panda with its hand, simulated in MuJoCo MJX.",
         "Camera": f"An ideal one with a RealSense D455's view, {width} x {height}, fixed across the table; "
-        "its depth is clean: no holes, no noise.",
+        f"{depth_is}.",
         "How it was made": f"A policy that sees the simulator's state, trained by PPO, grasped {len(names)} "
         "objects; episodes that failed were thrown away. In some steps its joint steps were disturbed "
         f"({noise}); `action` is what it asked for, not the disturbed step, so that recoveries are labelled.",
     }
     poses = store.episodes("T_world_cam")
-    read_one = partial(_read, store, names, indices, poses)
+    read_one = partial(_read, store, depth, names, indices, poses)
     return Source("demonstrations", contract.PANDA.name, about, [partial(read_one, i) for i in taken])
 
 
+def _open_noisy(path: Path, folder: Path) -> tuple[EpisodeStore, str]:
+    """The generated depth of the demonstrations in `folder`, and what a card says of it."""
+    place = path if artifacts.is_finished(path) else path / NOISY_STAGE
+    manifest = artifacts.read_manifest(place)
+    if manifest.parents.get(STAGE) != artifacts.read_artifact(folder).hash:
+        raise UserError(
+            f"{place} is not depth of the demonstrations in {folder}: make it with `ddgrasp ddg generate "
+            f"--demos {folder}`."
+        )
+    without = float(manifest.metrics["invalid_fraction"])
+    return EpisodeStore(place / NOISY_STORE), (
+        "its depth has a camera's holes and errors as a diffusion model of depth noise draws them "
+        f"(`ddgrasp ddg generate`; {without:.1%} of the pixels have none)"
+    )
+
+
 def _read(
-    store: EpisodeStore, names: Sequence[str], indices: Sequence[int], poses: np.ndarray, number: int
-) -> Episode:
+    store: EpisodeStore, depth: EpisodeStore, names: Sequence[str], indices: Sequence[int], poses: np.ndarray,
+    number: int,
+) -> Episode:  # fmt: skip
     ends = store.ends
     first, last = int(ends[number - 1]) if number else 0, int(ends[number])
 
     def pictures() -> Iterator[Picture]:
-        depth_mm = store.steps("depth_mm", first, last)
+        depth_mm = depth.steps("depth_mm", first, last)
         rgb = store.steps("rgb", first, last) if "rgb" in store.fields else [None] * len(depth_mm)
         yield from zip(depth_mm, rgb, strict=True)
 

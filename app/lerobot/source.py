@@ -10,14 +10,16 @@ from ddgrasp.errors import UserError
 from evaluation.report.deployments import find
 
 
-def open_source(path: Path, objects: Sequence[str] = ()) -> Source:
-    """The episodes at `path`, those with `objects` alone if any are named.
+def open_source(path: Path, objects: Sequence[str] = (), noisy: Path | None = None) -> Source:
+    """The episodes at `path`, those with `objects` alone if any are named; `noisy`: generated depth for them.
 
     Raises:
-      UserError: there are none, none with these objects, or what is there is damaged.
+      UserError: there are none, none with these objects, what is there is damaged, or `noisy` is not theirs.
     """
     if (stage := demonstrations.find(path)) is not None:
-        return demonstrations.read(stage, objects)
+        return demonstrations.read(stage, objects, noisy)
+    if noisy is not None:
+        raise UserError(f"--noisy goes with demonstrations, and {path} has none: leave it out.")
     if found := find(path):
         return deployments.read(found, objects)
     raise UserError(
