@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rig.world import RigWorld
 
 WorldName = Literal["as it is", "meshes", "furniture", "dark table", "spring"]
-SightName = Literal["stereo", "ideal", "full size"]
+SightName = Literal["stereo", "ideal", "full size", "holes", "values", "ripple", "mismatches"]
 _STREAM = 0x4F6666
 """Keeps the direction in which a camera is off apart from every other random number ("Off")."""
 
@@ -26,7 +26,8 @@ class Change:
     """meshes (the test rig's objects), furniture (its table's end, wall and clutter), dark table, or spring
     (the arm follows as the Franka driver lets it)."""
     sight: SightName = "stereo"
-    """stereo (matched at the policy's size), ideal (no errors), or full size (matched at 848x480)."""
+    """stereo (matched at the policy's size), ideal (no errors), full size (matched at 848x480), or one
+    kind of stereo's errors alone (rig/camera_errors.py)."""
     off: tuple[float, float] = (0.0, 0.0)
     """How far the camera stands from where the trial says, in a random direction: metres, degrees."""
 
@@ -55,11 +56,14 @@ class Change:
     def make_camera(self, config: Config, world: "RigWorld") -> "RigCamera":
         """The camera before `world`."""
         from rig.camera import make_camera
+        from rig.camera_errors import ERRORS, PartlyWrongCamera
 
         if self.sight == "full size":
             from deploy.full_size import FullSizeCamera
 
             return FullSizeCamera(world.model, config.record.stereo, config.world.profile)
+        if self.sight in ERRORS:
+            return PartlyWrongCamera(world.model, config.record.stereo, config.world.profile, self.sight)
         if self.world == "meshes":
             from rig.mesh_world import MeshCamera
 

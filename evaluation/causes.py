@@ -55,6 +55,15 @@ class Row:
 ROWS: dict[str, Row] = {
     REFERENCE: Row("development rig", "", Change()),
     IDEAL: Row("camera without errors", "camera noise", Change(sight="ideal")),
+    "holes": Row("camera's holes alone", "camera noise", Change(sight="holes"), against=IDEAL),
+    "values": Row("camera's values alone, no holes", "camera noise", Change(sight="values"), against=IDEAL),
+    "ripple": Row(
+        "values off by less than 1 px of disparity alone", "camera noise", Change(sight="ripple"),
+        against=IDEAL,
+    ),
+    "mismatches": Row(
+        "values off by 1 px or more alone", "camera noise", Change(sight="mismatches"), against=IDEAL,
+    ),
     "full_size": Row("stereo matched at 848x480", "camera resolution", Change(sight="full size")),
     "meshes": Row("meshes instead of primitives", "object shape", Change("meshes")),
     "off_2mm": Row("camera off by 2 mm and 0.2 degrees", "calibration", Change(off=(0.002, 0.2))),

@@ -82,6 +82,26 @@ def test_a_dark_table_returns_less_light():
     assert np.mean(dark[far] == 0) > np.mean(bright[far] == 0)
 
 
+def test_a_camera_that_makes_some_of_its_errors_makes_no_others():
+    world = reset(Change())
+
+    def seen(sight):
+        camera = Change(sight=sight).make_camera(CONFIG, world)
+        return camera.depth_mm(world.data, T_WORLD_CAM, np.random.default_rng(0), "can").astype(int)
+
+    clean, sensed = seen("ideal"), seen("stereo")
+    holes, values, ripple, mismatches = (seen(sight) for sight in ("holes", "values", "ripple", "mismatches"))
+    hole = sensed == 0
+    assert hole.any() and (ripple != clean).any() and (mismatches != clean).any()
+    np.testing.assert_array_equal(holes, np.where(hole, 0, clean))
+    np.testing.assert_array_equal(values, np.where(hole, clean, sensed))
+    np.testing.assert_array_equal(np.where(ripple != clean, ripple, mismatches), values)
+    disparity_px = [PROFILE.fx_px * PROFILE.baseline_m * 1e3 / np.maximum(mm, 1) for mm in (values, clean)]
+    off_px = np.abs(disparity_px[0] - disparity_px[1])
+    both = (values > 0) & (clean > 0)
+    assert off_px[both & (ripple != clean)].max() < 1.0 <= off_px[both & (mismatches != clean)].min()
+
+
 def test_the_spring_pulls_as_the_driver_s_does():
     stiffness, damping_s = np.linspace(400.0, 160.0, 7), 0.15
     world = SpringWorld(("cube",), CONFIG.world.random, stiffness, damping_s)

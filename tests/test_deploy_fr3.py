@@ -39,6 +39,9 @@ from rig.fr3.channel import Channel
 from rig.fr3.process import Fr3Rig
 from rig.fr3.scene import primitive
 
+pytestmark = pytest.mark.flaky(reruns=2, only_rerun=["UDP receive: Timeout"])
+"""libfranka gives a server up that a busy machine kept from answering: -ra names what was tried again."""
+
 HOST = "127.0.0.11"
 BELOW_THE_TABLE = (0.15, -0.45, -0.2)
 """A floor for the grip point that somebody set wrong."""

@@ -32,6 +32,9 @@ from rig.fr3 import scene
 from rig.fr3.picture import of_scene
 from rig.fr3.process import Fr3Rig
 
+pytestmark = pytest.mark.flaky(reruns=2, only_rerun=["UDP receive: Timeout"])
+"""libfranka gives a server up that a busy machine kept from answering: -ra names what was tried again."""
+
 PROFILE = contract.D455.scaled(0.25)
 T_WORLD_CAM = nominal_camera(PROFILE).T_world_cam
 STEREO = get_preset("demo").record.stereo

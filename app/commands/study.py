@@ -92,8 +92,8 @@ class StudyCauses:
     policy: Path
     """ONNX file that `ddgrasp export` wrote."""
     rows: tuple[str, ...] = ("all",)
-    """all, or of: ideal, full_size, meshes, off_2mm, off_10mm, furniture, dark_table, spring, fr3, test_rig.
-    What they are compared with is tried too."""
+    """all, or of: ideal, holes, values, ripple, mismatches, full_size, meshes, off_2mm, off_10mm, furniture,
+    dark_table, spring, fr3, test_rig. What they are compared with is tried too."""
     objects: tuple[str, ...] = ("all",)
     """Names, or all."""
     trials: Count = 10
