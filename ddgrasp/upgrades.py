@@ -8,7 +8,7 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 7
+VERSION = 8
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
@@ -123,6 +123,9 @@ _ADDED_AFTER_5 = {"student.training.edge_noise_px": 0.0}
 _ADDED_AFTER_6 = {"student.training.demo_stretch_steps": 0}
 """Fields that version 6 lacked, with what it did."""
 
+_ADDED_AFTER_7 = {"student.picture.fill_holes": False}
+"""Fields that version 7 lacked, with what it did."""
+
 _CLONE_ROUNDS = 8
 """What stands in a configuration that does not clone: version 2 wrote 0."""
 
@@ -152,6 +155,8 @@ def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
         _add(made, _ADDED_AFTER_5)
     if version < 7:
         _add(made, _ADDED_AFTER_6)
+    if version < 8:
+        _add(made, _ADDED_AFTER_7)
     return made
 
 
@@ -159,6 +164,8 @@ def downgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     """The JSON of a configuration of this version with the fields of an earlier one: what its hashes were
     over. Values of fields that it lacked are lost."""
     made = copy.deepcopy(dict(config))
+    if version < 8:
+        _drop(made, _ADDED_AFTER_7)
     if version < 7:
         _drop(made, _ADDED_AFTER_6)
     if version < 6:

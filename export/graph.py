@@ -116,6 +116,12 @@ def write_picture(
     relief = g.op("Sub", g.constant(table[None, None]), depth)
     relief = g.op("Div", relief, g.constant(preprocess.RELIEF_SCALE_M))
     relief, depth, valid = _write_resize(g, relief, depth, valid, window)
+    if student.picture.fill_holes:
+        size = (student.picture.height_px, student.picture.width_px)
+        relief = _write_filled(g, relief, valid, size)
+        depth = _write_filled(g, depth, valid, size) if "depth" in student.picture.channels else depth
+        some = g.op("ReduceMax", valid, g.integers([2, 3]))
+        valid = g.op("Expand", some, g.op("Shape", valid))
     relief = g.op("Clip", relief, g.constant(preprocess.RELIEF_MIN), g.constant(preprocess.RELIEF_MAX))
     planes = {"relief": g.mul(relief, valid), "valid": valid, "depth": depth}
     stacked = g.concat(
@@ -124,6 +130,34 @@ def write_picture(
     count = contract.DEPTH_FRAMES * len(student.picture.channels)
     picture = g.reshape(stacked, [0, count, student.picture.height_px, student.picture.width_px])
     return picture, (planes["relief"], planes["valid"])
+
+
+def _write_filled(g: GraphBuilder, plane: str, valid: str, size: tuple[int, int]) -> str:
+    """`preprocess.filled` of (B, 3, *size). Pools are means where there are sums: only quotients count."""
+    has = g.op("Greater", valid, g.constant(0.0))
+    known = g.op("Where", has, plane, g.constant(0.0))
+    rows, columns = size
+    if rows % 2 or columns % 2:
+        total, count = (g.op("ReduceSum", x, g.integers([2, 3])) for x in (known, valid))
+        return g.op("Where", has, known, g.op("Div", total, g.op("Max", count, g.constant(1.0))))
+    total, count = (g.op("AveragePool", x, kernel_shape=[2, 2], strides=[2, 2]) for x in (known, valid))
+    means, some = _write_mean(g, total, count, 4)
+    coarse = _write_filled(g, means, g.op("Cast", some, to=TensorProto.FLOAT), (rows // 2, columns // 2))
+    around = g.op(
+        "Resize", coarse, "", g.constant([1.0, 1.0, 2.0, 2.0]),
+        mode="linear", coordinate_transformation_mode="half_pixel",
+    )  # fmt: skip
+    total, count = (
+        g.op("AveragePool", x, kernel_shape=[3, 3], pads=[1] * 4, count_include_pad=1) for x in (known, valid)
+    )
+    beside, some = _write_mean(g, total, count, 9)
+    return g.op("Where", has, known, g.op("Where", some, beside, around))
+
+
+def _write_mean(g: GraphBuilder, total: str, count: str, pixels: int) -> tuple[str, str]:
+    """Mean over the valid ones of `pixels`, and whether any is; `total` and `count` are means over all."""
+    some = g.op("Greater", count, g.constant(0.5 / pixels))
+    return g.op("Div", total, g.op("Max", count, g.constant(1.0 / pixels))), some
 
 
 def _write_resize(

@@ -1,7 +1,8 @@
 """Raw depth frames to the encoder's picture: clean, crop, resize, subtract the empty table.
 
 Every constant the exported graph needs (crop window, resize matrices, table depth) is computed here in
-NumPy, so that training and export share the numbers. Nothing is inpainted: invalid pixels stay invalid.
+NumPy, so that training and export share the numbers. Invalid pixels stay invalid, or are filled from around
+them (`student.picture.fill_holes`).
 """
 
 from typing import NamedTuple
@@ -137,6 +138,7 @@ def prepare_depth(
     Returns:
         (B, h, w, 3 * channels) float32, channels of the oldest frame first. relief is in
         [RELIEF_MIN, RELIEF_MAX] and 0 where invalid; valid is 0 or 1; depth is in metres, 0 where invalid.
+        With `fill_holes` all of a frame is valid, unless none of it is.
     """
     expected = (contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
     if depth_m.shape[1:] != expected:
@@ -148,10 +150,43 @@ def prepare_depth(
     valid = (depth > 0).astype(jnp.float32)
     relief = (table[:, None] - depth) / RELIEF_SCALE_M
     relief, depth, valid = _resize_masked(relief, depth, valid, window, "depth" in config.picture.channels)
+    if config.picture.fill_holes:
+        relief = filled(relief, valid)
+        depth = filled(depth, valid) if "depth" in config.picture.channels else depth
+        valid = jnp.broadcast_to(valid.max((2, 3), keepdims=True), valid.shape)
     planes = {"relief": jnp.clip(relief, RELIEF_MIN, RELIEF_MAX) * valid, "valid": valid, "depth": depth}
     stacked = jnp.stack([planes[name] for name in config.picture.channels], axis=-1)  # (B, 3, h, w, C)
     picture = jnp.moveaxis(stacked, 1, 3)
     return picture.reshape(*picture.shape[:3], -1)
+
+
+def filled(
+    plane: Float32[AnyArray, "B F h w"], valid: Float32[AnyArray, "B F h w"]
+) -> Float32[jax.Array, "B F h w"]:
+    """`plane` where `valid` (0 or 1), elsewhere what is nearest: the mean of the valid among the eight pixels
+    beside it, where there are none that of the eight 2x2 blocks beside it, and so on, interpolated linearly
+    between blocks (after pull-push, Gortler et al. 1996). 0 if nothing is valid.
+    """
+    known = jnp.where(valid > 0, plane, 0.0)
+    rows, columns = plane.shape[2:]
+    if rows % 2 or columns % 2:
+        total, count = (x.sum((2, 3), keepdims=True) for x in (known, valid))
+        return jnp.where(valid > 0, known, total / jnp.maximum(count, 1.0))
+    blocks = (*plane.shape[:2], rows // 2, 2, columns // 2, 2)
+    total, count = (x.reshape(blocks).sum((3, 5)) for x in (known, valid))
+    coarse = filled(total / jnp.maximum(count, 1.0), (count > 0).astype(jnp.float32))
+    along_rows = jnp.einsum("or,bfrc->bfoc", resize_matrix(rows // 2, rows), coarse)
+    around = jnp.einsum("pc,bfoc->bfop", resize_matrix(columns // 2, columns), along_rows)
+    total, count = _sum_3x3(known), _sum_3x3(valid)
+    around = jnp.where(count > 0, total / jnp.maximum(count, 1.0), around)
+    return jnp.where(valid > 0, known, around)
+
+
+def _sum_3x3(x: AnyArray) -> jax.Array:
+    """(B, F, h, w) over every pixel and those beside it; there is nothing beyond the border."""
+    x = jnp.pad(x, ((0, 0), (0, 0), (1, 1), (1, 1)))
+    x = x[:, :, :-2] + x[:, :, 1:-1] + x[:, :, 2:]
+    return x[..., :-2] + x[..., 1:-1] + x[..., 2:]
 
 
 def _cut(

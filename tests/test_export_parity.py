@@ -37,7 +37,7 @@ OPTIONS = {
     "keypoints, resized, floats, padded cells": (
         replace(
             SMALL,
-            picture=replace(SMALL.picture, height_px=40, width_px=52),
+            picture=replace(SMALL.picture, height_px=40, width_px=52, fill_holes=True),
             encoder=replace(SMALL.encoder, output_stride=16, stage_blocks=(1, 1, 1)),
         ),
         ExportConfig(depth_dtype="float32_m", ddim_steps=4),
@@ -47,7 +47,13 @@ OPTIONS = {
             SMALL,
             encoder=replace(SMALL.encoder, pooling="tokens", stem="conv7", keypoints=2),
             head=replace(SMALL.head, conditioning="concat", features_to_head=True),
-            picture=replace(SMALL.picture, channels=("depth", "relief", "valid"), height_px=48, width_px=64),
+            picture=replace(
+                SMALL.picture,
+                channels=("depth", "relief", "valid"),
+                height_px=48,
+                width_px=64,
+                fill_holes=True,
+            ),
             hand_view=replace(SMALL.hand_view, pitch_m=0.002),
         ),
         ExportConfig(depth_dtype="float32_m"),

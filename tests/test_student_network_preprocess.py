@@ -71,6 +71,30 @@ def test_invalid_readings_change_nothing_but_their_own_pixels(config):
     assert np.all(dirty[..., 0][~valid] == 0.0)
 
 
+FILLED = replace(CONFIG, picture=replace(CONFIG.picture, fill_holes=True))
+
+
+def test_holes_are_filled_from_around_them_and_nothing_else_changes():
+    depth = TABLE.copy()
+    depth[60:120, 120:200] -= 0.05  # a plateau of relief 0.5
+    spoilt = depth.copy()
+    spoilt[80:100, 150:170] = 0.0
+    spoilt[:, :100] = np.nan
+    whole = np.asarray(preprocess.prepare_depth(frames_of(depth), None, PROFILE, FILLED))
+    np.testing.assert_array_equal(whole, preprocess.prepare_depth(frames_of(depth), None, PROFILE, CONFIG))
+    made = np.asarray(preprocess.prepare_depth(frames_of(spoilt), None, PROFILE, FILLED))
+    given = np.asarray(preprocess.prepare_depth(frames_of(spoilt), None, PROFILE, CONFIG))
+    assert np.all(made[..., 1::2] == 1.0)
+    has = given[..., 1] == 1.0
+    np.testing.assert_array_equal(made[..., 0][has], given[..., 0][has])
+    # Amid the plateau nothing but the plateau is near; left of column 100 it is as far as the table.
+    np.testing.assert_allclose(made[0, 80 - 34 : 100 - 34, 150 - 87 : 170 - 87, 0], 0.5, atol=1e-5)
+    left = made[0, :, : 100 - 87, 0]
+    assert np.isfinite(left).all() and 0.0 <= left.min() and left.max() <= 0.5 + 1e-5
+    nothing = np.zeros_like(TABLE)
+    assert not np.asarray(preprocess.prepare_depth(frames_of(nothing), None, PROFILE, FILLED)).any()
+
+
 def test_resized_pixel_with_more_hole_than_surface_is_invalid():
     depth = TABLE.copy()
     depth[:, 150:] = 0.0

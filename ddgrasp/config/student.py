@@ -52,6 +52,9 @@ class PictureConfig(Section, name="student.picture"):
     """Nearer readings are treated as invalid."""
     max_depth_m: _Metres = 2.5
     """Farther readings are treated as invalid."""
+    fill_holes: bool = False
+    """Fill invalid pixels from around them, inside the network: it sees surfaces then, and not the shape of a
+    camera's holes."""
 
     def check(self) -> None:
         """See `Section.check`."""
