@@ -62,7 +62,7 @@ DEBUG = Config(
     record=RecordConfig(trajectories=2, frames=12),
     ddg=_DEBUG_DDG,
     student=StudentConfig(
-        picture=PictureConfig(height_px=56, width_px=72),
+        picture=PictureConfig(height_px=56, width_px=72, fill_holes=True),
         encoder=EncoderConfig(width=8, keypoints=8),
         hand_view=HandViewConfig(size_px=16, pitch_m=0.008, width=8, blocks=1),
         head=HeadConfig(width=32, blocks=1, train_steps=4, batch_size=16),
@@ -97,6 +97,7 @@ DEMO = Config(
     ddg=DDGConfig(training=DDGTrainingConfig(steps=1000)),
     student=StudentConfig(
         init_from="pretrained/student",
+        picture=PictureConfig(fill_holes=True),
         training=StudentTrainingConfig(learning_rate=3e-4, steps=200),
         poses=PosesConfig(rounds=2, steps=500),
         dagger=DaggerConfig(rounds=1, episodes=48, steps=200),
@@ -115,6 +116,7 @@ LAPTOP = Config(
     record=RecordConfig(trajectories=80),
     ddg=DDGConfig(training=DDGTrainingConfig(steps=1200), sampling=SamplingConfig(sampler="progressive")),
     student=StudentConfig(
+        picture=PictureConfig(fill_holes=True),
         training=StudentTrainingConfig(steps=1500, clean_share=0.3),
         dagger=DaggerConfig(rounds=2, episodes=48, steps=400),
         head=HeadConfig(train_steps=3000),
@@ -206,7 +208,7 @@ PAPER = Config(
     record=RecordConfig(trajectories=80),
     ddg=_PAPER_DDG,
     student=StudentConfig(
-        picture=PictureConfig(height_px=224, width_px=288),
+        picture=PictureConfig(height_px=224, width_px=288, fill_holes=True),
         encoder=EncoderConfig(stem="conv7", width=64, stage_blocks=(2, 2, 2, 2), output_stride=16),
         head=HeadConfig(features_to_head=True, train_steps=20_000),
         training=StudentTrainingConfig(action_weight=1.0, steps=40_000, batch_size=256, crop_shift_px=12),
@@ -231,8 +233,9 @@ prior: inverse depth, holes filled, where the paper has Video Depth Anything: it
 sampler: DPM-Solver with 10 evaluations, where the paper goes through all K steps: 100 times the time.
 encoder: ResNet-18 from random numbers, where the paper's starts from ImageNet's weights, for the same reason
     (--student.encoder.weights weights/resnet18); its last stage keeps stride 16, and keypoints pool it.
-student: sees relief over the table instead of depth, and has a hand view, privileged losses and DAgger, which
-    the paper has not: perception to 5 mm is what decides whether it grasps (docs/student.md).
+student: sees relief over the table instead of depth, its holes filled from around them, and has a hand view,
+    privileged losses and DAgger, which the paper has not: perception to 5 mm is what decides whether it
+    grasps (docs/student.md).
 crops: shifted by up to 12 pixels around the window's place, since the camera's place is known here.
 teacher: networks, number of environments and steps are not in the paper; ours for its 95 %.
 """

@@ -64,10 +64,11 @@ def test_the_main_table_is_the_paper_s_with_hand_made_noise_off():
         made = rows.row_config(shared, ROWS[name])
         assert made.student.training.disparity_noise_px == 0.0 and made.ddg == LAPTOP.ddg
         assert made.student.depth_source == ROWS[name].source
-        same = replace(
-            made.student, depth_source="learned", training=LAPTOP.student.training
-        )  # the recipe is one
-        assert same == LAPTOP.student
+        recipe = LAPTOP.student  # one for all, but for who fills the holes
+        assert not made.student.picture.fill_holes
+        assert recipe == replace(
+            made.student, depth_source="learned", training=recipe.training, picture=recipe.picture
+        )
     assert {name: ROWS[name].depth for name in TABLES["main"].rows if ROWS[name].depth != "recorded"} == {
         "inpaint": "inpaint",
         "monocular": "monocular",
@@ -109,6 +110,14 @@ def test_ripple_and_the_paper_s_generator_are_one_difference_each():
         rows.row_config(still, ROWS["ddg_ripple"])
 
 
+def test_a_filled_row_differs_from_its_own_in_who_fills_the_holes():
+    shared = rows.shared_config(LAPTOP)
+    for name in ("sim_gt", "rand_noise", "ddg"):
+        plain, filled = (rows.row_config(shared, ROWS[row]) for row in (name, f"{name}_filled"))
+        picture = replace(plain.student.picture, fill_holes=True)
+        assert filled == replace(plain, student=replace(plain.student, picture=picture))
+
+
 def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
     def student(name: str, init_from: str = "", **training) -> str:
         config = replace(LAPTOP.student, depth_source="ideal", init_from=init_from)
@@ -138,7 +147,7 @@ def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
 def test_rows_are_chosen_by_name_or_by_table():
     assert rows.chosen((), ("main",)) == TABLES["main"].rows
     assert rows.chosen(("ddg", "sim_gt"), ("main",)) == ("sim_gt", "ddg")
-    assert set(rows.chosen((), ("main", "ripple", "grafting"))) == set(ROWS)
+    assert set(rows.chosen((), ("main", "ripple", "filled", "grafting"))) == set(ROWS)
 
 
 # --- tables --------------------------------------------------------------------------------------

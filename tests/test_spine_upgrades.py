@@ -16,13 +16,17 @@ from deploy.stage import STAGE, TrialLog
 ROOT = Path(__file__).parents[1]
 
 
-def _without_latch(config):
-    """`config` as it was before version 5: a closing of the gripper could be taken back."""
+def _as_before(config):
+    """`config` as it was before versions 5 and 8: a closing of the gripper could be taken back, and holes
+    stayed holes."""
     head = dataclasses.replace(config.student.head, closing_steps=0)
-    return dataclasses.replace(config, student=dataclasses.replace(config.student, head=head))
+    picture = dataclasses.replace(config.student.picture, fill_holes=False)
+    return dataclasses.replace(
+        config, student=dataclasses.replace(config.student, head=head, picture=picture)
+    )
 
 
-CONFIG = _without_latch(PRESETS["camera"])
+CONFIG = _as_before(PRESETS["camera"])
 FLAT = upgrades.downgraded(to_json(CONFIG), 1)
 ALL_STAGES = [stage.name for stage in (*STAGES, *ON_REQUEST)]
 
@@ -46,7 +50,7 @@ def of_version_2(name: str) -> dict:
 def test_version_1_and_back_loses_nothing(name):
     value = of_version_2(name)
     if name not in ("paper", "ppo", "ppo_paper"):  # these use fields that version 2 lacked
-        assert value == json.loads(json.dumps(to_json(_without_latch(PRESETS[name]))))
+        assert value == json.loads(json.dumps(to_json(_as_before(PRESETS[name]))))
     flat = json.loads(json.dumps(upgrades.downgraded(value, 1)))
     assert {"train_steps", "widths", "prior", "sample_batch"} <= flat["ddg"].keys()
     assert {"input_height_px", "head_batch_size", "dagger_teacher_share"} <= flat["student"].keys()
@@ -77,7 +81,7 @@ def test_the_paper_presets_picture_of_version_1_becomes_one_that_an_encoder_take
     flat = upgrades.downgraded(to_json(PRESETS["paper"]), 1)
     flat["student"] |= {"input_height_px": 225, "input_width_px": 290}
     student = artifacts.config_from_json(upgrades.upgraded(flat, 1)).student
-    assert student == _without_latch(PRESETS["paper"]).student
+    assert student == _as_before(PRESETS["paper"]).student
 
 
 @pytest.mark.parametrize(

@@ -24,9 +24,11 @@ class StudyTable2(FromPreset):
 
     rows: tuple[str, ...] = ()
     """Rows by name, instead of whole tables: sim_gt, rand_noise, inpaint, monocular, ddg_no_graft, ddg,
-    upper_bound, sim_gt_ripple, rand_noise_ripple, ddg_ripple, paper_ddg_no_graft, paper_ddg."""
+    upper_bound, sim_gt_ripple, rand_noise_ripple, ddg_ripple, sim_gt_filled, rand_noise_filled, ddg_filled,
+    paper_ddg_no_graft, paper_ddg."""
     table: tuple[str, ...] = ("main",)
-    """main (hand-made noise off), ripple (off and on), grafting (with the paper's own generator)."""
+    """main (hand-made noise off), ripple (off and on), filled (holes as recorded, and filled by
+    the student), grafting (with the paper's own generator)."""
     trials: Count = 50
     """How many with every object, the same for every row."""
     objects: tuple[str, ...] = ("all",)

@@ -36,11 +36,13 @@ class Row:
     the last two as much as the recipe has."""
     paper_generator: bool = False
     """Whether the generator is the paper's: depth itself, uniform weights."""
+    filled: bool = False
+    """Whether its student fills holes by itself (`student.picture.fill_holes`), in training as on the rig."""
 
     @property
     def student(self) -> str:
         """Name of the student that it needs, the same for rows that train alike."""
-        parts = (self.source, "paper" * self.paper_generator, "ripple" * self.ripple)
+        parts = (self.source, "paper" * self.paper_generator, "ripple" * self.ripple, "filled" * self.filled)
         return "_".join(part for part in parts if part)
 
 
@@ -65,6 +67,9 @@ ROWS: dict[str, Row] = {
     "sim_gt_ripple": Row("Sim GT, ripple", "ideal", ripple=True),
     "rand_noise_ripple": Row("Rand Noise, ripple", "dextrah", ripple=True),
     "ddg_ripple": Row("DDG, ripple", "learned", ripple=True),
+    "sim_gt_filled": Row("Sim GT, holes filled", "ideal", filled=True),
+    "rand_noise_filled": Row("Rand Noise, holes filled", "dextrah", filled=True),
+    "ddg_filled": Row("DDG, holes filled", "learned", filled=True),
     "paper_ddg_no_graft": Row(
         "Paper's generator without grafting", "learned_ungrafted", paper_generator=True
     ),
@@ -80,6 +85,11 @@ TABLES: dict[str, Table] = {
         "Hand-made ripple, off and on",
         "ddg",
         ("sim_gt", "sim_gt_ripple", "rand_noise", "rand_noise_ripple", "ddg", "ddg_ripple"),
+    ),
+    "filled": Table(
+        "Holes as recorded, and filled by the student",
+        "ddg_filled",
+        ("sim_gt", "sim_gt_filled", "rand_noise", "rand_noise_filled", "ddg", "ddg_filled"),
     ),
     "grafting": Table(
         "Grafting, with the paper's generator", "paper_ddg", ("paper_ddg_no_graft", "paper_ddg")
@@ -152,7 +162,8 @@ def row_config(shared: Config, row: Row) -> Config:
     training = shared.student.training
     if not row.ripple:
         training = replace(training, **dict.fromkeys(HAND_MADE, 0.0))
-    student = replace(shared.student, depth_source=row.source, training=training)
+    picture = replace(shared.student.picture, fill_holes=row.filled)
+    student = replace(shared.student, depth_source=row.source, training=training, picture=picture)
     ddg = paper_generator(shared.ddg) if row.paper_generator else shared.ddg
     return replace(shared, student=student, ddg=ddg)
 
