@@ -12,7 +12,7 @@ VERSION = 8
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
-edges. 6: demos are trained on from their beginning."""
+edges. 6: demos are trained on from their beginning. 7: a student leaves holes as they are."""
 
 VERSION_FIELD = "manifest_version"
 
