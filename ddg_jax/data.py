@@ -189,12 +189,14 @@ class Batch:
 def make_batch(frames: Frames, config: DDGConfig, seed: int, step: int) -> Batch:
     """The training batch of `step`: random frames, half of them upside down, their prior jittered.
 
+    A network that knows where it is (`ddg.unet.position`) sees all of them upright.
+
     A function of (seed, step) alone, so that a resumed run sees the batches an uninterrupted one would.
     Frames are never mirrored left to right: stereo shadows lie on one side.
     """
     rng = np.random.default_rng((seed, step))
     chosen = rng.integers(len(frames), size=config.training.batch_size)
-    flip = rng.random(config.training.batch_size) < 0.5
+    flip = rng.random(config.training.batch_size) < (0.0 if config.unet.position else 0.5)
     depth_m, surface_m, c = (
         np.where(flip[:, None, None], values[chosen, ::-1], values[chosen])
         for values in (frames.depth_m, frames.surface_m, frames.prior)

@@ -99,7 +99,8 @@ def _loaded(config: DDGConfig) -> Params:
     for name in (
         "depth.height_px", "depth.width_px", "depth.representation", "training.hole_loss", "depth.surface",
         "depth.near_m", "depth.far_m", "prior.source", "unet.space_to_depth", "unet.widths", "unet.blocks",
-        "unet.attention_heads", "diffusion.steps", "diffusion.schedule", "diffusion.log_snr_shift",
+        "unet.attention_heads", "unet.position", "diffusion.steps", "diffusion.schedule",
+        "diffusion.log_snr_shift",
     ):  # fmt: skip
         there, here = map(attrgetter(name), (generator.config, config))
         if there != here:

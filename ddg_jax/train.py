@@ -44,7 +44,11 @@ CHECKPOINTS = "checkpoints"
 def make_unet(config: DDGConfig) -> UNet:
     """The noise-prediction network of the configuration."""
     return UNet(
-        config.unet.widths, config.unet.blocks, config.unet.attention_heads, config.unet.space_to_depth
+        config.unet.widths,
+        config.unet.blocks,
+        config.unet.attention_heads,
+        config.unet.space_to_depth,
+        config.unet.position,
     )
 
 

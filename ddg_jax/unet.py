@@ -62,23 +62,31 @@ class UNet(nn.Module):
       blocks: residual blocks per level, in the encoder and again in the decoder.
       heads: attention heads in the middle (0: no attention).
       factor: space-to-depth before and depth-to-space after the network.
+      position: whether the network knows where in the picture it is, by a learnt embedding that is added to
+        what it sees (Dosovitskiy et al. 2021, section 3.1). It then takes maps of the size that it was
+        initialised with. A camera's own defects stay at their pixels, wherever it looks: a gap in the
+        projector's pattern, dust, a corner that the lens leaves dark.
     """
 
     widths: Sequence[int]
     blocks: Sequence[int]
     heads: int
     factor: int
+    position: bool = False
 
     @nn.compact
     def __call__(
         self, x_k: Float[AnyArray, "B H W C"], c: Float[AnyArray, "B H W"], step: Int[AnyArray, " B"]
     ) -> Float32[Array, "B H W C"]:
-        """x_k (B, H, W, C), c (B, H, W), step (B,) int -> (B, H, W, C) float32. Any H, W."""
+        """x_k (B, H, W, C), c (B, H, W), step (B,) int -> (B, H, W, C) float32."""
         height, width, maps = x_k.shape[1:]
         both = self._padded(jnp.concatenate([x_k, c[..., None]], axis=-1))
         folded = space_to_depth(both, self.factor)
         time = self._time_embedding(step)
-        h, skips = self._encode(nn.Dense(self.widths[0])(folded), time)
+        h = nn.Dense(self.widths[0])(folded)
+        if self.position:
+            h = h + self.param("position", nn.initializers.zeros, h.shape[1:])
+        h, skips = self._encode(h, time)
         h = ResBlock(self.widths[-1])(h, time)
         if self.heads:
             h = SelfAttention(self.heads)(h)

@@ -8,11 +8,12 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 8
+VERSION = 9
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
-edges. 6: demos are trained on from their beginning. 7: a student leaves holes as they are."""
+edges. 6: demos are trained on from their beginning. 7: a student leaves holes as they are. 8: a
+generator does not know where in the picture it is."""
 
 VERSION_FIELD = "manifest_version"
 
@@ -126,6 +127,9 @@ _ADDED_AFTER_6 = {"student.training.demo_stretch_steps": 0}
 _ADDED_AFTER_7 = {"student.picture.fill_holes": False}
 """Fields that version 7 lacked, with what it did."""
 
+_ADDED_AFTER_8 = {"ddg.unet.position": False}
+"""Fields that version 8 lacked, with what it did."""
+
 _CLONE_ROUNDS = 8
 """What stands in a configuration that does not clone: version 2 wrote 0."""
 
@@ -157,6 +161,8 @@ def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
         _add(made, _ADDED_AFTER_6)
     if version < 8:
         _add(made, _ADDED_AFTER_7)
+    if version < 9:
+        _add(made, _ADDED_AFTER_8)
     return made
 
 
@@ -164,6 +170,8 @@ def downgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     """The JSON of a configuration of this version with the fields of an earlier one: what its hashes were
     over. Values of fields that it lacked are lost."""
     made = copy.deepcopy(dict(config))
+    if version < 9:
+        _drop(made, _ADDED_AFTER_8)
     if version < 8:
         _drop(made, _ADDED_AFTER_7)
     if version < 7:

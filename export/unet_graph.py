@@ -30,7 +30,10 @@ class UNetWriter:
         self.first = dense.next("Dense")
         self.names = dense
         self.prior = self._folded(c)
-        self.prior_hidden = self._pointwise(self.prior, self._first_rows(of_prior=True), self.first["bias"])
+        hidden = self._pointwise(self.prior, self._first_rows(of_prior=True), self.first["bias"])
+        if self.config.position:
+            hidden = g.add(hidden, g.constant(np.moveaxis(np.asarray(params["position"]), -1, 0)[None]))
+        self.prior_hidden = hidden
 
     def write(self, x: str, step: str) -> str:
         """x (B, C, H, W) and the diffusion step (1, 1) float to the network's output (B, C, H, W)."""

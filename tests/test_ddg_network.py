@@ -14,6 +14,20 @@ from ddgrasp.config import DDGConfig, DDGDepthConfig, GraftConfig
 from ddgrasp.errors import UserError
 
 
+def test_a_unet_with_positions_sees_where_it_is_and_begins_without():
+    plain, positioned = (UNet((8, 8), (0, 1), 0, 2, position) for position in (False, True))
+    x, c, step = jnp.zeros((1, 20, 24, 2)), jnp.zeros((1, 20, 24)), jnp.zeros(1, int)
+    params = positioned.init(jax.random.key(0), x, c, step)["params"]
+    nowhere = params["position"]
+    assert nowhere.shape == (10, 12, 8) and not nowhere.any()
+    params = jax.tree.map(lambda p: p + 0.05, {name: params[name] for name in params if name != "position"})
+    blind = plain.apply({"params": params}, x, c, step)
+    same = positioned.apply({"params": params | {"position": nowhere}}, x, c, step)
+    np.testing.assert_array_equal(same, blind)
+    there = positioned.apply({"params": params | {"position": nowhere.at[2, 3].set(1.0)}}, x, c, step)
+    assert np.abs(there - blind)[0, 4:6, 6:8].min() > 1e-3
+
+
 def test_unet_takes_any_size_and_sees_prior_and_step():
     net = UNet((8, 8), (0, 1), 2, 4)
     x = jax.random.normal(jax.random.key(0), (2, 18, 21, 2))

@@ -55,6 +55,7 @@ OPTIONS = {
         unet=replace(SMALL.unet, attention_heads=0),
         sampling=SamplingConfig(sampler="ddpm", steps=5, spacing="trailing"),
     ),
+    "a network that knows where it is": replace(SMALL, unet=replace(SMALL.unet, position=True)),
     "distilled": replace(SMALL, sampling=SamplingConfig(sampler="progressive", steps=2)),
 }
 

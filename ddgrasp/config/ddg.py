@@ -121,6 +121,9 @@ class UNetConfig(Section, name="ddg.unet"):
     """Residual blocks per level, in the encoder and again in the decoder; two more sit in the middle."""
     attention_heads: Annotated[int, Range(0, 1024)] = 4
     """Attention heads in the middle; 0 turns attention off."""
+    position: bool = False
+    """The network knows where in the picture it is, and so learns what a camera always does at the same
+    pixels; frames are not turned upside down in training then."""
 
     def check(self) -> None:
         """See `Section.check`."""
