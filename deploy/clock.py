@@ -6,6 +6,8 @@ from deploy.interfaces import RobotError, TimedRobot
 
 _SPIN_S = 0.0005
 """The last half millisecond is waited for awake: the scheduler wakes sleepers tens of microseconds late."""
+_LOOK_S = 0.5
+"""A robot's time is looked at so often on a long wait, so that one that stands still is not waited for."""
 
 
 class RealClock:
@@ -60,7 +62,8 @@ class RobotClock:
         """
         now_s, moved_at = self.now(), time.monotonic()
         while now_s < deadline_s:
-            time.sleep(max(deadline_s - now_s - _SPIN_S, _SPIN_S))  # robots are not faster than the machine
+            # Robots are not faster than the machine.
+            time.sleep(min(max(deadline_s - now_s - _SPIN_S, _SPIN_S), _LOOK_S))
             before_s, now_s = now_s, self.now()
             if now_s > before_s:
                 moved_at = time.monotonic()

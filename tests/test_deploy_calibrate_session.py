@@ -4,6 +4,7 @@ The robot is an arm without inertia, the imager draws the board where the arm ho
 """
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ from ddgrasp import policy_metadata
 from ddgrasp.config import RandomConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
-from deploy import kinematics
+from deploy import clock, kinematics
 from deploy.calibration import poses, session, standing
 from deploy.calibration.drive import Driver
 from deploy.calibration.hand_eye import invert, project, rotation_spread_rad
@@ -120,7 +121,8 @@ def planned():
 
 @pytest.fixture
 def bench(monkeypatch, planned):
-    """The arm and its imager under the names that the command line knows."""
+    """The arm and its imager under the names that the command line knows; waiting takes no time."""
+    monkeypatch.setattr(clock, "time", SimpleNamespace(sleep=lambda s: None, monotonic=time.monotonic))
     monkeypatch.setattr(poses, "plan", lambda bench, count, *rest: planned[:count])
     arm = Arm()
     imager = DrawnImager(arm)
