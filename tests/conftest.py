@@ -30,8 +30,9 @@ if tuple(map(int, version("jax").split(".")[:2])) < (0, 12):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 
 SLOW = (
-    "test_flow_debug", "test_teacher_devices", "test_teacher_learner", "test_world_physics", "test_gpu_check",
-    "test_evaluation_score", "test_teacher_limits", "test_teacher_trials", "test_foundation_depth",
+    "test_flow_debug", "test_deploy_fr3", "test_teacher_devices", "test_evaluation_score",
+    "test_teacher_improves", "test_deploy_fr3_record", "test_world_physics", "test_programs_lower",
+    "test_student_training", "test_ddg_training", "test_gpu_check", "test_teacher_learner",
 )  # fmt: skip
 """Files that take longest come first: two workers end together if what they share out last is small."""
 

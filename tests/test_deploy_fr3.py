@@ -284,7 +284,9 @@ def test_limits_are_the_fr3_s_and_the_filter_keeps_them_before_the_arm_would(tmp
 
 
 def test_an_arm_that_gets_no_further_command_brakes_by_itself(rig):
-    robot, clock = connect(config_for(HOST), lambda question: None)
+    config = config_for(HOST)  # other tests left the arm elsewhere: half a minute away at a start's pace
+    quick = replace(config, franka=replace(config.franka, start_dynamics=0.3))
+    robot, clock = connect(quick, lambda question: None)
     robot.start()
     before = np.array(rig.channel.ask("state")["q_rad"])
     step = np.array([0.08, 0, 0, 0, 0, 0, 0])
