@@ -24,6 +24,8 @@ from deploy.loop import Step
 from rig.film import Film, contact_sheet
 
 STEPS_FILE, REPORT_FILE, FILM_FILE = "steps.jsonl", "report.json", "film.png"
+ENDED = {True: "lifted and held", False: "failed", None: "not judged"}
+"""How a deployment ended, in words, by its success."""
 FILM_COLUMNS = 12
 """Most pictures of the film strip: what comes later is thinned out evenly."""
 

@@ -25,7 +25,7 @@ from deploy.dry_run import DryRun
 from deploy.interfaces import Clock, Robot, TimedRobot
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
-from deploy.record import REPORT_FILE, DeploymentRecord, verdict
+from deploy.record import ENDED, REPORT_FILE, DeploymentRecord, verdict
 from deploy.setup import loop_settings, safety_filter, speed_notice
 
 
@@ -79,6 +79,8 @@ def _run(
         about["object"] = name
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
     kept.finish(folder, report.as_dict(), success, about)
+    if finished:
+        say(f"verdict: {ENDED[success]}")
     say(f"report: {folder / REPORT_FILE}")
     if isinstance(driven, DryRun):
         path = folder / "dry-run.png"

@@ -46,13 +46,13 @@ def run(tmp_path, monkeypatch):
         tmp_path / "p.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.2)
     )
 
-    def deployed(camera=ColourCamera, **changes):
+    def deployed(camera=ColourCamera, say=lambda text: None, **changes):
         monkeypatch.setattr(
             session, "make_devices", lambda setup: (KinematicRobot(setup.clock), camera(setup.clock))
         )
         options = replace(SessionOptions(seconds=0.5, out=tmp_path / "kept"), **changes)
         before = set(options.out.glob("*"))
-        report = session.deploy(get_preset("debug"), policy, options, lambda text: None)
+        report = session.deploy(get_preset("debug"), policy, options, say)
         (folder,) = set(options.out.glob("*")) - before
         return report, folder
 
@@ -98,13 +98,16 @@ def test_a_person_says_how_it_ended(run, monkeypatch, answer, success):
     assert json.loads((folder / "report.json").read_text())["success"] is success
 
 
-def test_the_rig_judges_by_itself(run):
+@pytest.mark.parametrize(("success", "words"), [(True, "lifted and held"), (False, "failed")])
+def test_the_rig_judges_by_itself_and_says_so(run, success, words):
     class Judging(ColourCamera):
         def success(self):
-            return True
+            return success
 
-    _, folder = run(Judging, yes=True)
-    assert json.loads((folder / "report.json").read_text())["success"] is True
+    said = []
+    _, folder = run(Judging, said.append, yes=True)
+    assert json.loads((folder / "report.json").read_text())["success"] is success
+    assert f"verdict: {words}" in said
 
 
 def test_a_disk_that_takes_no_frames_stops_nothing(run, monkeypatch):

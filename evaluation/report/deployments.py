@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp.files import atomic_write_text
-from deploy.record import FILM_FILE, REPORT_FILE, STEPS_FILE
+from deploy.record import ENDED, FILM_FILE, REPORT_FILE, STEPS_FILE
 from evaluation import wilson
 from evaluation.report.html import REPORT_HTML, contents, film, heading, page, table
 
@@ -18,7 +18,6 @@ _NOTE = (
     "the arm stood still for want of a frame or a state. Frame to command: from a frame in hand to the "
     "command sent.</p>"
 )
-_ENDED = {True: "lifted and held", False: "failed", None: "not judged"}
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Deployment:
             return f"fault: {self.report['fault']}"
         if self.report.get("dry_run"):
             return "dry run"
-        return "interrupted" if self.report["interrupted"] else _ENDED[self.report["success"]]
+        return "interrupted" if self.report["interrupted"] else ENDED[self.report["success"]]
 
 
 def find(folder: Path) -> list[Deployment]:
