@@ -31,6 +31,9 @@ class SafetyLimits:
     """Largest step per control period, divided by the period; no more than the driver will let the arm do."""
     acceleration_rad_s2: tuple[float, ...] = contract.JOINT_ACCELERATION_LIMIT_RAD_S2
     """Largest change between two steps that follow each other, divided by the period squared."""
+    braking_rad_s2: tuple[float, ...] | None = None
+    """How hard a joint brakes before its position limit (`contract.Arm`); None for one that stops at once."""
+    braking_reserve_rad_s: tuple[float, ...] = (0.0,) * 7
     workspace_lower_m: tuple[float, float, float] = (0.15, -0.45, 0.012)
     workspace_upper_m: tuple[float, float, float] = (0.80, 0.45, 0.80)
     """Box for the point between the finger pads, robot base frame; 12 mm = fingertips on the table."""
@@ -124,7 +127,20 @@ class SafetyFilter:
         # A joint measured outside its range may only come back, and no faster than the limit above.
         room_down = np.minimum(np.array(limits.lower_rad) - q_rad, largest)
         room_up = np.maximum(np.array(limits.upper_rad) - q_rad, -largest)
+        room_down, room_up = -self._braked(-room_down), self._braked(room_up)
         return self._noted(np.clip(step, room_down, room_up), step, "joint_position", causes)
+
+    def _braked(self, room_rad: np.ndarray) -> np.ndarray:
+        """(7,) the longest step towards a limit `room_rad` (7,) away after which the joint can still stop.
+
+        The step's speed v obeys v <= -c + sqrt(2 a (room - v dt)): braking a, reserve c, period dt.
+        """
+        if self.limits.braking_rad_s2 is None:
+            return room_rad
+        a, c = np.array(self.limits.braking_rad_s2), np.array(self.limits.braking_reserve_rad_s)
+        dt = self.limits.period_s
+        root = np.sqrt(np.maximum((c + a * dt) ** 2 - c**2 + 2.0 * a * room_rad, 0.0))
+        return np.minimum(room_rad, np.maximum(root - (c + a * dt), 0.0) * dt)
 
     def _limit_workspace(self, q_rad: np.ndarray, step: np.ndarray, causes: list[str]) -> np.ndarray:
         """(7,) `step`, changed so that the grip point ends in the box, or no further outside than it is."""

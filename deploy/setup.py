@@ -30,6 +30,8 @@ def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim"
         ),
         velocity_rad_s=speed,
         acceleration_rad_s2=tuple(config.acceleration_scale * a for a in arm.joint_acceleration_rad_s2),
+        braking_rad_s2=arm.braking_rad_s2 if robot == "franka" else None,
+        braking_reserve_rad_s=arm.braking_reserve_rad_s,
         workspace_lower_m=config.workspace_lower_m,
         workspace_upper_m=config.workspace_upper_m,
         arm_lower_m=config.arm_lower_m,

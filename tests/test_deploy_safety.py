@@ -1,5 +1,7 @@
 """Every limit of the safety filter, and that each change is counted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -155,3 +157,21 @@ def test_non_finite_action_is_refused(bad, place):
     with pytest.raises(NonFiniteAction):
         filter_.target(HOME, values)
     assert filter_.counts.commands == 0
+
+
+def test_a_joint_comes_to_its_limit_no_faster_than_it_can_brake():
+    """At full speed from 0.5 rad away, an arm that does as it is told keeps the FR3's curve in every step."""
+    limits = replace(
+        FREE,
+        upper_rad=contract.FR3.joint_upper_rad,
+        braking_rad_s2=contract.FR3.braking_rad_s2,
+        braking_reserve_rad_s=contract.FR3.braking_reserve_rad_s,
+    )
+    filter_, q = SafetyFilter(limits, 0.1), HOME.copy()
+    q[0] = contract.FR3.joint_upper_rad[0] - 0.5
+    for _ in range(20):
+        before, (q, _, _) = q[0], filter_.target(q, action(1.0))
+        room = contract.FR3.joint_upper_rad[0] - q[0]
+        assert (q[0] - before) / 0.1 <= max(-0.30 + np.sqrt(12.0 * room), 0.0) + 1e-9
+    assert 0.005 < room < 0.02
+    assert filter_.target(q, action(-1.0))[0][0] == pytest.approx(q[0] - 0.1), "away from it at once"
