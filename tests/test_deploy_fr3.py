@@ -27,6 +27,7 @@ from ddgrasp.config import DeployConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy.clock import RobotClock
+from deploy.devices.franka_hand import THREADS, WIDTH_PERIOD_S
 from deploy.devices.franka_robot import AT_START_RAD, FrankaRobot
 from deploy.devices.options import SessionOptions
 from deploy.dry_run import DryRun, draw
@@ -184,6 +185,10 @@ def test_a_close_can_be_aborted():
             narrowest = min(narrowest, width_m)
             clock.sleep_until(clock.now() + 0.01)
         robot.stop()
+        time.sleep(2 * WIDTH_PERIOD_S)
+        names = {thread.name for thread in threading.enumerate()}
+        assert THREADS not in names, "a thread is left to a gripper that goes"
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER, "libfranka's priority stayed with this thread"
     assert width_m >= 0.075 and 0.002 < narrowest < 0.06, "it opened without having closed first, or shut"
 
 
@@ -262,12 +267,14 @@ def test_dry_run_says_and_draws_what_it_would_send_and_moves_nothing(tmp_path, r
 
 
 def test_limits_are_the_fr3_s_and_the_filter_keeps_them_before_the_arm_would(tmp_path):
+    """From so far away that joint 4 comes at full speed: it has to brake in time, too."""
     near = HOME_RAD.copy()
-    near[3] = contract.FR3.joint_lower_rad[3] + 0.05
+    near[3] = contract.FR3.joint_lower_rad[3] + 0.35
     with Fr3Rig("127.0.0.14", primitive("cube"), q_rad=near) as rig:
         config = config_for(rig.host)
-        report = run_trial(tmp_path, config, joint_bias(j4=-1.0), steps=5)
-        assert report.fault == "" and report.safety.by_cause["joint_position"] >= 3
+        report = run_trial(tmp_path, config, joint_bias(j4=-1.0), steps=15)
+        assert report.fault == "" and report.safety.by_cause["joint_position"] >= 10
+        assert rig.channel.ask("state")["q_rad"][3] < contract.FR3.joint_lower_rad[3] + 0.06
         assert contract.PANDA.joint_lower_rad[3] < contract.FR3.joint_lower_rad[3]
         assert rig.channel.ask("state")["q_rad"][3] > contract.FR3.joint_lower_rad[3]
         robot, clock = connect(config)  # without the filter the arm itself refuses

@@ -10,6 +10,9 @@ SPEED_M_S = 0.1
 GRASP_ANY_WIDTH_M = contract.GRIPPER_MAX_WIDTH_M
 """franky's outer tolerance: a grasp of any width counts, as in simulation."""
 WIDTH_PERIOD_S = 0.03
+THREADS = "Franka Hand"
+END_S = 2.0
+"""Longest wait for the end of a command, and for that of one that was aborted."""
 
 
 class FrankaHand:
@@ -27,8 +30,9 @@ class FrankaHand:
         self._busy = False
         self._changed, self._stopping = threading.Event(), threading.Event()
         self._error: Exception | None = None
-        for work in (self._watch, self._act):
-            threading.Thread(target=self._guard, args=(work,), daemon=True).start()
+        self._acting = threading.Thread(target=self._guard, args=(self._act,), name=THREADS, daemon=True)
+        self._acting.start()
+        threading.Thread(target=self._guard, args=(self._watch,), name=THREADS, daemon=True).start()
 
     def width_m(self) -> float:
         """As the gripper last reported it. Raises what stopped it."""
@@ -45,10 +49,21 @@ class FrankaHand:
         if self._busy:
             threading.Thread(target=self._guard_once, args=(self._gripper.stop,), daemon=True).start()
 
-    def stop(self) -> None:
-        """End both threads, after what they are at; the gripper keeps its grip."""
+    def stop(self, connected: bool = True) -> None:
+        """End both threads, after what they are at; the gripper keeps its grip.
+
+        A command whose gripper goes away never returns: libfranka asks the closed socket again and again. So
+        one that lasts is aborted, not left behind. Where the connection has gone already (not `connected`)
+        nothing can be done.
+        """
         self._stopping.set()
         self._changed.set()
+        if not connected:
+            return
+        self._acting.join(END_S)
+        if self._acting.is_alive():
+            threading.Thread(target=self._guard_once, args=(self._gripper.stop,), daemon=True).start()
+            self._acting.join(END_S)
 
     def _guard(self, work: Callable[[], None]) -> None:
         while not self._stopping.is_set() and self._error is None:

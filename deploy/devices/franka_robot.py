@@ -22,7 +22,7 @@ from deploy import kinematics
 from deploy.devices import franka_faults
 from deploy.devices.franka_hand import FrankaHand
 from deploy.devices.franka_probe import check_arm
-from deploy.devices.franka_spring import FrankaSpring
+from deploy.devices.franka_spring import FrankaSpring, priority_kept
 from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotError, RobotState
 
@@ -79,9 +79,10 @@ class FrankaRobot:
         realtime = franky.RealtimeConfig
         kernel = realtime.Enforce if config.kernel == "realtime" else realtime.Ignore
         try:
-            self._arm = franky.Robot(
-                config.host, relative_dynamics_factor=config.dynamics, realtime_config=kernel
-            )
+            with priority_kept():
+                self._arm = franky.Robot(
+                    config.host, relative_dynamics_factor=config.dynamics, realtime_config=kernel
+                )
             self._prepare()
             gripper = franky.Gripper(config.host)
             if self._confirm is not None:
@@ -125,8 +126,6 @@ class FrankaRobot:
         Raises RobotError if the arm did not stop by itself before and cannot be told to.
         """
         hand, self._hand = self._hand, None
-        if hand is not None:
-            hand.stop()
         try:
             if self._arm is not None and self._moved and not self._faulted:
                 with self._reporting():
@@ -136,6 +135,8 @@ class FrankaRobot:
             if self._following is not None:
                 self._following.release()
             self._arm = self._following = None
+            if hand is not None:
+                hand.stop(connected=not self._faulted)
 
     def time_s(self) -> float | None:
         """See TimedRobot: the arm's own clock; None once the arm has failed."""

@@ -5,7 +5,10 @@ arm told to be somewhere else every 0.1 s either never gets there, since every p
 with hundreds of newtons on what it lands on; docs/hardware.md has both in numbers.
 """
 
+import contextlib
+import os
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -20,6 +23,23 @@ DAMPING_S = 0.15
 LATE = 1.5
 """Control periods for which a joint keeps its speed if no command follows; then it brakes."""
 _LOOK_S = 0.01
+
+
+@contextlib.contextmanager
+def priority_kept() -> Iterator[None]:
+    """This thread's scheduling stays what it is, on Linux.
+
+    libfranka gives a thread that connects or controls the highest real-time priority where it may, for good:
+    every thread started from there has it as well, and what computes keeps the machine from all others.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        yield
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameters)
 
 
 class FrankaSpring:
@@ -60,7 +80,8 @@ class FrankaSpring:
     def stop(self) -> None:
         """Brake, and return when the arm stands; its own control unit holds it then."""
         arm = self.release()
-        arm.move(self._franky.TorqueStopMotion())
+        with priority_kept():
+            arm.move(self._franky.TorqueStopMotion())
 
     def release(self) -> Any:
         """Let go of the arm, which is returned: a connection ends when nobody has it any more."""
