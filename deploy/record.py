@@ -93,8 +93,8 @@ class DeploymentRecord:
         if self._film:
             steps, rgb, depth_mm = zip(*self._film, strict=True)
             film = Film(steps, np.stack(rgb), np.stack(depth_mm))
-            outcome = {True: "success", False: "failure", None: "not judged"}[success]
-            atomic_write_bytes(folder / FILM_FILE, contact_sheet(film, f"{outcome} {report['fault']}"))
+            sheet = contact_sheet(film, f"{ENDED[success]} {report['fault']}")
+            atomic_write_bytes(folder / FILM_FILE, sheet)
 
     def _keep(self, index: int, rgb: np.ndarray, depth_mm: np.ndarray) -> None:
         """One of at most twice `FILM_COLUMNS` pictures, every second one dropped when there are more."""

@@ -79,7 +79,7 @@ def _run(
         about["object"] = name
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
     kept.finish(folder, report.as_dict(), success, about)
-    if finished:
+    if success is not None:
         say(f"verdict: {ENDED[success]}")
     say(f"report: {folder / REPORT_FILE}")
     if isinstance(driven, DryRun):

@@ -8,7 +8,7 @@ import pytest
 
 from ddg_jax import data, prior
 from ddgrasp import artifacts
-from ddgrasp.config import DDGConfig, DDGDepthConfig, DDGTrainingConfig, PriorConfig
+from ddgrasp.config import DDGConfig, DDGDepthConfig, DDGTrainingConfig, PriorConfig, UNetConfig
 from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
@@ -208,3 +208,18 @@ def test_recordings_of_another_contract_version_are_refused(recordings):
     path.write_text(path.read_text().replace('"contract_version": 1', '"contract_version": 99'))
     with pytest.raises(UserError, match="contract version 99"):
         load(recordings)
+
+
+@pytest.mark.parametrize("position", [False, True])
+def test_half_of_a_batch_is_upside_down_unless_the_network_knows_where_it_is(position):
+    depth = np.full((1, 8, 12), 1.0, np.float32)
+    depth[:, :4] = 2.0  # the upper half is farther
+    frames = data.Frames(depth, depth, np.where(depth > 1.5, -1.0, 1.0).astype(np.float16), np.zeros(1, int))
+    config = DDGConfig(
+        prior=PriorConfig(jitter=0.0),
+        unet=UNetConfig(position=position),
+        training=DDGTrainingConfig(batch_size=32),
+    )
+    priors = data.make_batch(frames, config, seed=0, step=0).c
+    turned = np.mean(priors[:, 0, 0] > 0)
+    assert turned == 0.0 if position else 0.3 < turned < 0.7

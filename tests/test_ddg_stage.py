@@ -161,6 +161,7 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
             {"training": dataclasses.replace(CONFIG.ddg.training, hole_loss="cross_entropy")},
             "ddg.training.hole_loss 'squared'.*'cross_entropy'",
         ),
+        ({"unet": dataclasses.replace(CONFIG.ddg.unet, position=True)}, "ddg.unet.position False.*True"),
     ):
         other = dataclasses.replace(config, ddg=dataclasses.replace(config.ddg, **change))
         with pytest.raises(UserError, match=message):

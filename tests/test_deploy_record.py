@@ -82,10 +82,11 @@ def test_two_in_a_second_are_two_recordings_of_one_folder(run, tmp_path):
 
 def test_an_interrupted_one_is_kept_as_far_as_it_went_and_not_judged(run, monkeypatch):
     monkeypatch.setattr(ColourCamera, "success", lambda self: False, raising=False)  # a rig knows
-    report, folder = run(lambda clock: ColourCamera(clock, fails_at=4), seconds=60.0)
+    said = []
+    report, folder = run(lambda clock: ColourCamera(clock, fails_at=4), said.append, seconds=60.0)
     assert report.interrupted and len(Recording.open(folder)) == 3
     kept = json.loads((folder / "report.json").read_text())
-    assert kept["interrupted"] and kept["success"] is None
+    assert kept["interrupted"] and kept["success"] is None and not any("verdict" in line for line in said)
     assert [deployment.ended for deployment in deployments.find(folder)] == ["interrupted"]
     assert json.loads((run()[1] / "report.json").read_text())["success"] is False
 

@@ -36,7 +36,7 @@ def _start(out: Path) -> subprocess.Popen:
 
 
 def _attempt(out: Path, log: Path) -> None:
-    """What `_start` starts, in a process that has imported everything already; both outputs go to `log`."""
+    """What `_start` starts, in a process that has imported all stages already; both outputs go to `log`."""
     os.chdir(ROOT)
     with log.open("w") as file:
         for stream in (1, 2):
@@ -61,19 +61,22 @@ def finished(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("flow")
     out, log = folder / "run", folder / "log.txt"
+    log.touch()
     forks = multiprocessing.get_context("forkserver")  # imports are half of such an attempt's time
     forks.set_forkserver_preload([stage.module for stage in pipeline.STAGES])
     kills = []
     for stage in pipeline.STAGES:
         process = forks.Process(target=_attempt, args=(out, log))
         process.start()
-        deadline = time.monotonic() + TIMEOUT_S
-        while not (out / stage.name / artifacts.STARTED).exists() and process.is_alive():
-            assert time.monotonic() < deadline, f"{stage.name} did not begin in time"
-            time.sleep(0.05)
-        time.sleep(KILL_AFTER_S)
-        process.kill()
-        process.join()
+        try:
+            deadline = time.monotonic() + TIMEOUT_S
+            while not (out / stage.name / artifacts.STARTED).exists() and process.is_alive():
+                assert time.monotonic() < deadline, f"{stage.name} did not begin in time"
+                time.sleep(0.05)
+            time.sleep(KILL_AFTER_S)
+        finally:
+            process.kill()
+            process.join()
         kills.append(_manifests(out))
         assert len(kills[-1]) >= len(kills) - 1, log.read_text()[-3000:]
     resumed = _start(out)
