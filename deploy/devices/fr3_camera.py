@@ -1,6 +1,7 @@
 """The FR3 rig's cameras as camera drivers: a D455 as it is run, and one that makes no errors."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -116,18 +117,16 @@ class Fr3Camera:
         from rig.fr3.channel import ChannelLost
 
         assert self._channel is not None and self._picture is not None
-        try:
-            self._channel.ask("slow", on=True)
-            asked_s = self._clock.now()
-            state = self._channel.ask("state")
+        with self._time_held():
+            try:
+                asked_s = self._clock.now()
+                state = self._channel.ask("state")
+            except ChannelLost as error:
+                raise CameraError(str(error)) from error
             self._judge(np.array(state["object_position_m"]))
             self._picture.pose(np.array(state["qpos"]))
             depth = self._sense(self._picture, self._T_world_cam, self._object)
-            frame = Frame(depth, asked_s, self.picture() if self._in_colour else None)
-            self._channel.ask("slow", on=False)
-        except ChannelLost as error:
-            raise CameraError(str(error)) from error
-        return frame
+            return Frame(depth, asked_s, self._colour() if self._in_colour else None)
 
     def stop(self) -> None:
         """Disconnect."""
@@ -141,19 +140,41 @@ class Fr3Camera:
         """See Judge; as of the last `read`, one for every control step."""
         return self._held_steps >= contract.HOLD_STEPS
 
+    @contextlib.contextmanager
+    def _time_held(self) -> Iterator[None]:
+        """The rig's time nearly stands still meanwhile: what takes long here is not the robot's doing.
+
+        That the rig is gone, whoever asks next for the arm or a frame hears.
+        """
+        from rig.fr3.channel import ChannelLost
+
+        assert self._channel is not None
+        try:
+            with contextlib.suppress(ChannelLost):
+                self._channel.ask("slow", on=True)
+            yield
+        finally:
+            with contextlib.suppress(ChannelLost):
+                self._channel.ask("slow", on=False)
+
+    def _colour(self) -> UInt8[np.ndarray, "H W 3"]:
+        assert self._picture is not None
+        return self._picture.rgb(pinhole(self._profile, self._T_world_cam))
+
     def _judge(self, object_m: np.ndarray) -> None:
         held = np.linalg.norm(object_m - contract.LIFT_TARGET_M) < contract.LIFT_TOLERANCE_M
         self._held_steps = self._held_steps + 1 if held else 0
 
     def picture(self) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour of the scene as it was last read, from the same place (for people)."""
-        assert self._picture is not None
-        return self._picture.rgb(pinhole(self._profile, self._T_world_cam))
+        with self._time_held():
+            return self._colour()
 
     def clean_mm(self) -> UInt16[np.ndarray, "H W"]:
         """See Simulated; as of the last `read`."""
         assert self._picture is not None
-        return to_millimetres(self._picture.depth_m(pinhole(self._profile, self._T_world_cam)))
+        with self._time_held():
+            return to_millimetres(self._picture.depth_m(pinhole(self._profile, self._T_world_cam)))
 
     def scene(self) -> "tuple[mujoco.MjModel, mujoco.MjData]":
         """See Staged; as of the last `read`."""
