@@ -29,9 +29,10 @@ class Arm:
     joint_upper_rad: tuple[float, ...]
     joint_velocity_rad_s: tuple[float, ...]
     joint_acceleration_rad_s2: tuple[float, ...]
-    braking_rad_s2: tuple[float, ...]
-    """Towards a position limit r rad away a joint may do -braking_reserve + sqrt(2 braking r) rad/s."""
-    braking_reserve_rad_s: tuple[float, ...]
+    braking_rad_s2: tuple[float, ...] = (6.0, 2.585, 3.5, 4.0, 17.0, 5.5, 17.0)
+    """Towards a position limit r rad away a joint may do -braking_reserve + sqrt(2 braking r) rad/s. The
+    FR3's ("Limits for Franka Research 3", Franka's control parameters); for the Panda its maker names nothing."""
+    braking_reserve_rad_s: tuple[float, ...] = (0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35)
     hand_width_m: float = 0.08
     """Largest opening between the pads of the Franka Hand."""
 
@@ -42,20 +43,16 @@ PANDA = Arm(
     joint_upper_rad=(2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973),
     joint_velocity_rad_s=(2.1750, 2.1750, 2.1750, 2.1750, 2.6100, 2.6100, 2.6100),
     joint_acceleration_rad_s2=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
-    braking_rad_s2=(6.0, 2.585, 3.5, 4.0, 17.0, 5.5, 17.0),
-    braking_reserve_rad_s=(0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35),
 )
-"""Franka Emika Panda: what training and the development rig drive. Its maker names no braking: the FR3's."""
+"""Franka Emika Panda: what training and the development rig drive."""
 FR3 = Arm(
     name="fr3",
     joint_lower_rad=(-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159),
     joint_upper_rad=(2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159),
     joint_velocity_rad_s=(2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
     joint_acceleration_rad_s2=(10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0),
-    braking_rad_s2=PANDA.braking_rad_s2,
-    braking_reserve_rad_s=PANDA.braking_reserve_rad_s,
 )
-"""Franka Research 3; braking: "Limits for Franka Research 3" in Franka's control parameters."""
+"""Franka Research 3."""
 ARMS = {arm.name: arm for arm in (PANDA, FR3)}
 
 HOME_RAD = (0.0, -0.2016, 0.0, -2.4853, 0.0, 2.2836, 0.7854)

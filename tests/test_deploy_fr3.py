@@ -171,6 +171,7 @@ def test_gripper_that_closes_on_nothing_is_an_event_with_its_width(tmp_path, rig
 
 def test_a_close_can_be_aborted():
     """At a quarter of real time: a client that a busy machine keeps waiting is still in time to abort."""
+    priority = os.sched_getscheduler(0)
     with Fr3Rig("127.0.0.15", primitive("cube"), speed=0.25) as rig:
         robot, clock = connect(config_for(rig.host))
         robot.start()
@@ -188,7 +189,7 @@ def test_a_close_can_be_aborted():
         time.sleep(2 * WIDTH_PERIOD_S)
         names = {thread.name for thread in threading.enumerate()}
         assert THREADS not in names, "a thread is left to a gripper that goes"
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER, "libfranka's priority stayed with this thread"
+    assert os.sched_getscheduler(0) == priority, "libfranka's priority stayed with this thread"
     assert width_m >= 0.075 and 0.002 < narrowest < 0.06, "it opened without having closed first, or shut"
 
 

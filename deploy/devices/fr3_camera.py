@@ -1,7 +1,6 @@
 """The FR3 rig's cameras as camera drivers: a D455 as it is run, and one that makes no errors."""
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -117,7 +116,7 @@ class Fr3Camera:
         from rig.fr3.channel import ChannelLost
 
         assert self._channel is not None and self._picture is not None
-        with self._time_held():
+        with self._channel.time_held():
             try:
                 asked_s = self._clock.now()
                 state = self._channel.ask("state")
@@ -140,23 +139,6 @@ class Fr3Camera:
         """See Judge; as of the last `read`, one for every control step."""
         return self._held_steps >= contract.HOLD_STEPS
 
-    @contextlib.contextmanager
-    def _time_held(self) -> Iterator[None]:
-        """The rig's time nearly stands still meanwhile: what takes long here is not the robot's doing.
-
-        That the rig is gone, whoever asks next for the arm or a frame hears.
-        """
-        from rig.fr3.channel import ChannelLost
-
-        assert self._channel is not None
-        try:
-            with contextlib.suppress(ChannelLost):
-                self._channel.ask("slow", on=True)
-            yield
-        finally:
-            with contextlib.suppress(ChannelLost):
-                self._channel.ask("slow", on=False)
-
     def _colour(self) -> UInt8[np.ndarray, "H W 3"]:
         assert self._picture is not None
         return self._picture.rgb(pinhole(self._profile, self._T_world_cam))
@@ -167,13 +149,14 @@ class Fr3Camera:
 
     def picture(self) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour of the scene as it was last read, from the same place (for people)."""
-        with self._time_held():
+        assert self._channel is not None
+        with self._channel.time_held():
             return self._colour()
 
     def clean_mm(self) -> UInt16[np.ndarray, "H W"]:
         """See Simulated; as of the last `read`."""
-        assert self._picture is not None
-        with self._time_held():
+        assert self._channel is not None and self._picture is not None
+        with self._channel.time_held():
             return to_millimetres(self._picture.depth_m(pinhole(self._profile, self._T_world_cam)))
 
     def scene(self) -> "tuple[mujoco.MjModel, mujoco.MjData]":

@@ -57,14 +57,13 @@ class Fr3Imager:
         from rig.fr3.channel import ChannelLost
 
         assert self._channel is not None and self._picture is not None
-        try:
-            self._channel.ask("slow", on=True)
-            self._picture.pose(np.array(self._channel.ask("state")["qpos"]))
-            gray = look(self._picture, self._T_world_cam, self._rng)
-            self._channel.ask("slow", on=False)
-        except ChannelLost as error:
-            raise CameraError(str(error)) from error
-        return gray
+        with self._channel.time_held():
+            try:
+                state = self._channel.ask("state")
+            except ChannelLost as error:
+                raise CameraError(str(error)) from error
+            self._picture.pose(np.array(state["qpos"]))
+            return look(self._picture, self._T_world_cam, self._rng)
 
     def truth(self) -> Pose:
         """(4, 4) where the camera stands, in the robot's base frame."""

@@ -47,7 +47,7 @@ class FrankaHand:
         self._wish = close
         self._changed.set()
         if self._busy:
-            threading.Thread(target=self._guard_once, args=(self._gripper.stop,), daemon=True).start()
+            self._abort()
 
     def stop(self, connected: bool = True) -> None:
         """End both threads, after what they are at; the gripper keeps its grip.
@@ -62,8 +62,11 @@ class FrankaHand:
             return
         self._acting.join(END_S)
         if self._acting.is_alive():
-            threading.Thread(target=self._guard_once, args=(self._gripper.stop,), daemon=True).start()
+            self._abort()
             self._acting.join(END_S)
+
+    def _abort(self) -> None:
+        threading.Thread(target=self._guard_once, args=(self._gripper.stop,), daemon=True).start()
 
     def _guard(self, work: Callable[[], None]) -> None:
         while not self._stopping.is_set() and self._error is None:

@@ -62,7 +62,7 @@ class FrankaRobot:
         self._following: FrankaSpring | None = None
         self._errors: tuple[type[Exception], ...] = ()
         self._lost_by: tuple[type[Exception], ...] = ()
-        self._holding = self._moved = self._faulted = False
+        self._holding = self._moved = self._faulted = self._cut_off = False
 
     def start(self) -> None:
         """Connect, check which arm answers, clear its errors, set its limits, then move it to the start pose.
@@ -74,7 +74,7 @@ class FrankaRobot:
         # A socket that breaks comes through libfranka as a bare RuntimeError ("Net Exception").
         self._errors = (franky.Exception, franky.GripperException, RuntimeError)
         self._lost_by = (franky.NetworkException, RuntimeError)
-        self._holding = self._moved = self._faulted = False
+        self._holding = self._moved = self._faulted = self._cut_off = False
         config = self._config
         realtime = franky.RealtimeConfig
         kernel = realtime.Enforce if config.kernel == "realtime" else realtime.Ignore
@@ -136,7 +136,7 @@ class FrankaRobot:
                 self._following.release()
             self._arm = self._following = None
             if hand is not None:
-                hand.stop(connected=not self._faulted)
+                hand.stop(connected=not self._cut_off)
 
     def time_s(self) -> float | None:
         """See TimedRobot: the arm's own clock; None once the arm has failed."""
@@ -238,6 +238,7 @@ class FrankaRobot:
         return not self._arm.has_errors
 
     def _lost(self, error: Exception) -> str:
+        self._cut_off = True
         said = franka_faults.one_line(error)
         return f"{LOST} {self._config.host} is lost ({said}): the arm stands by itself"
 

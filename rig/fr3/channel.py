@@ -4,8 +4,10 @@ One line of JSON asks, one answers. The loop, the driver and the safety filter n
 rig's camera, for judging success and for the tests.
 """
 
+import contextlib
 import json
 import socket
+from collections.abc import Iterator
 from typing import Any
 
 from ddgrasp.errors import UserError
@@ -49,6 +51,20 @@ class Channel:
             raise UserError(
                 "What answers there is no FR3 rig: name its address, on this machine --host 127.0.0.1."
             ) from None
+
+    @contextlib.contextmanager
+    def time_held(self) -> Iterator[None]:
+        """The rig's time nearly stands still meanwhile: a picture takes long, which is not the arm's doing.
+
+        That the rig is gone, whoever asks for something next hears.
+        """
+        try:
+            with contextlib.suppress(ChannelLost):
+                self.ask("slow", on=True)
+            yield
+        finally:
+            with contextlib.suppress(ChannelLost):
+                self.ask("slow", on=False)
 
     def close(self) -> None:
         """Ends the connection."""
