@@ -31,7 +31,7 @@ class Arm:
     joint_acceleration_rad_s2: tuple[float, ...]
     braking_rad_s2: tuple[float, ...] = (6.0, 2.585, 3.5, 4.0, 17.0, 5.5, 17.0)
     """Towards a position limit r rad away a joint may do -braking_reserve + sqrt(2 braking r) rad/s. The
-    FR3's ("Limits for Franka Research 3", Franka's control parameters); for the Panda its maker names nothing."""
+    FR3's ("Limits for Franka Research 3", Franka's control parameters); the Panda's maker names none."""
     braking_reserve_rad_s: tuple[float, ...] = (0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35)
     hand_width_m: float = 0.08
     """Largest opening between the pads of the Franka Hand."""
