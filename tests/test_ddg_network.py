@@ -38,7 +38,7 @@ def test_unet_takes_any_size_and_sees_prior_and_step():
     assert out.shape == (2, 18, 21, 2) and out.dtype == jnp.float32
     assert not np.allclose(out, net.apply(params, x, c + 1, jnp.array([3, 3])))
     assert not np.allclose(out, net.apply(params, x, c, jnp.array([3, 900]))[1], atol=1e-4)
-    np.testing.assert_allclose(net.apply(params, x[:1], c[:1], jnp.array([3])), out[:1], atol=1e-5)
+    np.testing.assert_allclose(net.apply(params, x[:1], c[:1], jnp.array([3])), out[:1], rtol=1e-5, atol=1e-5)
 
 
 DEPTH = DDGConfig(depth=DDGDepthConfig(representation="depth"), graft=GraftConfig(noise_threshold=-0.5))
