@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import time
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import numpy as np
@@ -35,18 +36,32 @@ def _start(out: Path) -> subprocess.Popen:
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def _attempt(out: Path, log: Path) -> None:
-    """What `_start` starts, in a process that has imported all stages already; both outputs go to `log`."""
+def _main(command: list[str], log: Path) -> None:
     os.chdir(ROOT)
     with log.open("w") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
-    sys.exit(cli.main(_run(out)))
+    sys.exit(cli.main(command))
 
 
-def _given(command: list[str]) -> subprocess.CompletedProcess:
-    args = [sys.executable, "-m", "app.cli", *command]
-    return subprocess.run(args, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
+def _fork(command: list[str], log: Path) -> ForkServerProcess:
+    """The command, begun in a process that has imported all stages already; both outputs go to `log`."""
+    forks = multiprocessing.get_context("forkserver")  # imports are half of a short command's time
+    forks.set_forkserver_preload([stage.module for stage in pipeline.STAGES])
+    process = forks.Process(target=_main, args=(command, log))
+    process.start()
+    return process
+
+
+def _given(command: list[str], log: Path) -> str:
+    """Both outputs of a command that succeeds."""
+    process = _fork(command, log)
+    try:
+        process.join(TIMEOUT_S)
+        assert process.exitcode == 0, log.read_text()[-3000:]
+    finally:
+        process.kill()
+    return log.read_text()
 
 
 def _manifests(out: Path) -> dict[str, bytes]:
@@ -62,12 +77,9 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flow")
     out, log = folder / "run", folder / "log.txt"
     log.touch()
-    forks = multiprocessing.get_context("forkserver")  # imports are half of such an attempt's time
-    forks.set_forkserver_preload([stage.module for stage in pipeline.STAGES])
     kills = []
     for stage in pipeline.STAGES:
-        process = forks.Process(target=_attempt, args=(out, log))
-        process.start()
+        process = _fork(_run(out), log)
         try:
             deadline = time.monotonic() + TIMEOUT_S
             while not (out / stage.name / artifacts.STARTED).exists() and process.is_alive():
@@ -152,9 +164,8 @@ def test_table_2_of_two_rows_from_the_run_s_own_parts(finished, tmp_path):
     before = _manifests(finished[0])
     _, command = small("reproduce.md")
     command = moved(command, {"runs/small-table2": out})
-    made = _given(command)
-    assert made.returncode == 0, made.stderr[-3000:]
-    assert "Inpaint" in made.stdout and "Table II" in made.stdout
+    printed = _given(command, tmp_path / "log.txt")
+    assert "Inpaint" in printed and "Table II" in printed
     assert _manifests(finished[0]) == before
     student = artifacts.read_artifact(out / "students" / "ideal" / "student").manifest
     assert student.config["student"]["depth_source"] == "ideal"
@@ -169,7 +180,7 @@ def test_table_2_of_two_rows_from_the_run_s_own_parts(finished, tmp_path):
         assert (out / name).stat().st_size > 0
     trials = (out / "trials").rglob("trials.jsonl")
     kept = {path: path.read_text() for path in trials}
-    assert _given(command).returncode == 0
+    _given(command, tmp_path / "log.txt")
     assert all(path.read_text() == text for path, text in kept.items())
 
 
@@ -181,8 +192,7 @@ def test_the_tutorial_s_generator_is_drawn(finished, tmp_path):
         "runs/small-room": tmp_path,
         "runs/small-room/ddg": finished[0] / "ddg",
     }
-    done = _given(moved(sample, places))
-    assert done.returncode == 0, done.stderr[-3000:]
+    _given(moved(sample, places), tmp_path / "log.txt")
     assert (tmp_path / "samples.png").stat().st_size > 0
 
 
@@ -200,8 +210,7 @@ def test_the_tutorial_s_code_takes_another_simulator_s_depth(finished):
 def test_the_tutorial_s_policy_answers_on_a_rig_and_in_a_loop_of_ones_own(finished, tmp_path):
     out = finished[0]
     (command,) = small("your_robot.md")
-    done = _given(moved(command, {"runs/small": out, "runs/small-deployments": tmp_path}))
-    assert done.returncode == 0, done.stderr[-3000:]
+    _given(moved(command, {"runs/small": out, "runs/small-deployments": tmp_path}), tmp_path / "log.txt")
     assert [path.name for path in tmp_path.rglob("report.json")] == ["report.json"]
     (block,) = code("your_robot.md")
     names: dict = {}
