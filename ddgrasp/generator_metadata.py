@@ -54,6 +54,8 @@ class GeneratorMetadata:
     """What depth is measured in."""
     camera: dict[str, Any] = field(default_factory=dict)
     """What it was fitted on: name, width_px, height_px, fx_px, near_m, far_m (of readings), where known."""
+    knows_position: bool = False
+    """Whether it knows where in the picture a pixel is: it draws one camera then, upright and as it stood."""
     licence: str = ""
     source: str = ""
     """Where the recordings come from, in words."""

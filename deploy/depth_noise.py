@@ -51,9 +51,12 @@ class DepthGenerator:
           seed: of the noise of calls that are given none.
 
         Raises:
-          UserError: no such file, no generator, or a device that onnxruntime does not have.
+          UserError: no such file, no generator, a device that onnxruntime does not have, or no number where
+            one is wanted.
         """
         self.path = shipped(path)
+        check_count("threads", threads, 0)
+        check_count("seed", seed, 0)
         self._kind, self._device_number = _device(device)
         self._session = _open(self.path, self._kind, self._device_number, threads)
         self.info = names.read(self._session.get_modelmeta().custom_metadata_map, str(self.path))
@@ -98,7 +101,12 @@ class DepthGenerator:
           count: cameras, or environments.
           seed: of the noise.
           device: PyTorch's name of a device, for tensors there; empty makes NumPy arrays.
+
+        Raises:
+          UserError: no whole number of cameras, or no seed.
         """
+        check_count("count", count, 1)
+        check_count("seed", seed, 0)
         return EpisodeNoise(self.info, count, _Normals(seed, device))
 
     # --- checks ------------------------------------------------------------------------------------
@@ -106,6 +114,7 @@ class DepthGenerator:
     def _checked_steps(self, steps: int | None) -> int:
         if steps is None:
             return self.info.steps
+        check_count("steps", steps, 1)
         least = self.info.steps if self.info.fixed_steps else 1
         if not least <= steps <= self.info.most_steps:
             raise UserError(f"steps is {steps}; {self.path} takes {least} to {self.info.most_steps}.")
@@ -234,6 +243,12 @@ class _Normals:
         return self._torch.as_tensor(values, device=self._device) if self._device else values
 
 
+def check_count(name: str, value: Any, least: int) -> None:
+    """UserError if `value` is no whole number from `least` on."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise UserError(f"{name} is {value!r}; expected a whole number of at least {least}.")
+
+
 def _frames(depth: Array) -> Array:
     """(N, H, W) of what came in; UserError for another rank or integers."""
     shape: tuple[int, ...] = tuple(getattr(depth, "shape", ()))
@@ -258,7 +273,7 @@ def _host(values: Array) -> np.ndarray:
 
 def _device(name: str) -> tuple[str, int]:
     """(cpu or cuda, number) of `cpu`, `cuda`, `cuda:1`; UserError for another name."""
-    kind, _, number = name.partition(":")
+    kind, _, number = str(name).partition(":")
     if kind not in ("cpu", "cuda") or (number and not number.isdecimal()):
         raise UserError(f"device is {name!r}; expected cpu, cuda or cuda:1.")
     return kind, int(number or 0)

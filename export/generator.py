@@ -111,6 +111,7 @@ def describe(
         deviation_correlation=config.sampling.deviation_correlation,
         unit="planar metres, 0 = nothing in range or no reading",
         camera=camera,
+        knows_position=config.unet.position,
         licence=licence or from_licence,
         source=source,
         manifest_hash=artifact.hash,

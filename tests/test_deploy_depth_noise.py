@@ -10,7 +10,7 @@ import pytest
 
 from ddgrasp import generator_metadata as names
 from ddgrasp.errors import UserError
-from deploy.depth_noise import DepthGenerator
+from deploy.depth_noise import DepthGenerator, check_count
 from tutorial_support import code
 
 ROOT = Path(__file__).parents[1]
@@ -132,6 +132,19 @@ def test_wrong_noise_and_steps_are_refused(generator, scene):
         generator(scene, [0.0])
     with pytest.raises(UserError, match="steps is 51; .* takes 1 to 50"):
         generator(scene, steps=51)
+
+
+def test_what_is_no_number_is_refused(generator, scene):
+    with pytest.raises(UserError, match="steps is 0; expected a whole number of at least 1"):
+        generator(scene, steps=0)
+    with pytest.raises(UserError, match="count is -1; expected a whole number of at least 1"):
+        generator.noise(-1)
+    with pytest.raises(UserError, match="seed is -3; expected a whole number of at least 0"):
+        generator.noise(1, seed=-3)
+    for wrong in (2.5, "4", None, True):  # the tests' own check of types would stop these at the door
+        with pytest.raises(UserError, match=f"steps is {wrong!r}; expected a whole number of at least 1"):
+            check_count("steps", wrong, 1)
+    check_count("steps", np.int64(1), 1)
 
 
 def test_files_that_are_no_generators_are_refused(tmp_path):

@@ -87,6 +87,7 @@ def test_the_file_draws_what_jax_draws(name, tmp_path):
     session = open_session(tmp_path / "generator.onnx")
     info = generator_metadata.read(session.get_modelmeta().custom_metadata_map, "it")
     assert (info.height_px, info.width_px, info.steps) == (27, 48, generator.config.sampling.steps)
+    assert info.knows_position == generator.config.unet.position
     inputs = {one.name for one in session.get_inputs()}
     assert inputs == {"depth", "noise"} | (set() if info.fixed_steps else {"steps"})
 
