@@ -19,6 +19,7 @@ from deploy.changes import Change
 from deploy.policy import POLICY_FILE
 from deploy.trials import Rig
 from evaluation.rig_trials import Series
+from mjx_envs.grasp_math import HAND_DOWN
 
 if TYPE_CHECKING:
     from student_jax.policy import Aux
@@ -80,7 +81,7 @@ class Errors:
     away_m: Float[np.ndarray, "T 3"]
     """Perceived minus true position of the grasp, in the robot's frame."""
     yaw_rad: Float[np.ndarray, " T"]
-    """The grasp's, without sign."""
+    """The grasp's, without sign; NaN where any yaw is as good."""
     held: Float[np.ndarray, " T"]
     """Perceived probability that the object is in the hand."""
     distance_m: Float[np.ndarray, " T"]
@@ -102,7 +103,7 @@ def errors(seen: Seen, aux: "Aux") -> Errors:
     to_grasp = observation[:, OBSERVATION.grip_pos] - observation[:, OBSERVATION.grasp_pos]
     return Errors(
         away_m=away,
-        yaw_rad=np.abs(np.angle(np.exp(1j * turn))) / YAW_MULTIPLE,
+        yaw_rad=np.where(_any_yaw(observation), np.nan, np.abs(np.angle(np.exp(1j * turn))) / YAW_MULTIPLE),
         held=1 / (1 + np.exp(-aux.held_logit)),
         distance_m=np.linalg.norm(to_grasp, axis=1),
         touched=np.maximum.accumulate(np.linalg.norm(at - lay, axis=1) > MOVED_M),
@@ -110,12 +111,18 @@ def errors(seen: Seen, aux: "Aux") -> Errors:
     )
 
 
+def _any_yaw(observation: Float[np.ndarray, "N 40"]) -> Bool[np.ndarray, " N"]:
+    """Whether the object is grasped as well from any side: the hand keeps its yaw of 0 then, to the bit
+    (`grasp_math.grasp_pose`), which no other object asks for."""
+    return (observation[:, OBSERVATION.grasp_quat] == np.array(HAND_DOWN)).all(axis=1)
+
+
 def tabulate(parts: Sequence[Errors], success: Sequence[bool], names: Sequence[str]) -> list[dict[str, Any]]:
     """A row for each part of a trial: of all trials, of those that succeeded, of those that did not, and for
     each object of the steps with the hand near. `success` and `names` are the trials' outcomes and objects.
 
     Position (mm): medians without sign, in the plane and in height, and means with it, x away from the base,
-    y to its left, z up. Yaw (degrees): median. Held: share of steps told wrongly.
+    y to its left, z up. Yaw (degrees): median, of objects that have one. Held: share of steps told wrongly.
     """
     groups = {"all": list(parts)}
     for title, wanted in (("success", True), ("failure", False)):
@@ -138,6 +145,11 @@ _PHASES: dict[str, Callable[[Errors], np.ndarray]] = {
 }
 
 
+def _median_deg(yaw_rad: Float[np.ndarray, " N"]) -> float | None:
+    told = yaw_rad[~np.isnan(yaw_rad)]
+    return round(float(np.degrees(np.median(told))), 1) if len(told) else None
+
+
 def _row(parts: Sequence[Errors], where: Sequence[np.ndarray], carried: bool) -> dict[str, Any]:
     def of(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name)[w] for part, w in zip(parts, where, strict=True)])
@@ -151,6 +163,6 @@ def _row(parts: Sequence[Errors], where: Sequence[np.ndarray], carried: bool) ->
         "mean_x_mm": x,
         "mean_y_mm": y,
         "mean_z_mm": z,
-        "yaw_deg": round(float(np.degrees(np.median(of("yaw_rad")))), 1),
+        "yaw_deg": _median_deg(of("yaw_rad")),
         "held_wrong": round(float(np.mean((of("held") > 0.5) != carried)), 3),
     }

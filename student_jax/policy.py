@@ -51,7 +51,7 @@ class Aux(NamedTuple):
     position: Float[Numbers, "B 3"]
     """Object position in network units; see `position_from_world` and `position_to_world`."""
     yaw: Float[Numbers, "B 2"]
-    """Cosine and sine of k times the grasp yaw, k being the object's symmetry."""
+    """Cosine and sine of twice the grasp yaw (`data.YAW_MULTIPLE`)."""
     held_logit: Float[Numbers, " B"]
     """Logit of the object being in the hand."""
 

@@ -55,6 +55,21 @@ def test_every_part_of_a_trial_has_its_errors():
     assert len(text) == 8 and "horizontal_mm" in text[0]
 
 
+def test_what_is_round_has_no_error_of_yaw():
+    seen = _seen([0.3, 0.05], [0, 0])
+    for observation in seen.observation:
+        observation[OBSERVATION.grasp_quat] = [0, 1, 0, 0]
+    reported = _reported(seen, np.zeros(3), 0.7, [False, False])
+    apart = perception.errors(seen, reported)
+    (row, *_) = perception.tabulate([apart], [True], ["apple"])
+    assert row["yaw_deg"] is None
+    both = perception.tabulate(
+        [apart, perception.errors(turned := _seen([0.3], [0]), _reported(turned, np.zeros(3), 0.2, [False]))],
+        [True, True], ["apple", "cube"],
+    )  # fmt: skip
+    assert both[0]["yaw_deg"] == pytest.approx(np.degrees(0.2), abs=0.1)
+
+
 def test_rows_stay_until_the_student_is_made_anew(tmp_path):
     directory = tmp_path / "student"
     artifacts.finish(directory, "student", PRESETS["debug"], seconds=1.0, metrics={})
