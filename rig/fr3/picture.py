@@ -4,10 +4,11 @@ import math
 import os
 import sys
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int32, UInt8
+from jaxtyping import Float32, Float64, Int32, UInt8
 
 from ddgrasp.errors import UserError
 from mjx_envs.camera import Buffers, Camera
@@ -103,23 +104,34 @@ def _normals(
     """(H, W, 3) unit normals, world frame, towards the camera: differences of neighbours on one geom."""
     x = ((np.arange(camera.width_px) + 0.5 - camera.cx_px) / camera.fx_px).astype(np.float32)[None, :]
     y = ((np.arange(camera.height_px) + 0.5 - camera.cy_px) / camera.fy_px).astype(np.float32)[:, None]
-    points = np.stack([x * depth_m, y * depth_m, depth_m], axis=-1)
-    normal = np.cross(_slope(points, geoms, 0), _slope(points, geoms, 1))
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    facing = np.where((normal * points).sum(-1, keepdims=True) > 0, np.float32(-1), np.float32(1))
-    unit = normal * facing / np.maximum(length, np.float32(1e-12))
-    unit[(geoms < 0) | (length[..., 0] == 0)] = 0.0
-    return (unit @ np.asarray(camera.T_world_cam)[:3, :3].T.astype(np.float32)).astype(np.float32)
+    points = (x * depth_m, y * depth_m, depth_m)  # planes: arrays whose last axis has three numbers are slow
+    (ax, ay, az), (bx, by, bz) = ([_slope(plane, geoms, axis) for plane in points] for axis in (0, 1))
+    normal = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
+    length = np.sqrt(_dot(normal, normal))
+    nowhere = (geoms < 0) | (length == 0)
+    towards = np.copysign(np.maximum(length, np.float32(1e-12)), np.float32(0) - _dot(normal, points))
+    towards[nowhere] = np.inf
+    unit = np.stack([plane / towards for plane in normal], axis=-1)
+    return unit @ np.asarray(camera.T_world_cam)[:3, :3].T.astype(np.float32)
+
+
+def _dot(
+    a: Sequence[Float32[np.ndarray, "H W"]], b: Sequence[Float32[np.ndarray, "H W"]]
+) -> Float32[np.ndarray, "H W"]:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _slope(
-    points: Float[np.ndarray, "H W 3"], geoms: Int32[np.ndarray, "H W"], axis: int
-) -> Float[np.ndarray, "H W 3"]:
+    plane: Float32[np.ndarray, "H W"], geoms: Int32[np.ndarray, "H W"], axis: int
+) -> Float32[np.ndarray, "H W"]:
     """Along an axis of the picture: the sum of the differences to both neighbours, but to other geoms."""
-    step = np.diff(points, axis=axis)
-    step *= (np.diff(geoms, axis=axis) == 0)[..., None]
-    nothing = np.zeros_like(points.take([0], axis))
-    return np.concatenate([nothing, step], axis) + np.concatenate([step, nothing], axis)
+    step = np.diff(plane, axis=axis) * (np.diff(geoms, axis=axis) == 0)
+    slope = np.zeros_like(plane)
+    here, there = np.moveaxis(slope, axis, 0)[1:], np.moveaxis(slope, axis, 0)[:-1]
+    step = np.moveaxis(step, axis, 0)
+    here += step
+    there += step
+    return slope
 
 
 def _without_display() -> None:
