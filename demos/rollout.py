@@ -17,6 +17,7 @@ from ddgrasp.layout import ACTION, QPOS
 from demos.spool import Spool
 from mjx_envs import randomize
 from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.physics.interface import warn_of_dropped
 from mjx_envs.render.visual import Viewer
 from ppo.policy import TeacherPolicy
 
@@ -94,11 +95,12 @@ class Roller:
         self._advance = jax.jit(jax.vmap(self.env.step))
 
     def run(self, key: jax.Array, actor: Actor, on_step: Callable[[int], None] = lambda _: None) -> Episodes:
-        """One episode in each environment under `actor`."""
+        """One episode in each environment under `actor`. Says on standard error what physics lost."""
         state, cameras = self._begin(key)
         alive = np.ones(self.count, bool)
         length = np.zeros(self.count, int)
         success = np.zeros(self.count, bool)
+        dropped = 0.0
         columns: dict[str, list[np.ndarray]] = {"state": [], "expert": [], "observation": [], "held": []}
         pictures = self._spools()
         for t in range(self.steps):
@@ -109,12 +111,14 @@ class Roller:
                 spool.add(getattr(scene, name))
             length += alive
             state = self._advance(state, jnp.asarray(actor(scene), jnp.float32))
+            dropped += float(np.asarray(state.metrics["contacts_dropped"])[alive].sum())
             success |= alive & (np.asarray(state.metrics["success"]) > 0)
             alive &= np.asarray(state.done) == 0
             on_step(t)
             if not alive.any():
                 break
 
+        warn_of_dropped(dropped, int(length.sum()))
         whole = {name: np.stack(values, axis=1) for name, values in columns.items()}
         return Episodes(
             state=whole["state"],

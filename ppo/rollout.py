@@ -1,6 +1,5 @@
 """Whole episodes of a deterministic teacher, on all devices, keeping of every step what is asked for."""
 
-import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -16,7 +15,7 @@ from mujoco_playground import State
 from ddgrasp.arrays import AnyArray
 from mjx_envs import devices
 from mjx_envs.grasp_env import GraspEnv
-from mjx_envs.physics.interface import ModelParams, dropped_warning
+from mjx_envs.physics.interface import ModelParams, warn_of_dropped
 from ppo.policy import TeacherPolicy
 
 Keep = Callable[[State, jax.Array, State], dict[str, jax.Array]]
@@ -54,8 +53,7 @@ def roll_out(env: GraspEnv, policy: TeacherPolicy, keys: jax.Array | np.ndarray,
     first = partial(jax.tree.map, lambda values: values[: len(keys)])
     running, kept, lost = jax.tree.map(lambda values: values[:, : len(keys)], (running, kept, lost))
     dropped = int(lost[running].sum())
-    if warning := dropped_warning(dropped, int(running.sum())):
-        print(warning, file=sys.stderr, flush=True)
+    warn_of_dropped(dropped, int(running.sum()))
     return Rollout(first(params), first(index), first(success), running, kept, dropped)
 
 

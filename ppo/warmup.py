@@ -14,6 +14,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.layout import ACTION
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.physics.interface import warn_of_dropped
 from ppo import learner
 from ppo.guide import guide
 from ppo.policy import TeacherPolicy, from_learner
@@ -41,7 +42,7 @@ def clone_guide(
     opt_state = optimizer.init(policy)
     observations, labels = [], []
     rng = np.random.default_rng([seed, _SEED])
-    collect = _Collector(env, config.clone_envs)
+    collect = Collector(env, config.clone_envs)
     fit = jax.jit(partial(_fit, optimizer))
     with progress.task("cloning the guide", config.clone_rounds) as task:
         for i in range(config.clone_rounds):
@@ -66,7 +67,7 @@ def clone_guide(
     return policy, normalizer
 
 
-class _Collector:
+class Collector:
     """Whole episodes acted by a mix of guide and policy. A host loop over small programs."""
 
     def __init__(self, env: GraspEnv, count: int):
@@ -81,6 +82,7 @@ class _Collector:
         state = self._reset(jax.random.split(jax.random.PRNGKey(seed), self._count))
         alive = np.ones(self._count, bool)
         observations, labels = [], []
+        dropped = 0.0
         for _ in range(self._steps):
             seen = np.asarray(state.obs)
             label = np.asarray(self._guide(state.obs))
@@ -93,7 +95,9 @@ class _Collector:
             noise[:, ACTION.gripper] = 0.0
             action = np.clip(np.where(guided, label, policy(seen)) + noise, -1, 1)
             state = self._step(state, action.astype(np.float32))
+            dropped += float(np.asarray(state.metrics["contacts_dropped"])[alive].sum())
             alive &= np.asarray(state.done) == 0
+        warn_of_dropped(dropped, sum(map(len, observations)))
         return np.concatenate(observations), np.concatenate(labels)
 
 

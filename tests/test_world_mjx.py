@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from ddgrasp.config import WorldConfig
+from ddgrasp.config import Config, WorldConfig
+from demos.rollout import Roller
 from mjx_envs import scene
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.object_spec import DEFAULT_SLOTS, SlotLayout
 from mjx_envs.objects import OBJECTS
 from mjx_envs.physics import interface, mjx_collision, mjx_kinematics
 from mjx_envs.physics.mjx_jax import JaxPhysics
-from ppo import rollout
+from ppo import rollout, warmup
 from ppo.policy import TeacherPolicy
 
 BATCH = 64
@@ -201,6 +202,22 @@ def test_an_evaluation_reports_what_its_physics_lost(lost, capsys):
     assert seen.dropped == (3 * int(seen.running.sum()) if lost else 0)
     assert ("36 contacts in 12 control steps were more than the physics backend holds" in said) == lost
     assert said.count("\n") == int(lost)
+
+
+def test_demos_and_dagger_report_what_their_physics_lost(capsys):
+    roller = Roller(Config("test", world=WorldConfig(episode_steps=3)), _still(), 4, with_depth=False)
+    roller.env.physics = Overfull(roller.env.physics)
+    roller.run(jax.random.PRNGKey(0), lambda scene: scene.expert)
+    said = capsys.readouterr().err
+    assert said.startswith("warning: 36 contacts in 12 control steps were more") and said.count("\n") == 1
+
+
+def test_cloning_the_guide_reports_what_its_physics_lost(capsys):
+    env = GraspEnv(WorldConfig(episode_steps=3))
+    env.physics = Overfull(env.physics)
+    observations, _ = warmup.Collector(env, 4)(_still(), seed=0, guide_share=1.0)
+    assert len(observations) == 12
+    assert capsys.readouterr().err.startswith("warning: 36 contacts in 12 control steps were more")
 
 
 def _nothing(before, action, after):

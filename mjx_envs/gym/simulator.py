@@ -80,12 +80,15 @@ class Simulator:
         return {"depth": self._depth(scenes), "state": within(joints_space(), joints)}
 
     def facts(self, scenes: Scenes) -> dict[str, np.ndarray]:
-        """(N,) each: success (bool), object (str), and the weighted terms of the last step's reward."""
+        """(N,) each: success (bool), object (str), contacts that the physics backend had no room for in the
+        last step, and the weighted terms of its reward."""
         metrics = scenes.state.metrics
         names = np.array(self.env.table.names, object)
         terms = {f"reward/{name}": np.array(metrics[f"reward/{name}"], float) for name in rewards.TERMS}
         index = np.asarray(scenes.state.info["episode"].object_index)
-        return {"success": np.asarray(metrics["success"]) > 0, "object": names[index]} | terms
+        lost = np.array(metrics["contacts_dropped"], float)
+        success = np.asarray(metrics["success"]) > 0
+        return {"success": success, "object": names[index], "contacts_dropped": lost} | terms
 
     def rgb(self, scenes: Scenes) -> UInt8[np.ndarray, "n height width 3"]:
         """(N, H, W, 3) the depth camera's whole picture, in colour."""

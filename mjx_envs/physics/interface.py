@@ -6,6 +6,7 @@ and `mjx_warp` (MJX-Warp), chosen in `backends`; `conformance` says how closely 
 for one environment; use `jax.vmap` for many.
 """
 
+import sys
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
@@ -80,6 +81,12 @@ def initial_state(qpos: Float[jax.Array, "16"]) -> PhysicsState:
         qpos=qpos, qvel=jnp.zeros(scene.NV), warmstart=jnp.zeros(scene.NV), touch=jnp.zeros(2),
         dropped=jnp.zeros((), jnp.int32),
     )  # fmt: skip
+
+
+def warn_of_dropped(dropped: float, control_steps: float) -> None:
+    """Prints `dropped_warning` to standard error, if there is one."""
+    if warning := dropped_warning(dropped, control_steps):
+        print(warning, file=sys.stderr, flush=True)
 
 
 def dropped_warning(dropped: float, control_steps: float) -> str | None:
