@@ -17,7 +17,10 @@ from ddgrasp.stages import get_stage
 
 @dataclass(frozen=True)
 class TeacherTrain(OneStage):
-    """Train the privileged teacher by PPO, on every device there is, on one host or several."""
+    """Train the privileged teacher by PPO, on every device there is, on one host or several.
+
+    --teacher.start says what it begins from: nothing, a scripted guide, or a checkpoint.
+    """
 
     hosts: HostsConfig = field(default_factory=HostsConfig)
     """Several hosts: start the same command on each, with an --out that all of them share."""

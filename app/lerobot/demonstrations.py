@@ -53,13 +53,19 @@ def read(folder: Path, objects: Sequence[str] = (), noisy: Path | None = None) -
         "Robot": "Franka Emika Panda with its hand, simulated in MuJoCo MJX.",
         "Camera": f"An ideal one with a RealSense D455's view, {width} x {height}, fixed across the table; "
         f"{depth_is}.",
-        "How it was made": f"A policy that sees the simulator's state, trained by PPO, grasped {len(names)} "
+        "How it was made": f"A policy that sees the simulator's state, trained by PPO "
+        f"{_begun(config.teacher.start)}, grasped {len(names)} "
         "objects; episodes that failed were thrown away. In some steps its joint steps were disturbed "
         f"({noise}); `action` is what it asked for, not the disturbed step, so that recoveries are labelled.",
     }
     poses = store.episodes("T_world_cam")
     read_one = partial(_read, store, depth, names, indices, poses)
     return Source("demonstrations", contract.PANDA.name, about, [partial(read_one, i) for i in taken])
+
+
+def _begun(start: str) -> str:
+    """What PPO began from, in words."""
+    return {"nothing": "from nothing", "guide": "from a scripted controller"}.get(start, f"from {start}")
 
 
 def _open_noisy(path: Path, folder: Path) -> tuple[EpisodeStore, str]:
