@@ -15,6 +15,7 @@ OTHERWISE_NAMED = {
     "rerun": "rerun-sdk",
     "sklearn": "scikit-learn",
     "warp": "warp-lang",
+    "yaml": "pyyaml",
 }
 """Import name -> name on the package index, where they differ by more than a hyphen."""
 TRAIN = "train"

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ddgrasp import artifacts
+from ddgrasp import artifacts, config_file
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
@@ -45,6 +45,7 @@ def run(
     check_place(run_dir, resume=resume, stages=stages)
     for stage in stages:
         make(stage, config, run_dir, resume=resume, quiet=quiet)
+        config_file.write(config, run_dir / config_file.CONFIG_FILE)
     return importlib.import_module("evaluation.report.stage").write_report(run_dir)
 
 

@@ -28,7 +28,9 @@ from app.commands.student import Deploy, Export, StudentEval, StudentPerception,
 from app.commands.study import StudyCauses, StudyTable2
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
 from app.commands.trials import DeployTrials
+from ddgrasp import config_file
 from ddgrasp.config import Config
+from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.scaling import scaled
 from ddgrasp.shipped import shipped
@@ -100,10 +102,8 @@ def parse(name: str, args: Sequence[str]) -> Command:
     cls = COMMANDS[name]
     options: dict[str, Any] = {}
     if issubclass(cls, FromPreset):
-        preset = _scaled(
-            get_preset(_option(args, "--preset") or cls.default_preset()), _option(args, "--scale")
-        )
-        options["default"] = cls(config=preset, out=cls.default_out(preset.preset))
+        base = _base(args, cls.default_preset())
+        options["default"] = cls(config=base, out=cls.default_out(base.preset))
     elif issubclass(cls, Scoring):
         preset = get_preset(_option(args, "--preset") or DEFAULT_PRESET)
         default = cls(preset.score, preset.preset, Path("runs") / preset.preset)
@@ -127,6 +127,17 @@ def _found(command: Any) -> Any:
     """`command` with the places of what it reads that comes with this project (`shipped`)."""
     given = {field.name: getattr(command, field.name) for field in fields(command) if field.name != "out"}
     return replace(command, **{name: shipped(path) for name, path in given.items() if isinstance(path, Path)})
+
+
+def _base(args: Sequence[str], default_preset: str) -> Config:
+    """What single values are given besides: the file of --config, or a preset at --scale."""
+    file, preset, scale = (_option(args, name) for name in ("--config", "--preset", "--scale"))
+    if file is None:
+        return _scaled(get_preset(preset or default_preset), scale)
+    for name, value in (("--preset", preset), ("--scale", scale)):
+        if value is not None:
+            raise UserError(f"--config {file} and {name} {value} both say where to begin: give one.")
+    return config_file.read(Path(file))
 
 
 def _scaled(preset: Config, scale: str | None) -> Config:
@@ -175,6 +186,7 @@ _PRESET_HELP = (
     "nothing), camera (laptop, the generator for short recordings of a real camera), paper (one GPU). Any",
     "value of a preset can be given, for example --teacher.num-envs 64. --scale 0.001 makes all its counts",
     "that much smaller, never its networks or pictures: a trial run, whose figures mean nothing.",
+    'Commands and options are completed after  eval "$(ddgrasp completion bash)"  (or zsh).',
 )
 
 

@@ -33,6 +33,9 @@ class FromPreset:
     """Directory of the run."""
     resume: bool = False
     """Continue what is there; finished stages are not redone."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    """YAML file to take instead of a preset, which it names, with what differs from it: `config.yaml` of any
+    run. Single values can be given besides."""
 
     @classmethod
     def default_preset(cls) -> str:

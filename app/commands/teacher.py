@@ -19,7 +19,7 @@ from ddgrasp.stages import get_stage
 class TeacherTrain(OneStage):
     """Train the privileged teacher by PPO, on every device there is, on one host or several.
 
-    --teacher.start says what it begins from: nothing, a scripted guide, or a checkpoint.
+    The value teacher.start says what it begins from: nothing, a scripted guide, or a checkpoint.
     """
 
     hosts: HostsConfig = field(default_factory=HostsConfig)

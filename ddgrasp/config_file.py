@@ -1,0 +1,75 @@
+"""A run's configuration as a small YAML file: its preset, and what differs from it.
+
+Every run leaves one, `config.yaml`; `--config FILE` takes it.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ddgrasp.artifacts import config_from_json, to_json
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.files import atomic_write_text
+from ddgrasp.presets import PRESETS, get_preset
+
+CONFIG_FILE = "config.yaml"
+_PRESET = "preset"
+
+
+def write(config: Config, path: Path) -> None:
+    """Writes what `read` makes `config` of."""
+    import yaml
+
+    preset = PRESETS.get(config.preset, Config(config.preset))
+    values = {_PRESET: config.preset, **_differences(to_json(preset), to_json(config))}
+    text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=110)
+    atomic_write_text(path, f"# ddgrasp run --config {path.name}\n{text}")
+
+
+def read(path: Path) -> Config:
+    """The configuration of the file.
+
+    Raises UserError if there is no such file, it is no YAML, names no preset, or has a setting that does not
+    exist or a value that is out of bounds.
+    """
+    import yaml
+
+    try:
+        values = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "no text"
+        raise UserError(f"--config {path} cannot be read ({reason}).") from None
+    except yaml.YAMLError as error:
+        raise UserError(f"--config {path} is no YAML: {' '.join(str(error).split())}.") from None
+    if not isinstance(values, dict) or not isinstance(values.get(_PRESET), str):
+        raise UserError(f"--config {path} names no preset: its first line is to be `preset: demo`.")
+    preset = to_json(get_preset(values[_PRESET]))
+    return config_from_json(_merged(preset, values, f"--config {path}: ", ""))
+
+
+def _differences(preset: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str, Any]:
+    different: dict[str, Any] = {}
+    for name, value in here.items():
+        if isinstance(value, Mapping) and isinstance(preset[name], Mapping):
+            if inside := _differences(preset[name], value):
+                different[name] = inside
+        elif value != preset[name]:
+            different[name] = value
+    return different
+
+
+def _merged(preset: Mapping[str, Any], given: Mapping[str, Any], file: str, section: str) -> dict[str, Any]:
+    merged = dict(preset)
+    for name, value in given.items():
+        place = f"{section}{name}"
+        if name not in preset:
+            known = [f"{section}{other}" for other in preset]
+            raise unknown_name(f"setting in {file.removesuffix(': ')}", place, known)
+        if isinstance(preset[name], Mapping):
+            if not isinstance(value, Mapping):
+                raise UserError(f"{file}{place} is {value!r}; expected its settings, indented below it.")
+            merged[name] = _merged(preset[name], value, file, f"{place}.")
+        else:
+            merged[name] = value
+    return merged

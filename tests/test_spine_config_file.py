@@ -1,0 +1,94 @@
+"""`config.yaml`: what differs from a preset, written beside a run and accepted back."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from app.commands import parse
+from ddgrasp import config_file
+from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
+from ddgrasp.scaling import scaled
+
+
+def _changed():
+    command = parse("run", ["--preset", "debug", "--seed", "7", "--world.objects", "cube", "can",
+                            "--student.training.steps", "9", "--ddg.graft.window-px", "1.25"])  # fmt: skip
+    return command.config
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_every_preset_is_one_line(name, tmp_path):
+    path = tmp_path / "config.yaml"
+    config_file.write(PRESETS[name], path)
+    assert path.read_text().splitlines()[1:] == [f"preset: {name}"]
+    assert config_file.read(path) == PRESETS[name]
+
+
+def test_what_differs_is_kept_and_nothing_else(tmp_path):
+    path = tmp_path / "config.yaml"
+    config_file.write(_changed(), path)
+    assert path.read_text().splitlines()[1:] == [
+        "preset: debug",
+        "seed: 7",
+        "world:",
+        "  objects:",
+        "  - cube",
+        "  - can",
+        "ddg:",
+        "  graft:",
+        "    window_px: 1.25",
+        "student:",
+        "  training:",
+        "    steps: 9",
+    ]
+    assert parse("run", ["--config", str(path)]).config == _changed()
+
+
+def test_single_values_can_be_given_besides_and_name_the_place(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("preset: debug\nseed: 3\n")
+    command = parse("teacher train", ["--config", str(path), "--teacher.num-envs", "16", "--resume"])
+    assert command.config == replace(
+        PRESETS["debug"], seed=3, teacher=replace(PRESETS["debug"].teacher, num_envs=16)
+    )
+    assert (command.out, command.resume) == (Path("runs/debug"), True)
+
+
+def test_a_run_at_scale_comes_back(tmp_path):
+    small = scaled(replace(PRESETS["paper"], scale=0.001), 0.001)
+    config_file.write(small, tmp_path / "config.yaml")
+    assert config_file.read(tmp_path / "config.yaml") == small
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("seed: 3", "names no preset: its first line is to be `preset: demo`"),
+        ("- 3", "names no preset"),
+        ("preset: dmo", "Unknown preset 'dmo'. Did you mean 'demo'?"),
+        (
+            "preset: demo\nworld: {objcts: [cube]}",
+            "Unknown setting in --config .* 'world.objcts'. Did you mean",
+        ),
+        ("preset: demo\nworld: 3", "world is 3; expected its settings, indented below it"),
+        ("preset: demo\nteacher: {num_envs: 0}", "teacher.num_envs is 0; expected at least 1"),
+        ("preset: demo\nteacher: {num_envs: many}", "teacher.num_envs is 'many'; expected"),
+        ("preset: [", "is no YAML"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_named(text, said, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError, match=said) as refused:
+        parse("run", ["--config", str(path)])
+    assert "\n" not in str(refused.value)
+
+
+def test_a_file_that_is_not_there_and_two_beginnings_are_refused(tmp_path):
+    with pytest.raises(UserError, match="nowhere.yaml cannot be read \\(No such file or directory\\)"):
+        parse("run", ["--config", str(tmp_path / "nowhere.yaml")])
+    for option, value in (("--preset", "demo"), ("--scale", "0.5")):
+        with pytest.raises(UserError, match=f"x.yaml and {option} {value} both say where to begin"):
+            parse("run", ["--config", "x.yaml", option, value])
