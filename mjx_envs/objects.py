@@ -207,20 +207,6 @@ SHAPES: dict[str, ObjectSpec] = {
             other_pose=RestPose("y", rest_height_m=0.027, grasp_symmetry=2),
             source="54 x 70 mm, stands or lies; " + _MADE_UP,
         ),
-        ObjectSpec(
-            "post", 19, mass_kg=0.150, friction=0.6, rgb=(0.45, 0.32, 0.22), rest_height_m=0.0575,
-            grasp_symmetry=4, grasp_offset_m=(0.0, 0.0, 0.0275), box=Box((0.020, 0.020, 0.0575)),
-            other_pose=RestPose("y", rest_height_m=0.020, grasp_symmetry=2),
-            source="40 x 40 x 115 mm, stands or lies; " + _MADE_UP,
-        ),
-        ObjectSpec(
-            "drum", 20, mass_kg=0.250, friction=0.5, rgb=(0.55, 0.55, 0.20), rest_height_m=0.0475,
-            grasp_symmetry=0, grasp_offset_m=(0.0, 0.0, 0.0175), box=Box((0.0212, 0.0212, 0.0475)),
-            capsules=_staves(radius_m=0.030, half_m=0.0395, edge_m=0.008),
-            cylinders=(Cylinder(0.030, 0.0475),),
-            other_pose=RestPose("y", rest_height_m=0.030, grasp_symmetry=2),
-            source="60 x 95 mm, stands or lies; " + _MADE_UP,
-        ),
     )
 }  # fmt: skip
 """Plain shapes to train on besides (`--world.objects`), so that a student knows more than six: none is one

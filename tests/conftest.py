@@ -25,11 +25,9 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Compiling is most of the suite's time, and half of that goes into making small programs faster.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # The older emitters of XLA compile the same programs in a third of the time (PPO's four: 5.2 s instead of
-# 16.2 s of CPU time), and programs that are not split for many threads in six sevenths of it (two workers
-# keep two cores busy already). JAX 0.12 has only the new emitters, and an unknown flag ends the process.
+# 16.2 s of CPU time). JAX 0.12 has only the new ones, and an unknown flag ends the process.
 if tuple(map(int, version("jax").split(".")[:2])) < (0, 12):
-    _FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FLAGS}"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 
 SLOW = (
     "test_flow_debug", "test_deploy_fr3", "test_teacher_devices", "test_evaluation_score",
