@@ -1,6 +1,6 @@
 """A run's configuration as a small YAML file: its preset, and what differs from it.
 
-Every run leaves one, `config.yaml`; `--config FILE` takes it.
+`ddgrasp run` leaves one, `config.yaml`, in the run's folder; `--config FILE` takes it.
 """
 
 from collections.abc import Mapping
@@ -45,7 +45,7 @@ def read(path: Path) -> Config:
     if not isinstance(values, dict) or not isinstance(values.get(_PRESET), str):
         raise UserError(f"--config {path} names no preset: its first line is to be `preset: demo`.")
     preset = to_json(get_preset(values[_PRESET]))
-    return config_from_json(_merged(preset, values, f"--config {path}: ", ""))
+    return config_from_json(_merged(preset, values, f"--config {path}", ""))
 
 
 def _differences(preset: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str, Any]:
@@ -65,10 +65,10 @@ def _merged(preset: Mapping[str, Any], given: Mapping[str, Any], file: str, sect
         place = f"{section}{name}"
         if name not in preset:
             known = [f"{section}{other}" for other in preset]
-            raise unknown_name(f"setting in {file.removesuffix(': ')}", place, known)
+            raise unknown_name(f"setting in {file}", place, known)
         if isinstance(preset[name], Mapping):
             if not isinstance(value, Mapping):
-                raise UserError(f"{file}{place} is {value!r}; expected its settings, indented below it.")
+                raise UserError(f"{file}: {place} is {value!r}; expected its settings, indented below it.")
             merged[name] = _merged(preset[name], value, file, f"{place}.")
         else:
             merged[name] = value
