@@ -44,6 +44,22 @@ def test_a_cameras_holes_lie_where_a_camera_loses_pixels(generator, scene):
     assert beside > 3 * holes[:, -height // 5 :].mean()  # the shadow of the box, and open floor
 
 
+def test_the_d435s_generator_loses_pixels_beside_what_is_near():
+    """A floor that recedes from 1 to 4 m and a post before it, seen as by the robot whose camera it was."""
+    generator = DepthGenerator(ROOT / "pretrained" / "d435" / "generator.onnx", threads=1)
+    info = generator.info
+    assert (info.licence, info.stochastic, info.camera["fx_px"]) == ("MIT", True, 382.7)
+    floor = np.linspace(4.0, 1.0, info.height_px, dtype=np.float32)[:, None]
+    depth_m = np.tile(floor, (4, 1, info.width_px))
+    post = slice(150, 190)
+    depth_m[:, :160, post] = 0.8
+    made = generator.generate(depth_m)
+    holes = made.depth_m == 0
+    np.testing.assert_array_equal(made.depth_m[~made.mask], depth_m[~made.mask])
+    beside = holes[:, :160, post.start - 8 : post.start].mean()
+    assert beside > 0.8 and beside > 10 * holes[:, -80:, 20:-20].mean()
+
+
 def test_layout_of_the_input_is_kept(generator, scene):
     noise = generator.noise(2).next()
     plain = generator(scene, noise)

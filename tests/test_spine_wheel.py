@@ -79,7 +79,7 @@ def test_a_wheel_has_one_top_level_name(wheel, installed):
     assert {path.name for path in installed.iterdir()} == {"ddgrasp", about.name}
     assert (about / "top_level.txt").read_text().split() == ["ddgrasp"]
     assert "ddgrasp = ddgrasp.app.cli:main" in (about / "entry_points.txt").read_text()
-    assert wheel.stat().st_size < 20e6
+    assert wheel.stat().st_size < 32e6  # 28 of them checkpoints
 
 
 def test_a_wheel_has_every_module_and_file(installed):
