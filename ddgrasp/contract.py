@@ -92,6 +92,9 @@ LIFT_TARGET_M = (0.5, 0.0, 0.4)
 LIFT_TOLERANCE_M = 0.05
 HOLD_STEPS = 5
 """An episode succeeds if its last HOLD_STEPS steps all had the object within tolerance."""
+TRIAL_S = 12.0
+"""A trial on a rig ends as soon as that is so, and fails after this: twice an episode of training, so that a
+hand that has closed on nothing can try again. The paper gives a trial no limit."""
 
 # --- objects ---------------------------------------------------------------------------------
 SEEN_OBJECTS = ("apple", "pear", "peach", "banana", "cube", "block")

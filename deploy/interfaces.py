@@ -190,3 +190,7 @@ class Judge(Protocol):
     def success(self) -> bool:
         """Whether the object has been at the lift target for the last HOLD_STEPS control steps."""
         ...
+
+
+class RigCamera(Filmed, Judge, Protocol):
+    """What a trial is filmed with and judged by."""

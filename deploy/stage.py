@@ -15,7 +15,7 @@ from ddgrasp.progress import Progress
 from deploy.policy import POLICY_FILE
 from deploy.timing import Timings
 from deploy.trial_log import TrialLog
-from deploy.trials import TrialResult, plan, run_trials
+from deploy.trials import TrialResult, lasting, plan, run_trials
 from rig.film import Film, contact_sheet
 
 STAGE = "deploy"
@@ -35,10 +35,11 @@ def run(job: Job) -> Artifact:
     trials = plan(config)
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(log.results))
-        for batch, workers in ((False, config.deploy.workers), (True, 1)):
-            # Latency is measured with the machine to itself, hence one process on the real clock.
+        simulated = lasting(config, contract.TRIAL_S), config.deploy.workers
+        # Latency is measured with the machine to itself, hence one process on the real clock.
+        for batch, (settings, workers) in ((False, simulated), (True, (config, 1))):
             todo = [t for t in trials if t.realtime is batch and (t.index, t.realtime) not in log.results]
-            for result, film in run_trials(config, policy_path, todo, workers):
+            for result, film in run_trials(settings, policy_path, todo, workers):
                 log.append(result)
                 _keep_film(directory, result, film, progress)
                 done = [r for r in log.results.values() if not r.realtime]
@@ -73,6 +74,7 @@ def _header(config: Config, policy_path: Path) -> dict[str, Any]:
     return {
         "policy_sha256": hashlib.sha256(policy_path.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),
+        "trial_s": contract.TRIAL_S,
     }
 
 

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -15,12 +15,13 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ddgrasp import contract
 from ddgrasp.config import Config
 from deploy.changes import AS_IT_IS, Change
 from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
 from deploy.devices.rig_robot import SimRobot
-from deploy.interfaces import Depth, Filmed
+from deploy.interfaces import Depth, Filmed, RigCamera
 from deploy.loop import ControlLoop, LoopReport, Step
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
@@ -72,6 +73,12 @@ def plan(config: Config) -> list[Trial]:
     simulated = [Trial(i, names[i % len(names)]) for i in range(config.evaluation.rig_trials)]
     real = [Trial(i, names[i % len(names)], True) for i in range(config.deploy.realtime_trials)]
     return simulated + real
+
+
+def lasting(config: Config, seconds: float) -> Config:
+    """`config` with trials that end after so long unless they succeed before."""
+    steps = round(seconds * contract.CONTROL_HZ)
+    return replace(config, world=replace(config.world, episode_steps=steps))
 
 
 Watch = Callable[[Step, Filmed], bool | None]
@@ -154,7 +161,8 @@ class Rig:
         loop = ControlLoop(seen, robot, self._policy, safety, clock, settings)
         filming = Filming(camera, config.deploy.film_every, watch)
         # Drawing for people takes the time of a period: not while time is measured.
-        report = loop.run(config.world.episode_steps, None if trial.realtime else filming.look)
+        look = filming.look if not trial.realtime else lambda _: camera.success()
+        report = loop.run(config.world.episode_steps, look)
         if report.interrupted:
             raise KeyboardInterrupt
         robot.catch_up()
@@ -203,17 +211,19 @@ def run_trials(
 
 
 class Filming:
-    """Collects a picture every few steps, and shows every step to who watches."""
+    """Collects pictures, shows every step to who watches, and ends a trial that has succeeded."""
 
-    def __init__(self, camera: Filmed, every: int, watch: Watch | None = None):
+    def __init__(self, camera: RigCamera, every: int, watch: Watch | None = None):
         self._camera, self._every, self._watch = camera, every, watch
         self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
 
     def look(self, step: Step) -> bool | None:
-        """Takes the picture if it is due; what the loop's `on_step` is called with. True ends the trial."""
+        """Takes the picture if it is due; what the loop's `on_step` is called with. True ends the trial, as
+        success does."""
         if step.index % self._every == 0 and step.frame is not None:
             self._columns.append((step.index, self._camera.picture(), step.frame.depth))
-        return None if self._watch is None else self._watch(step, self._camera)
+        told = self._watch is not None and self._watch(step, self._camera)
+        return told or self._camera.success()
 
     def film(self) -> Film:
         """The pictures so far."""

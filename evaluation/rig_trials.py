@@ -21,7 +21,7 @@ from deploy.recorded import RecordedBench
 from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
 from deploy.trial_log import TrialLog
-from deploy.trials import Bench, Rig, Trial, TrialResult, run_trials
+from deploy.trials import Bench, Rig, Trial, TrialResult, lasting, run_trials
 from evaluation import wilson
 from evaluation.treatments import RECORDED, TreatmentName, make_treatment
 from rig import seeds
@@ -51,8 +51,8 @@ class Series:
     camera: Sight = "stereo"
     """stereo (the rig's own), ideal (no errors), or coarse (rig fr3: matched at the policy's size)."""
 
-    seconds: float = 6.0
-    """Length of a trial."""
+    seconds: float = contract.TRIAL_S
+    """A trial ends with success, or after this."""
     contact: float = 100.0
     """On rig fr3: newtons at the hand, and newton metres, at which the arm stops itself."""
 
@@ -83,9 +83,9 @@ class Series:
         """`config` with the trials' length, seed and objects. UserError if `policy` is no file."""
         if not policy.is_file():
             raise UserError(f"{policy}: no such file; make one with `ddgrasp export`.")
-        steps = round(self.seconds * contract.CONTROL_HZ)
-        world = replace(config.world, objects=_trained(), episode_steps=steps)
-        return replace(config, seed=seeds.seed(self.split, self.number), world=world)
+        world = replace(config.world, objects=_trained())
+        config = replace(config, seed=seeds.seed(self.split, self.number), world=world)
+        return lasting(config, self.seconds)
 
     def make(
         self, config: Config, treatment: Treatment | Replacement | None = None

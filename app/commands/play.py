@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import PRETRAINED
@@ -50,8 +51,8 @@ class Play:
     """Whose errors the policy sees: camera (a simulated D455's), none, or generator (the learned ones)."""
     trials: Count = 1
     """How many with every object."""
-    seconds: Annotated[float, Range(0.5, 60)] = 6.0
-    """Length of a trial."""
+    seconds: Annotated[float, Range(0.5, 60)] = contract.TRIAL_S
+    """A trial ends with success, or after this."""
     number: Annotated[int, Range(0, 999)] = 0
     """Another number, other places of the objects."""
     generator: Path | None = None

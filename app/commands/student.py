@@ -8,7 +8,7 @@ import tyro
 
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config
 from app.commands.checks import check_objects
-from ddgrasp import artifacts
+from ddgrasp import artifacts, contract
 from ddgrasp.config import Camera, Config, Robot
 from ddgrasp.config.checks import Count, Range, Seed
 from ddgrasp.presets import get_preset
@@ -109,7 +109,7 @@ class Deploy:
     """Recording for camera replay."""
     object_name: str = ""
     """Object on the rig's table, empty takes the first configured one; before a real arm it is only noted."""
-    seconds: float = 6.0
+    seconds: float = contract.TRIAL_S
     """How long to run; inf runs until Ctrl-C."""
     dry_run: bool = False
     """Everything but the motion: what would be sent is printed and drawn."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from app.commands.base import FromPreset
 from app.commands.checks import check_config_values, check_devices, check_memory
+from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
@@ -102,8 +103,8 @@ class StudyCauses:
     """How many with every object, the same for every row."""
     number: Annotated[int, Range(0, 999)] = 0
     """Which development seed."""
-    seconds: Annotated[float, Range(0.5, 60)] = 6.0
-    """Length of a trial."""
+    seconds: Annotated[float, Range(0.5, 60)] = contract.TRIAL_S
+    """A trial ends with success, or after this."""
     preset: str | None = None
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
     workers: Annotated[int, Range(1, 64)] = 2

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
 
 
@@ -28,8 +29,8 @@ class DeployTrials:
     """On rig fr3: mesh objects, or the development rig's primitives."""
     camera: Literal["stereo", "coarse", "ideal"] = "stereo"
     """stereo (the rig's own), ideal (without errors), coarse (on rig fr3: matched at the policy's size)."""
-    seconds: Annotated[float, Range(0.5, 60)] = 6.0
-    """Length of a trial."""
+    seconds: Annotated[float, Range(0.5, 60)] = contract.TRIAL_S
+    """A trial ends with success, or after this."""
     contact: Annotated[float, Range(1, 100)] = 100.0
     """On rig fr3: newtons at the hand, and newton metres, at which the arm stops itself."""
     depth: Literal["recorded", "inpaint", "monocular"] = "recorded"

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.policy_metadata import PolicyMetadata
 from deploy.interfaces import Clock
@@ -27,7 +28,7 @@ class SessionOptions:
     """Recording for camera replay."""
     object_name: str = ""
     """Object on the rig's table, empty takes the first configured one; before a real arm it is only noted."""
-    seconds: float = 6.0
+    seconds: float = contract.TRIAL_S
     """How long to run; inf runs until Ctrl-C."""
     dry_run: bool = False
     """Everything but the motion: what would be sent is said and drawn."""
