@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.commands.student import config_of
 from ddgrasp import artifacts, contract
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import (
@@ -20,6 +21,7 @@ from ddgrasp.config import (
 )
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from ddgrasp.shipped import PRETRAINED
 from deploy import stage
 from deploy import trials as rig_eval
 from deploy.clock import SimClock
@@ -27,6 +29,7 @@ from deploy.devices.rig_robot import SimRobot
 from deploy.stage import TrialLog, metrics
 from deploy.trials import Trial, TrialResult, plan, run_trials
 from deploy_support import write_policy
+from evaluation.rig_trials import Series
 from job_support import make_job
 from mjx_envs.camera import nominal_camera
 from rig.camera import camera_pose
@@ -191,6 +194,15 @@ def test_trial_is_repeatable_and_fits_the_loop(policy):
     assert film.rgb.shape == (2, 90, 160, 3) and film.depth_mm.shape == (2, 90, 160)
     seen = film.depth_mm[film.depth_mm > 0]
     assert 0.5 < np.median(seen) / 1000 < 1.5 and len(seen) > 0.5 * film.depth_mm.size
+
+
+def test_a_trial_ends_with_success():
+    """The student under pretrained/: the apple is up long before the time is over."""
+    student = PRETRAINED / "student" / "policy.onnx"
+    series = Series("development", ("apple",), trials=1)
+    rig = series.make(CONFIG)(series.configured(config_of(student, None), student), student)
+    ended, _ = rig.run(series.trial("apple", 0))
+    assert ended.success and 20 < ended.steps < 0.75 * contract.TRIAL_S * contract.CONTROL_HZ
 
 
 def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):
