@@ -15,7 +15,7 @@ from ddgrasp.progress import Progress
 from deploy.policy import POLICY_FILE
 from deploy.timing import Timings
 from deploy.trial_log import TrialLog
-from deploy.trials import TrialResult, lasting, plan, run_trials
+from deploy.trials import ENDS, TrialResult, lasting, plan, run_trials
 from rig.film import Film, contact_sheet
 
 STAGE = "deploy"
@@ -75,7 +75,7 @@ def _header(config: Config, policy_path: Path) -> dict[str, Any]:
         "policy_sha256": hashlib.sha256(policy_path.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),
         "trial_s": contract.TRIAL_S,
-    }
+    } | ENDS
 
 
 def _keep_film(directory: Path, result: TrialResult, film: Film, progress: Progress) -> None:

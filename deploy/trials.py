@@ -81,6 +81,10 @@ def lasting(config: Config, seconds: float) -> Config:
     return replace(config, world=replace(config.world, episode_steps=steps))
 
 
+ENDS = {"ends": "with success"}
+"""Header of a log of trials: those of before 2026-11-25 were judged when their time was over."""
+
+
 Watch = Callable[[Step, Filmed], bool | None]
 """Is called after every step, with the camera of the trial for colour pictures; True ends the trial."""
 

@@ -21,7 +21,7 @@ from deploy.recorded import RecordedBench
 from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
 from deploy.trial_log import TrialLog
-from deploy.trials import Bench, Rig, Trial, TrialResult, lasting, run_trials
+from deploy.trials import ENDS, Bench, Rig, Trial, TrialResult, lasting, run_trials
 from evaluation import wilson
 from evaluation.treatments import RECORDED, TreatmentName, make_treatment
 from rig import seeds
@@ -202,8 +202,8 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
 
 
 def made_with(config: Config, policy: Path) -> dict[str, str]:
-    """Policy and configuration in the header of a log of trials."""
+    """Policy, configuration and rule in the header of a log of trials."""
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),
-    }
+    } | ENDS

@@ -79,7 +79,7 @@ def test_a_wheel_has_one_top_level_name(wheel, installed):
     assert {path.name for path in installed.iterdir()} == {"ddgrasp", about.name}
     assert (about / "top_level.txt").read_text().split() == ["ddgrasp"]
     assert "ddgrasp = ddgrasp.app.cli:main" in (about / "entry_points.txt").read_text()
-    assert wheel.stat().st_size < 32e6  # 28 of them checkpoints
+    assert wheel.stat().st_size < 20e6
 
 
 def test_a_wheel_has_every_module_and_file(installed):
@@ -92,7 +92,9 @@ def test_a_wheel_has_every_module_and_file(installed):
         return {str(path.relative_to(folder)) for path in found}
 
     expected = {f"{name}/{file}" for name in (*MOVED, *SETUP.DATA) for file in there(ROOT / name)}
-    assert there(installed / "ddgrasp") == expected | there(ROOT / "ddgrasp")
+    left_out = {f"pretrained/{file}" for file in there(ROOT / "pretrained") if file.startswith("d435/")}
+    assert len(left_out) == 3
+    assert there(installed / "ddgrasp") == (expected | there(ROOT / "ddgrasp")) - left_out
 
 
 def test_without_git_the_version_is_the_one_in_pyproject(wheel, installed):
