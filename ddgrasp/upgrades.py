@@ -8,7 +8,7 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 9
+VERSION = 10
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
@@ -130,6 +130,9 @@ _ADDED_AFTER_7 = {"student.picture.fill_holes": False}
 _ADDED_AFTER_8 = {"ddg.unet.position": False}
 """Fields that version 8 lacked, with what it did."""
 
+_ADDED_AFTER_9 = {"deploy.retry": False}
+"""Fields that version 9 lacked, with what it did."""
+
 _CLONE_ROUNDS = 8
 """What stands in a configuration that does not clone: version 2 wrote 0."""
 
@@ -163,6 +166,8 @@ def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
         _add(made, _ADDED_AFTER_7)
     if version < 9:
         _add(made, _ADDED_AFTER_8)
+    if version < 10:
+        _add(made, _ADDED_AFTER_9)
     return made
 
 
@@ -170,6 +175,8 @@ def downgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     """The JSON of a configuration of this version with the fields of an earlier one: what its hashes were
     over. Values of fields that it lacked are lost."""
     made = copy.deepcopy(dict(config))
+    if version < 10:
+        _drop(made, _ADDED_AFTER_9)
     if version < 9:
         _drop(made, _ADDED_AFTER_8)
     if version < 8:

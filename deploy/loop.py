@@ -12,11 +12,10 @@ from jaxtyping import Float
 from ddgrasp.errors import UserError
 from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotError, RobotState
 from deploy.policy import OnnxPolicy
+from deploy.retry import EMPTY_WIDTH_M, Retry
 from deploy.safety import NonFiniteAction, SafetyCounts, SafetyFilter
 from deploy.timing import Timings
 
-EMPTY_WIDTH_M = 0.002
-"""A closed hand narrower than this holds nothing."""
 KEPT_EVENTS = 1000
 """Events kept in a report; later ones are counted only."""
 
@@ -28,6 +27,8 @@ class LoopSettings:
     period_s: float = 0.1
     stale_periods: float = 2.0
     """A frame older than this many periods is stale."""
+    retry: bool = False
+    """Whether a hand that stands still, or has closed on nothing, tries again (`deploy.retry`)."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Event:
     time_s: float
     """Since the loop's start."""
     kind: str
-    """hold, recover, missed, empty, fault, stop."""
+    """hold, recover, missed, retry, empty, fault, stop."""
     reason: str
 
     def __str__(self) -> str:
@@ -114,6 +115,7 @@ class ControlLoop:
         """`say` is called with one line per event, as it happens."""
         self._camera, self._robot, self._policy = camera, robot, policy
         self._safety, self._clock, self._settings, self._say = safety, clock, settings, say
+        self._retry = Retry() if settings.retry else None
         self._report = LoopReport(settings.period_s, safety=safety.counts)
         self._last_frame_s = -math.inf
         self._held_for = ""
@@ -186,11 +188,13 @@ class ControlLoop:
         timings.sense_s.append(time.perf_counter() - started)
         problem = problem or _state_problem(state)
         self._report.width_m = float(state.width_m)
-        action = None
+        action, inferring = None, False
         started = time.perf_counter()
         if frame is not None and not problem:
-            inferring = self._policy.will_infer
-            action = self._policy.act(frame.depth, state.vector())
+            action = self._try_again(state)
+            if action is None:
+                inferring = self._policy.will_infer
+                action = self._policy.act(frame.depth, state.vector())
             if inferring:
                 timings.infer_s.append(time.perf_counter() - started)
         acting = time.perf_counter()
@@ -206,6 +210,16 @@ class ControlLoop:
         if action is not None and inferring:
             timings.latency_s.append(ended - started)
         return Step(self._report.steps, frame, state, None if problem else action, target)
+
+    def _try_again(self, state: RobotState) -> np.ndarray | None:
+        """(8,) action of a hand that tries again, None where the policy is to act."""
+        if self._retry is None:
+            return None
+        action = self._retry(state.vector())
+        if self._retry.begun:
+            self._log("retry", self._retry.begun)
+            self._policy.restart()
+        return action
 
     def _sense_camera(self) -> tuple[Frame | None, str]:
         """The newest frame and why it cannot be used ("" if it can)."""
@@ -250,6 +264,8 @@ class ControlLoop:
         self._safety.stopped()
         # The arm stands still, so after the gap one frame repeated is what three frames would show.
         self._policy.forget()
+        if self._retry is not None:
+            self._retry.reset()
         self._report.holds += 1
         kind = reason.split(":")[0]
         if kind != self._held_for:

@@ -79,6 +79,10 @@ class OnnxPolicy:
     def reset(self, seed: int) -> None:
         """Start of an episode: forget all frames, draw noise from `seed`."""
         self._rng = np.random.default_rng(seed)
+        self.restart()
+
+    def restart(self) -> None:
+        """Something else acts for a while: what is seen and begun now does not count, draws go on."""
         self._latch.reset()
         self.forget()
 

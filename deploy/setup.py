@@ -13,7 +13,7 @@ the control unit stops an arm that asks for more than its range."""
 
 def loop_settings(config: DeployConfig, info: PolicyMetadata) -> LoopSettings:
     """The policy's own rate, the configured patience."""
-    return LoopSettings(period_s=1.0 / info.control_hz, stale_periods=config.stale_periods)
+    return LoopSettings(1.0 / info.control_hz, config.stale_periods, config.retry)
 
 
 def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim") -> SafetyFilter:

@@ -59,6 +59,8 @@ class Series:
     depth: TreatmentName = RECORDED
     """What the policy sees: depth as recorded, inpaint (holes filled on line), or monocular (a network on
     colour, made metric by recorded depth)."""
+    retry: bool = True
+    """Whether a hand that stands still, or has closed on nothing, tries again (`deploy.retry`)."""
 
     def names(self) -> tuple[str, ...]:
         """The objects. UserError for an unknown one, or a choice that the rig does not have."""
@@ -84,7 +86,8 @@ class Series:
         if not policy.is_file():
             raise UserError(f"{policy}: no such file; make one with `ddgrasp export`.")
         world = replace(config.world, objects=_trained())
-        config = replace(config, seed=seeds.seed(self.split, self.number), world=world)
+        deploy = replace(config.deploy, retry=self.retry)
+        config = replace(config, seed=seeds.seed(self.split, self.number), world=world, deploy=deploy)
         return lasting(config, self.seconds)
 
     def make(

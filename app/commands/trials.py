@@ -35,6 +35,8 @@ class DeployTrials:
     """On rig fr3: newtons at the hand, and newton metres, at which the arm stops itself."""
     depth: Literal["recorded", "inpaint", "monocular"] = "recorded"
     """What the policy sees: recorded, inpaint (holes filled on line), or monocular (a network on colour)."""
+    retry: bool = True
+    """A hand that stands still or has closed on nothing tries again; --no-retry lets the policy alone act."""
     preset: str | None = None
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
     workers: Annotated[int, Range(1, 64)] = 2
@@ -61,6 +63,7 @@ class DeployTrials:
             self.seconds,
             self.contact,
             self.depth,
+            self.retry,
         )
         config = config_of(self.policy, self.preset)
         progress = Progress(name="deploy trials")

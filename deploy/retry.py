@@ -1,0 +1,114 @@
+"""What a hand that stands still or has closed on nothing does: it closes, or looks again from above.
+
+A policy sees three frames, 0.3 s. Nothing tells it that it has stood for a second around something taller
+than it believes, waiting to get lower, or that it closes beside the object again and again, where its own
+hand hides what it looks for. Time and the fingers' opening tell that without a camera.
+"""
+
+from collections import deque
+
+import numpy as np
+from jaxtyping import Float
+
+from ddgrasp import contract
+from ddgrasp.gripper import CLOSE
+from ddgrasp.layout import ACTION, STATE
+from deploy.kinematics import grip_position
+
+EMPTY_WIDTH_M = 0.006
+"""A closed hand narrower than this holds nothing."""
+EMPTY_STEPS = 2
+"""Control steps in a row for which it is to be so."""
+STILL_STEPS, STILL_M = 10, 0.010
+"""A hand stands still that has moved by less within so many control steps."""
+OPEN_WIDTH_M = 0.07
+"""Fingers are open that are farther apart."""
+LOW_M = 0.20
+"""Only below this height of the grip does standing still mean that it is at something."""
+CLOSING_STEPS = 10
+"""Control steps given to fingers to close: a Franka Hand's from open to shut, and two."""
+ABOVE_M = 0.22
+"""Where a hand that went up is high enough to look again, height of the grip."""
+RETREAT_STEPS = 25
+"""Control steps after which it looks again in any case."""
+OPEN = -1.0
+"""The gripper's command while it goes up."""
+
+
+class Retry:
+    """Acts instead of the policy for a while; call it with the robot's state in every control step.
+
+    A hand that is empty goes up with open fingers, towards the start pose. One that stands still, low and
+    open, closes once; if it comes to stand still again, it goes up.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Start of an episode, or the arm was held: what was before does not count."""
+        self.begun = ""
+        """Why it took over in the last call, empty if it did not."""
+        self._forget()
+        self._closed_once = False
+
+    def __call__(self, state: Float[np.ndarray, "8"]) -> Float[np.ndarray, "8"] | None:
+        """(8,) action for the state (8,), None where the policy is to act."""
+        self.begun = ""
+        grip_m = grip_position(state[STATE.arm].astype(np.float64))
+        self._places.append(grip_m)
+        self._widths.append(float(state[STATE.width][0]))
+        if not (self._closing or self._retreat):
+            self._look(grip_m)
+        if self._closing:
+            self._closing -= 1
+            if not self._closing:
+                self._forget()
+            return _still(CLOSE)
+        if self._retreat:
+            self._retreat -= 1
+            if not self._retreat or (grip_m[2] > ABOVE_M and self._widths[-1] > OPEN_WIDTH_M):
+                self._forget()
+            return _homeward(state)
+        return None
+
+    def _look(self, grip_m: Float[np.ndarray, "3"]) -> None:
+        """Whether to take over, and how."""
+        widths = [*self._widths]
+        if len(widths) >= EMPTY_STEPS and max(widths[-EMPTY_STEPS:]) < EMPTY_WIDTH_M:
+            self._go_up(f"the hand closed to {1e3 * widths[-1]:.1f} mm, on nothing")
+        elif len(widths) > STILL_STEPS and self._stands(grip_m):
+            reason = f"the open hand has stood still for {STILL_STEPS * contract.CONTROL_DT_S:.0f} s"
+            if self._closed_once:
+                self._go_up(f"{reason} again")
+            else:
+                self.begun, self._closing, self._closed_once = f"{reason}; closes", CLOSING_STEPS, True
+
+    def _stands(self, grip_m: Float[np.ndarray, "3"]) -> bool:
+        moved_m = float(np.linalg.norm(self._places[0] - grip_m))
+        return moved_m < STILL_M and min(self._widths) > OPEN_WIDTH_M and float(grip_m[2]) < LOW_M
+
+    def _go_up(self, reason: str) -> None:
+        self.begun, self._retreat, self._closed_once = (
+            f"{reason}; goes up to look again",
+            RETREAT_STEPS,
+            False,
+        )
+
+    def _forget(self) -> None:
+        self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
+        self._widths: deque[float] = deque(maxlen=STILL_STEPS + 1)
+        self._closing = self._retreat = 0
+
+
+def _still(gripper: float) -> Float[np.ndarray, "8"]:
+    action = np.zeros(contract.ACTION_SIZE)
+    action[ACTION.gripper] = gripper
+    return action
+
+
+def _homeward(state: Float[np.ndarray, "8"]) -> Float[np.ndarray, "8"]:
+    action = _still(OPEN)
+    way_rad = np.array(contract.HOME_RAD) - state[STATE.arm]
+    action[ACTION.arm] = np.clip(way_rad / contract.ACTION_SCALE_RAD, -1.0, 1.0)
+    return action

@@ -1,0 +1,107 @@
+"""A hand that stands still or has closed on nothing: what it does instead of the policy, and when not."""
+
+import numpy as np
+import pytest
+
+from ddgrasp import contract
+from ddgrasp.layout import ACTION, STATE, closes
+from deploy.clock import SimClock
+from deploy.kinematics import grip_position
+from deploy.loop import ControlLoop, LoopSettings
+from deploy.policy import OnnxPolicy
+from deploy.retry import (
+    ABOVE_M,
+    CLOSING_STEPS,
+    EMPTY_STEPS,
+    LOW_M,
+    RETREAT_STEPS,
+    STILL_STEPS,
+    Retry,
+)
+from deploy.safety import SafetyFilter, SafetyLimits
+from deploy_support import KinematicRobot, ScriptedCamera, constant_bias, depth_mm, describe, write_policy
+
+HOME = np.array(contract.HOME_RAD)
+LOW = HOME + np.array([0, 0.2, 0, 0, 0, 0, 0])
+"""At an object: the grip is lower than `LOW_M`."""
+OPEN, HOLDING, SHUT = 0.08, 0.05, 0.0
+
+
+def state(q_rad: np.ndarray, width_m: float) -> np.ndarray:
+    return np.append(q_rad, width_m)
+
+
+def told(retry: Retry, q_rad: np.ndarray, width_m: float, steps: int) -> list[np.ndarray | None]:
+    return [retry(state(q_rad, width_m)) for _ in range(steps)]
+
+
+def test_the_poses_are_where_they_are_said_to_be():
+    assert grip_position(LOW)[2] < LOW_M < ABOVE_M < grip_position(HOME)[2]
+
+
+def test_a_low_open_hand_that_stands_still_closes_once_then_goes_up_to_the_start_pose():
+    retry = Retry()
+    assert told(retry, LOW, OPEN, STILL_STEPS) == [None] * STILL_STEPS
+    action = retry(state(LOW, OPEN))
+    assert action is not None and closes(action) and not action[ACTION.arm].any()
+    assert retry.begun == "the open hand has stood still for 1 s; closes"
+    assert all(closes(a) for a in told(retry, LOW, HOLDING, CLOSING_STEPS - 1))
+    assert not retry.begun, "said once"
+    assert told(retry, LOW, OPEN, STILL_STEPS) == [None] * STILL_STEPS, "the policy has it again"
+    action = retry(state(LOW, OPEN))
+    assert action is not None and not closes(action) and "goes up" in retry.begun
+    np.testing.assert_allclose(
+        LOW + contract.ACTION_SCALE_RAD * action[ACTION.arm], HOME - [0, -0.1, *[0] * 5]
+    )
+    assert retry(state(HOME, OPEN)) is not None
+    assert retry(state(HOME, OPEN)) is None, "it is high and open: the policy looks"
+
+
+def test_a_hand_that_closed_on_nothing_opens_and_goes_up_for_a_while_at_most():
+    retry = Retry()
+    assert told(retry, LOW, SHUT, EMPTY_STEPS - 1) == [None] * (EMPTY_STEPS - 1)
+    way_up = told(retry, LOW, SHUT, RETREAT_STEPS)
+    assert all(a is not None and not closes(a) and a[ACTION.arm].any() for a in way_up)
+    assert told(retry, LOW, OPEN, 1) == [None], "an arm that cannot get up does not try for ever"
+
+
+@pytest.mark.parametrize(
+    ("q_rad", "width_m", "drift_rad"),
+    [(LOW, HOLDING, 0.0), (HOME, OPEN, 0.0), (LOW, OPEN, 0.003)],
+    ids=["it holds something", "it waits above", "it moves, slowly"],
+)
+def test_it_leaves_alone(q_rad, width_m, drift_rad):
+    retry = Retry()
+    for step in range(4 * STILL_STEPS):
+        assert retry(state(q_rad - [drift_rad * step, *[0] * 6], width_m)) is None
+    assert STATE.size == 8
+
+
+def test_what_was_before_a_reset_does_not_count():
+    retry = Retry()
+    told(retry, LOW, OPEN, STILL_STEPS)
+    retry.reset()
+    assert retry(state(LOW, OPEN)) is None
+
+
+def test_the_loop_says_so_and_lets_the_policy_begin_anew(tmp_path):
+    def run(retry: bool):
+        clock = SimClock()
+        policy = OnnxPolicy(
+            write_policy(tmp_path / "p.onnx", describe(), bias=constant_bias(0.0, gripper=1.0))
+        )
+        robot = KinematicRobot(clock)
+        limits = SafetyLimits(acceleration_rad_s2=(1e6,) * 7)
+        loop = ControlLoop(
+            ScriptedCamera(clock, [depth_mm()]), robot, policy, SafetyFilter(limits, 0.1), clock,
+            LoopSettings(0.1, retry=retry),
+        )  # fmt: skip
+        closed = []
+        report = loop.run(7, lambda step: closed.append(bool(closes(step.action))))
+        return closed, [(event.step, event.kind) for event in report.events if event.kind == "retry"], report
+
+    closed, events, report = run(retry=True)
+    # Shut from step 1 on, seen twice, open in steps 2 and 3 (the start pose is high), then the policy again.
+    assert closed == [True, True, False, False, True, True, False] and events == [(2, "retry"), (6, "retry")]
+    assert len(report.timings.infer_s) == 4, "the policy is not asked meanwhile"
+    assert run(retry=False)[:2] == ([True] * 7, [])
