@@ -191,12 +191,11 @@ class ControlLoop:
         action, inferring = None, False
         started = time.perf_counter()
         if frame is not None and not problem:
-            action = self._try_again(state)
-            if action is None:
-                inferring = self._policy.will_infer
-                action = self._policy.act(frame.depth, state.vector())
+            inferring = self._policy.will_infer
+            action = self._policy.act(frame.depth, state.vector())
             if inferring:
                 timings.infer_s.append(time.perf_counter() - started)
+            action = self._or_retry(state, action)
         acting = time.perf_counter()
         target = None
         if action is not None:
@@ -211,15 +210,16 @@ class ControlLoop:
             timings.latency_s.append(ended - started)
         return Step(self._report.steps, frame, state, None if problem else action, target)
 
-    def _try_again(self, state: RobotState) -> np.ndarray | None:
-        """(8,) action of a hand that tries again, None where the policy is to act."""
-        if self._retry is None:
-            return None
-        action = self._retry(state.vector())
+    def _or_retry(self, state: RobotState, action: np.ndarray) -> np.ndarray:
+        """(8,) `action`, or what a hand does that tries again, after which the policy begins anew."""
+        instead = None if self._retry is None else self._retry(state.vector())
+        if instead is None:
+            return action
+        assert self._retry is not None
         if self._retry.begun:
             self._log("retry", self._retry.begun)
-            self._policy.restart()
-        return action
+        self._policy.restart()
+        return instead
 
     def _sense_camera(self) -> tuple[Frame | None, str]:
         """The newest frame and why it cannot be used ("" if it can)."""

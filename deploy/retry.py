@@ -2,7 +2,9 @@
 
 A policy sees three frames, 0.3 s. Nothing tells it that it has stood for a second around something taller
 than it believes, waiting to get lower, or that it closes beside the object again and again, where its own
-hand hides what it looks for. Time and the fingers' opening tell that without a camera.
+hand hides what it looks for. Nor does it know that it has done what it was trained for, in episodes of 6 s:
+it goes on, its elbow drifts, and after a minute it is where no training was. Time and the fingers' opening
+tell all of that without a camera.
 """
 
 from collections import deque
@@ -31,6 +33,10 @@ ABOVE_M = 0.22
 """Where a hand that went up is high enough to look again, height of the grip."""
 RETREAT_STEPS = 25
 """Control steps after which it looks again in any case."""
+WIDEST_HELD_M = contract.GRIPPER_MAX_WIDTH_M - 0.002
+"""Fingers that are closer than this, and not `EMPTY_WIDTH_M`, hold something."""
+DONE_STEPS = 20
+"""Control steps in a row that a hand has held something where objects are lifted to: it is done."""
 OPEN = -1.0
 """The gripper's command while it goes up."""
 
@@ -39,7 +45,8 @@ class Retry:
     """Acts instead of the policy for a while; call it with the robot's state in every control step.
 
     A hand that is empty goes up with open fingers, towards the start pose. One that stands still, low and
-    open, closes once; if it comes to stand still again, it goes up.
+    open, closes once; if it comes to stand still again, it goes up. One that has lifted something stays there
+    for as long as it has it.
     """
 
     def __init__(self) -> None:
@@ -51,6 +58,8 @@ class Retry:
         """Why it took over in the last call, empty if it did not."""
         self._forget()
         self._closed_once = False
+        self._lifted_steps = 0
+        self._stay_rad: np.ndarray | None = None
 
     def __call__(self, state: Float[np.ndarray, "8"]) -> Float[np.ndarray, "8"] | None:
         """(8,) action for the state (8,), None where the policy is to act."""
@@ -58,6 +67,8 @@ class Retry:
         grip_m = grip_position(state[STATE.arm].astype(np.float64))
         self._places.append(grip_m)
         self._widths.append(float(state[STATE.width][0]))
+        if (stay := self._stay(state, grip_m)) is not None:
+            return stay
         if not (self._closing or self._retreat):
             self._look(grip_m)
         if self._closing:
@@ -69,8 +80,21 @@ class Retry:
             self._retreat -= 1
             if not self._retreat or (grip_m[2] > ABOVE_M and self._widths[-1] > OPEN_WIDTH_M):
                 self._forget()
-            return _homeward(state)
+            return _towards(np.array(contract.HOME_RAD), state, OPEN)
         return None
+
+    def _stay(self, state: Float[np.ndarray, "8"], grip_m: Float[np.ndarray, "3"]) -> np.ndarray | None:
+        """(8,) action of a hand that has held something at the lift's place for long enough; else None."""
+        away_m = float(np.linalg.norm(grip_m - contract.LIFT_TARGET_M))
+        there = self._stay_rad is not None or away_m < contract.LIFT_TOLERANCE_M
+        if not (there and EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M):
+            self._lifted_steps, self._stay_rad = 0, None
+            return None
+        self._lifted_steps += 1
+        if self._lifted_steps == DONE_STEPS:
+            self._stay_rad = np.array(state[STATE.arm])
+            self.begun = "what was grasped is lifted; stays there"
+        return None if self._stay_rad is None else _towards(self._stay_rad, state, CLOSE)
 
     def _look(self, grip_m: Float[np.ndarray, "3"]) -> None:
         """Whether to take over, and how."""
@@ -89,11 +113,8 @@ class Retry:
         return moved_m < STILL_M and min(self._widths) > OPEN_WIDTH_M and float(grip_m[2]) < LOW_M
 
     def _go_up(self, reason: str) -> None:
-        self.begun, self._retreat, self._closed_once = (
-            f"{reason}; goes up to look again",
-            RETREAT_STEPS,
-            False,
-        )
+        self.begun = f"{reason}; goes up to look again"
+        self._retreat, self._closed_once = RETREAT_STEPS, False
 
     def _forget(self) -> None:
         self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
@@ -107,8 +128,8 @@ def _still(gripper: float) -> Float[np.ndarray, "8"]:
     return action
 
 
-def _homeward(state: Float[np.ndarray, "8"]) -> Float[np.ndarray, "8"]:
-    action = _still(OPEN)
-    way_rad = np.array(contract.HOME_RAD) - state[STATE.arm]
+def _towards(q_rad: Float[np.ndarray, "7"], state: Float[np.ndarray, "8"], gripper: float) -> np.ndarray:
+    action = _still(gripper)
+    way_rad = np.asarray(q_rad) - state[STATE.arm]
     action[ACTION.arm] = np.clip(way_rad / contract.ACTION_SCALE_RAD, -1.0, 1.0)
     return action

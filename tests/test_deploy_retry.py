@@ -12,6 +12,7 @@ from deploy.policy import OnnxPolicy
 from deploy.retry import (
     ABOVE_M,
     CLOSING_STEPS,
+    DONE_STEPS,
     EMPTY_STEPS,
     LOW_M,
     RETREAT_STEPS,
@@ -77,6 +78,21 @@ def test_it_leaves_alone(q_rad, width_m, drift_rad):
     assert STATE.size == 8
 
 
+def test_a_hand_that_has_lifted_something_stays_there_until_it_has_lost_it():
+    lifted = HOME + np.array([0, 0.09, 0, 0.53, 0, -0.58, 0])
+    assert np.linalg.norm(grip_position(lifted) - contract.LIFT_TARGET_M) < contract.LIFT_TOLERANCE_M
+    retry = Retry()
+    assert told(retry, lifted, HOLDING, DONE_STEPS - 1) == [None] * (DONE_STEPS - 1)
+    action = retry(state(lifted, HOLDING))
+    assert action is not None and closes(action) and not action[ACTION.arm].any()
+    assert retry.begun == "what was grasped is lifted; stays there"
+    drifted = lifted + 0.02
+    action = retry(state(drifted, HOLDING))
+    assert action is not None and not retry.begun
+    np.testing.assert_allclose(drifted + contract.ACTION_SCALE_RAD * action[ACTION.arm], lifted)
+    assert retry(state(lifted, OPEN)) is None, "it has dropped it: the policy's turn"
+
+
 def test_what_was_before_a_reset_does_not_count():
     retry = Retry()
     told(retry, LOW, OPEN, STILL_STEPS)
@@ -103,5 +119,5 @@ def test_the_loop_says_so_and_lets_the_policy_begin_anew(tmp_path):
     closed, events, report = run(retry=True)
     # Shut from step 1 on, seen twice, open in steps 2 and 3 (the start pose is high), then the policy again.
     assert closed == [True, True, False, False, True, True, False] and events == [(2, "retry"), (6, "retry")]
-    assert len(report.timings.infer_s) == 4, "the policy is not asked meanwhile"
+    assert len(report.timings.infer_s) == 7, "the policy goes on being asked, so that time is measured"
     assert run(retry=False)[:2] == ([True] * 7, [])
