@@ -13,7 +13,7 @@ VERSION = 10
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
 edges. 6: demos are trained on from their beginning. 7: a student leaves holes as they are. 8: a
-generator does not know where in the picture it is."""
+generator does not know where in the picture it is. 9: the policy alone acts in the loop."""
 
 VERSION_FIELD = "manifest_version"
 

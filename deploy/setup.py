@@ -12,7 +12,7 @@ the control unit stops an arm that asks for more than its range."""
 
 
 def loop_settings(config: DeployConfig, info: PolicyMetadata) -> LoopSettings:
-    """The policy's own rate, the configured patience."""
+    """The policy's own rate, the configured patience, whether a hand tries again."""
     return LoopSettings(1.0 / info.control_hz, config.stale_periods, config.retry)
 
 
