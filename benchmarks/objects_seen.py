@@ -3,10 +3,11 @@
     python -m benchmarks.objects_seen [--model RUN/ddg] [--windows 0 1 1.25 1.5] [--scenes 6]
 
 The twelve objects on the table, the arm at its start, the same scenes for every line. Object pixels are those
-more than 12 mm above the table within 10 cm of the object. A line has their number over clean depth's, and
-how far the mean of their points is from clean depth's, in millimetres, robot's base frame (x from the base to
-the camera, z up): mean, and root mean square over scenes. Lines `window` are clean depth through
-`ddg_jax.window.mixed`.
+more than 12 mm above the table within 10 cm of the object. A line has their number over clean depth's, how
+many of clean depth's are holes, by how much inverse depth is off in the whole picture (median and 99th
+percentile, 1/m), and how far the mean of the object's points is from clean depth's, in millimetres, robot's
+base frame (x from the base to the camera, z up): mean, and root mean square over scenes. Lines `window` are
+clean depth through `ddg_jax.window.mixed`.
 """
 
 import argparse
@@ -47,11 +48,15 @@ def main() -> None:
             made = generate(jax.random.key(0), generator, clean_m[None], episode=number)
             seen["generator"] = made.depth_m[0]
         truth = object_points(clean_m, T_world_cam, object_m)
+        shown = object_pixels(clean_m, T_world_cam, object_m)
         for name, depth_m in seen.items():
             points = object_points(depth_m, T_world_cam, object_m)
             moved_mm = 1e3 * (points.mean(0) - truth.mean(0)) if len(points) else np.full(3, np.nan)
-            rows.setdefault(name, []).append(np.array([len(points) / len(truth), *moved_mm]))
-    print(f"{'':16}{'pixels':>8}   x, y, z: mean, mm        root mean square, mm")
+            values = [len(points) / len(truth), np.mean(depth_m[shown] == 0), *off_per_m(depth_m, clean_m)]
+            rows.setdefault(name, []).append(np.array([*values, *moved_mm]))
+    print(
+        f"{'':16}{'pixels':>8}{'holes':>8}   off, 1/m: p50, p99   x, y, z, mm: mean        root mean square"
+    )
     for name, values in rows.items():
         print(_line(name, np.stack(values)))
 
@@ -73,22 +78,38 @@ def scenes(count: int) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray
         yield number, to_metres(clean_mm), to_metres(sensed_mm), pose, world.data.qpos[QPOS.object_pos].copy()
 
 
+def off_per_m(depth_m: np.ndarray, clean_m: np.ndarray) -> np.ndarray:
+    """(2,) median and 99th percentile of |1/d - 1/d_clean|, 1/m, where (H, W) depth has both."""
+    valid = (depth_m > 0) & (clean_m > 0)
+    return np.percentile(np.abs(1 / depth_m[valid] - 1 / clean_m[valid]), [50, 99])
+
+
 def object_points(depth_m: np.ndarray, T_world_cam: np.ndarray, object_m: np.ndarray) -> np.ndarray:
     """(N, 3) metres, world frame: points of the object in (H, W) depth."""
+    return _points(depth_m, T_world_cam)[object_pixels(depth_m, T_world_cam, object_m)]
+
+
+def object_pixels(depth_m: np.ndarray, T_world_cam: np.ndarray, object_m: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels of the object in (H, W) depth."""
+    points = _points(depth_m, T_world_cam)
+    near = np.linalg.norm(points[..., :2] - object_m[:2], axis=-1) < NEAR_M
+    return (depth_m > 0) & near & (points[..., 2] > ABOVE_TABLE_M)
+
+
+def _points(depth_m: np.ndarray, T_world_cam: np.ndarray) -> np.ndarray:
+    """(H, W, 3) metres, world frame."""
     lens = nominal_camera(contract.D455.scaled(depth_m.shape[1] / contract.D455.width_px))
     v, u = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]]
     rays = np.stack([(u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px, np.ones_like(u)], axis=-1)
-    points = (depth_m[..., None] * rays) @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
-    near = np.linalg.norm(points[..., :2] - object_m[:2], axis=-1) < NEAR_M
-    return points[(depth_m > 0) & near & (points[..., 2] > ABOVE_TABLE_M)]
+    return (depth_m[..., None] * rays) @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
 
 
 def _line(name: str, values: np.ndarray) -> str:
-    pixels, moved = np.nanmean(values[:, 0]), values[:, 1:]
+    (pixels, holes, p50, p99), moved = np.nanmean(values[:, :4], 0), values[:, 4:]
     texts: Sequence[str] = [
         "".join(f"{v:7.1f}" for v in row) for row in (np.nanmean(moved, 0), np.sqrt(np.nanmean(moved**2, 0)))
     ]
-    return f"{name:16}{pixels:8.2f}{texts[0]}    {texts[1]}"
+    return f"{name:16}{pixels:8.2f}{holes:8.1%}{p50:14.5f}{p99:9.5f}{texts[0]}    {texts[1]}"
 
 
 if __name__ == "__main__":

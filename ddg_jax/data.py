@@ -13,12 +13,13 @@ from ddg_jax.piecewise import piecewise_smooth
 from ddg_jax.prior import Prior
 from ddg_jax.representation import encode
 from ddgrasp import artifacts
-from ddgrasp.config import PIECEWISE, DDGConfig
+from ddgrasp.config import PIECEWISE, PLANES, DDGConfig
 from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from sensors.recordings.recording import Recording, find_recordings, is_recording
 from sensors.statistics.holes import fill_from_background, smooth_surface
+from sensors.statistics.planes import on_planes
 
 LEAST_KEPT = 0.98
 """Share of a frame below which it is said that the generator sees a window of it."""
@@ -127,7 +128,8 @@ def surfaces(
     frames = depth_m if progress is None else progress.track(depth_m, "surfaces")
     if kind == PIECEWISE:
         return np.stack([invert(piecewise_smooth(invert(frame))) for frame in frames])
-    return np.stack([invert(smooth_surface(fill_from_background(invert(frame)))) for frame in frames])
+    smooth = (smooth_surface(fill_from_background(invert(frame))) for frame in frames)
+    return np.stack([invert(frame) for frame in (map(on_planes, smooth) if kind == PLANES else smooth)])
 
 
 def _folders(root: Path) -> list[Path]:

@@ -7,7 +7,8 @@ where the holes were, or the generator would look for traces of filling that cle
 Three things hide them: filled pixels take the background's depth of their own row (the true surface behind an
 occlusion shadow), c is smoothed (which hides the noise of recorded surfaces too), and some frames are filled
 under decoy holes as well. With `surface` piecewise, planes with sharp edges take the place of filling and
-smoothing.
+smoothing; with planes, large ones are made flat besides, since what the camera bends there would show in c
+and never does in simulation.
 """
 
 from collections.abc import Iterable
@@ -20,8 +21,9 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from ddg_jax.inverse_depth import invert, normalise
 from ddg_jax.network_prior import NETWORKS, DepthNetworkPrior
 from ddg_jax.piecewise import piecewise_smooth
-from ddgrasp.config import FILTERED, PIECEWISE, DDGConfig
+from ddgrasp.config import FILTERED, PIECEWISE, PLANES, DDGConfig
 from sensors.statistics.holes import fill_from_background, smooth_surface
+from sensors.statistics.planes import on_planes
 
 NEAREST_M = 0.15
 """Closer than any reading of the D435 that the metric prior was tried on (0.23 m): c stays the same from here
@@ -88,7 +90,8 @@ class InverseDepthPrior:
         if self.surface == PIECEWISE:
             return self._scaled(self._blurred([piecewise_smooth(frame) for frame in inverse]))
         filled = np.stack([fill_from_background(frame) for frame in inverse])
-        return self._scaled(self._blurred(map(smooth_surface, smooth_in_time(filled))))
+        smooth = map(smooth_surface, smooth_in_time(filled))
+        return self._scaled(self._blurred(map(on_planes, smooth) if self.surface == PLANES else smooth))
 
     def from_sim(
         self, depth_m: Float[np.ndarray, "T H W"], rgb: UInt8[np.ndarray, "T h w 3"] | None = None

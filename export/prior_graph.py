@@ -12,7 +12,7 @@ from onnx import TensorProto
 from ddg_jax.inverse_depth import NORMALISED_LIMIT, STATISTICS_STRIDE
 from ddg_jax.network_prior import NETWORKS
 from ddg_jax.prior import NEAREST_M, MetricInverseDepthPrior
-from ddgrasp.config import FILTERED, DDGConfig
+from ddgrasp.config import PIECEWISE, DDGConfig
 from ddgrasp.errors import UserError
 from export.builder import GraphBuilder
 from sensors.statistics import holes
@@ -36,7 +36,7 @@ def write_prior(g: GraphBuilder, depth: str, config: DDGConfig) -> str:
     inverse = write_inverse(g, depth)
     if prior.source in NETWORKS:
         return write_normalised(g, inverse, size)
-    if config.depth.surface == FILTERED:
+    if config.depth.surface != PIECEWISE:
         inverse = write_bilateral(g, write_median(g, inverse, size), size)
     if prior.blur_px > 0:
         inverse = write_blur(g, inverse, prior.blur_px)

@@ -55,7 +55,9 @@ OPTIONS = {
         unet=replace(SMALL.unet, attention_heads=0),
         sampling=SamplingConfig(sampler="ddpm", steps=5, spacing="trailing"),
     ),
-    "a network that knows where it is": replace(SMALL, unet=replace(SMALL.unet, position=True)),
+    "a network that knows where it is, large planes": replace(
+        SMALL, unet=replace(SMALL.unet, position=True), depth=replace(SMALL.depth, surface="planes")
+    ),
     "distilled": replace(SMALL, sampling=SamplingConfig(sampler="progressive", steps=2)),
 }
 

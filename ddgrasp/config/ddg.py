@@ -21,8 +21,8 @@ from ddgrasp.errors import UserError
 
 Representation = Literal["depth", "deviation"]
 DEPTH, DEVIATION = REPRESENTATIONS = get_args(Representation)
-Surface = Literal["filtered", "piecewise"]
-FILTERED, PIECEWISE = SURFACES = get_args(Surface)
+Surface = Literal["filtered", "planes", "piecewise"]
+FILTERED, PLANES, PIECEWISE = SURFACES = get_args(Surface)
 PriorSource = Literal["inverse_depth", "metric_inverse_depth", "video_depth_anything", "depth_anything_v2"]
 PriorInSim = Literal["depth", "rgb"]
 DType = Literal["float32", "bfloat16"]
@@ -58,8 +58,10 @@ class DDGDepthConfig(Section, name="ddg.depth"):
     far_m: _Metres = 10.0
     """Farthest depth that is told apart (representation depth), and that a monocular baseline may have."""
     surface: Surface = "filtered"
-    """The surface that recorded depth deviates from: filtered (fast), or piecewise (planes with sharp edges;
-    nearer to the truth, 0.1 to 0.3 s a frame; ddg_jax/piecewise.py)."""
+    """The surface that recorded depth deviates from: filtered (errors wider than 9 px are lost), planes (the
+    same, but tables, floors and walls are flat, so that the bumps that a stereo camera sees in them are
+    learnt; sensors/statistics/planes.py), or piecewise (small planes with sharp edges, 0.1 to 0.4 s a
+    frame; ddg_jax/piecewise.py)."""
 
     def check(self) -> None:
         """See `Section.check`."""
