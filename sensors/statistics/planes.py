@@ -13,10 +13,10 @@ TOLERANCE_PER_M = 0.015
 (0.0075; 0.24 px of a D455's disparity at 320 px), half of what a 3 cm
 high object on a table 1 m away is off."""
 LEAST_SHARE = 0.05
-"""Of the picture: smaller planes are left as they are."""
+"""Share of the picture: smaller planes are left as they are."""
 MOST_PLANES = 3
 MARGIN_SHARE = 1 / 50
-"""Of the picture's width: so near to anything that is not on the plane, the plane does not count."""
+"""Share of the picture's width: so near to anything that is not on the plane, the plane does not count."""
 STRIDE_PX = 4
 """Planes are looked for among every so many pixels."""
 _TRIALS = 60
