@@ -47,10 +47,9 @@ def main() -> None:
         if generator is not None:
             made = generate(jax.random.key(0), generator, clean_m[None], episode=number)
             seen["generator"] = made.depth_m[0]
-        truth = object_points(clean_m, T_world_cam, object_m)
-        shown = object_pixels(clean_m, T_world_cam, object_m)
+        shown, truth = object_points(clean_m, T_world_cam, object_m)
         for name, depth_m in seen.items():
-            points = object_points(depth_m, T_world_cam, object_m)
+            _, points = object_points(depth_m, T_world_cam, object_m)
             moved_mm = 1e3 * (points.mean(0) - truth.mean(0)) if len(points) else np.full(3, np.nan)
             values = [len(points) / len(truth), np.mean(depth_m[shown] == 0), *off_per_m(depth_m, clean_m)]
             rows.setdefault(name, []).append(np.array([*values, *moved_mm]))
@@ -84,24 +83,17 @@ def off_per_m(depth_m: np.ndarray, clean_m: np.ndarray) -> np.ndarray:
     return np.percentile(np.abs(1 / depth_m[valid] - 1 / clean_m[valid]), [50, 99])
 
 
-def object_points(depth_m: np.ndarray, T_world_cam: np.ndarray, object_m: np.ndarray) -> np.ndarray:
-    """(N, 3) metres, world frame: points of the object in (H, W) depth."""
-    return _points(depth_m, T_world_cam)[object_pixels(depth_m, T_world_cam, object_m)]
-
-
-def object_pixels(depth_m: np.ndarray, T_world_cam: np.ndarray, object_m: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels of the object in (H, W) depth."""
-    points = _points(depth_m, T_world_cam)
-    near = np.linalg.norm(points[..., :2] - object_m[:2], axis=-1) < NEAR_M
-    return (depth_m > 0) & near & (points[..., 2] > ABOVE_TABLE_M)
-
-
-def _points(depth_m: np.ndarray, T_world_cam: np.ndarray) -> np.ndarray:
-    """(H, W, 3) metres, world frame."""
+def object_points(
+    depth_m: np.ndarray, T_world_cam: np.ndarray, object_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """((H, W) bool pixels of the object in (H, W) depth, (N, 3) metres: their points, world frame)."""
     lens = nominal_camera(contract.D455.scaled(depth_m.shape[1] / contract.D455.width_px))
     v, u = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]]
     rays = np.stack([(u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px, np.ones_like(u)], axis=-1)
-    return (depth_m[..., None] * rays) @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+    points = (depth_m[..., None] * rays) @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+    near = np.linalg.norm(points[..., :2] - object_m[:2], axis=-1) < NEAR_M
+    pixels = (depth_m > 0) & near & (points[..., 2] > ABOVE_TABLE_M)
+    return pixels, points[pixels]
 
 
 def _line(name: str, values: np.ndarray) -> str:

@@ -46,6 +46,11 @@ def test_what_has_no_large_plane_stays():
     assert np.mean(on_planes(ball) != ball) < 0.2
 
 
+def test_a_picture_too_small_for_planes_stays():
+    tiny = np.array([[0.5, 0.5], [0.5, 2.0]], np.float32)
+    np.testing.assert_array_equal(on_planes(tiny), tiny)
+
+
 def test_two_planes_each_become_flat(bumps):
     wall = np.where(V < 80, 0.45, 0.45 + 0.004 * (V - 80)).astype(np.float32)
     made = on_planes(wall + bumps)

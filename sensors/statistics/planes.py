@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Float32
 
 TOLERANCE_PER_M = 0.015
 """How far off a plane its own pixels may be, in inverse depth: twice the 90th percentile of the rig's camera
-(0.0075; 0.24 px of a D455's disparity at 320 px), half of what a 3 cm
-high object on a table 1 m away is off."""
+(0.0075; 0.24 px of a D455's disparity at 320 px), half of what a 3 cm high object on a table 1 m away is off.
+"""
 LEAST_SHARE = 0.05
 """Share of the picture: smaller planes are left as they are."""
 MOST_PLANES = 3
@@ -20,6 +20,8 @@ MARGIN_SHARE = 1 / 50
 STRIDE_PX = 4
 """Planes are looked for among every so many pixels."""
 _TRIALS = 60
+_POINTS = 3
+"""What a plane goes through."""
 
 
 def on_planes(inverse: Float[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
@@ -50,7 +52,7 @@ def _largest(inverse: np.ndarray, left: Bool[np.ndarray, "H W"]) -> Float32[np.n
     from sklearn.linear_model import RANSACRegressor
 
     rows, columns = np.nonzero(left[::STRIDE_PX, ::STRIDE_PX])
-    if len(rows) < LEAST_SHARE * left[::STRIDE_PX, ::STRIDE_PX].size:
+    if len(rows) < max(_POINTS, LEAST_SHARE * left[::STRIDE_PX, ::STRIDE_PX].size):
         return None
     pixels = np.stack([rows, columns], axis=1) * STRIDE_PX
     values = inverse[pixels[:, 0], pixels[:, 1]]
