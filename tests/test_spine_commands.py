@@ -21,10 +21,17 @@ def shown(page: str) -> tuple[list[str], list[str]]:
     """(commands in fenced blocks, commands in running text) of a page, without `ddgrasp`."""
     text = (ROOT / page).read_text()
     blocks = re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    lines = [line for block in blocks for line in expanded(block.replace("\\\n", " ")).splitlines()]
     fenced = [match[1] for line in lines if (match := re.search(r"(?:^|\s|/)ddgrasp (.*)", line))]
     prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
     return fenced, re.findall(r"`(?:\.venv/bin/)?ddgrasp ([^`]*)`", prose)
+
+
+def expanded(block: str) -> str:
+    """A shell block with the variables that it sets (`NAME="..."`) put in where it uses them."""
+    while match := re.search(r'^([A-Z_]+)="(.*)"\n', block, re.MULTILINE):
+        block = block.replace(match[0], "").replace(f"${match[1]}", match[2])
+    return block
 
 
 def named(words: list[str]) -> str:
@@ -65,3 +72,8 @@ def test_a_command_that_does_not_exist_is_found():
     assert "--bogus" in refusal("run --bogus 3")
     assert "Unknown preset" in refusal("run --preset huge")
     assert refusal("run --preset debug --out runs/x  # a comment") == ""
+
+
+def test_variables_that_a_block_sets_are_put_in_where_it_uses_them():
+    block = 'A="--preset debug"\nB="$A --out runs/x"\nddgrasp run $B'
+    assert expanded(block) == "ddgrasp run --preset debug --out runs/x"
