@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp import contract, upgrades
-from ddgrasp.config import Config
+from ddgrasp.config import Config, ExportConfig
 from ddgrasp.errors import UserError
 from ddgrasp.files import TEMPORARY, atomic_write_json, read_json, to_json
 from ddgrasp.stages import config_fields, get_stage
@@ -25,6 +25,9 @@ from ddgrasp.stages import config_fields, get_stage
 MANIFEST = "manifest.json"
 STARTED = "started.json"
 
+_BOUNDS = {"export": {"max_abs_diff": ExportConfig.max_abs_diff}}
+"""Section -> fields that decide whether a result is accepted, not what it is. They count as these values when
+configurations are compared, so that a stage that missed its bound goes on with another one."""
 _LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
 
 
@@ -282,7 +285,13 @@ def library_versions() -> dict[str, str]:
 
 
 def _relevant(config: Mapping[str, Any], stage: str) -> dict[str, Any]:
-    return {name: config.get(name) for name in config_fields(get_stage(stage))}
+    fields = config_fields(get_stage(stage))
+    return {name: _without_bounds(name, config.get(name)) for name in fields}
+
+
+def _without_bounds(section: str, value: Any) -> Any:
+    bounds = _BOUNDS.get(section, {})
+    return value | bounds if bounds and isinstance(value, Mapping) else value
 
 
 def _hash(value: Any) -> str:

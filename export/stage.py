@@ -82,7 +82,8 @@ def measure(
     if not difference <= bound:
         raise UserError(
             f"The ONNX policy differs from JAX by {difference:.2e}, more than export.max_abs_diff = "
-            f"{bound:g}; nothing was written. Train longer, or raise the bound if so much is acceptable."
+            f"{bound:g}; nothing was written, the student is kept. If so much is acceptable, go on with "
+            f"--resume --export.max-abs-diff {2 * difference:.0e}; otherwise train longer."
         )
     inputs = parity.random_inputs(rng, 1, student, profile, dtype, _pick(frames_m, 1, rng))
     return {

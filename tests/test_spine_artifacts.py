@@ -96,6 +96,16 @@ def test_the_config_hash_covers_a_stage_and_what_it_is_made_from_only():
     assert artifacts.config_hash(reseeded, "teacher") != artifacts.config_hash(CONFIG, "teacher")
 
 
+def test_an_accepted_difference_is_no_part_of_what_a_stage_is(tmp_path):
+    looser = dataclasses.replace(CONFIG, export=dataclasses.replace(CONFIG.export, max_abs_diff=1e-3))
+    assert artifacts.config_hash(looser, "export") == artifacts.config_hash(CONFIG, "export")
+    artifacts.begin(tmp_path, "deploy", CONFIG)
+    (tmp_path / "student").touch()
+    artifacts.begin(tmp_path, "deploy", looser)
+    _finish(tmp_path / "export")
+    artifacts.require(tmp_path, "export", looser)
+
+
 def test_an_artifact_of_another_config_is_refused_naming_both_values(tmp_path):
     _finish(tmp_path / "export")
     other = dataclasses.replace(CONFIG, export=ExportConfig(latency_runs=7))
