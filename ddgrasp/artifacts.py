@@ -291,7 +291,7 @@ def _relevant(config: Mapping[str, Any], stage: str) -> dict[str, Any]:
 
 def _without_bounds(section: str, value: Any) -> Any:
     bounds = _BOUNDS.get(section, {})
-    return value | bounds if bounds and isinstance(value, Mapping) else value
+    return {**value, **bounds} if bounds and isinstance(value, Mapping) else value
 
 
 def _hash(value: Any) -> str:

@@ -37,10 +37,22 @@ _DEBUG_DDG = DDGConfig(
     training=DDGTrainingConfig(steps=20, batch_size=4, checkpoint_every=10),
     sampling=SamplingConfig(steps=2, batch_size=4),
 )
+_BUMPS = SamplingConfig(sampler="ddim", spacing="linspace", steps=6, deviation_correlation=0.5)
+"""Bumps are decided in strong noise, where linspace steps stop and quadratic ones hardly do."""
+_RIG_DDG = DDGConfig(
+    depth=DDGDepthConfig(surface="planes"),
+    unet=UNetConfig(position=True),
+    training=DDGTrainingConfig(steps=1000),
+    sampling=_BUMPS,
+)
+"""Bumps and places of the rig's camera are learnt, chosen by a student's success (docs/student.md)."""
 _PAPER_DDG = DDGConfig(
-    unet=UNetConfig(space_to_depth=2, widths=(96, 192, 384), blocks=(2, 2, 2), attention_heads=8),
+    depth=_RIG_DDG.depth,
+    unet=UNetConfig(
+        space_to_depth=2, widths=(96, 192, 384), blocks=(2, 2, 2), attention_heads=8, position=True
+    ),
     training=DDGTrainingConfig(steps=8000, batch_size=64, learning_rate=3e-4, ema_decay=0.999),
-    sampling=SamplingConfig(steps=10, batch_size=256),
+    sampling=replace(_BUMPS, steps=10, batch_size=256),
 )
 
 DEBUG = Config(
@@ -94,7 +106,7 @@ DEMO = Config(
     teacher=TeacherConfig(total_steps=300_000, eval_every=10),
     demos=DemosConfig(episodes=120),
     record=RecordConfig(trajectories=24),
-    ddg=DDGConfig(training=DDGTrainingConfig(steps=1000)),
+    ddg=_RIG_DDG,
     student=StudentConfig(
         init_from="pretrained/student",
         picture=PictureConfig(fill_holes=True),
@@ -114,7 +126,7 @@ LAPTOP = Config(
     teacher=TeacherConfig(total_steps=500_000, eval_every=10),
     demos=DemosConfig(episodes=240),
     record=RecordConfig(trajectories=80),
-    ddg=DDGConfig(training=DDGTrainingConfig(steps=1200), sampling=SamplingConfig(sampler="progressive")),
+    ddg=replace(_RIG_DDG, training=DDGTrainingConfig(steps=1200)),
     student=StudentConfig(
         picture=PictureConfig(fill_holes=True),
         training=StudentTrainingConfig(steps=1500, clean_share=0.3),
@@ -230,7 +242,9 @@ generator: at 320 x 180 (the paper does not say), drawing holes and deviations f
     depth itself (--ddg.depth.representation depth is the paper's; docs/generator.md compares them).
 prior: inverse depth, holes filled, where the paper has Video Depth Anything: its weights are not part of this
     repository (--ddg.prior.source video_depth_anything, once they are converted).
-sampler: DPM-Solver with 10 evaluations, where the paper goes through all K steps: 100 times the time.
+sampler: DDIM with 10 evaluations, where the paper goes through all K steps: 100 times the time.
+bumps: deviations are counted from planes, and the network knows where in the picture it is: what a student's
+    success was chosen by (docs/student.md); the paper says nothing of either.
 encoder: ResNet-18 from random numbers, where the paper's starts from ImageNet's weights, for the same reason
     (--student.encoder.weights weights/resnet18); its last stage keeps stride 16, and keypoints pool it.
 student: sees relief over the table instead of depth, its holes filled from around them, and has a hand view,

@@ -20,7 +20,7 @@ def test_calls_of_the_paper_preset_by_hand():
     assert found["ddg", "generator: train step"].calls == 8000
     assert found["student", "student: train step"].calls == 40_000 + 6 * 5000
     drawn = (1200 * 0.8 + 6 * 512 + 100) * 60 / 256
-    assert found["student", "sampler: dpm_solver"].calls == pytest.approx(drawn)
+    assert found["student", "sampler: ddim"].calls == pytest.approx(drawn)
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
