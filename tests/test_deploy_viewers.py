@@ -4,11 +4,13 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from app.commands import parse
+from app.commands import parse, play
 from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import PRETRAINED
@@ -195,3 +197,22 @@ def test_without_a_display_a_window_is_refused_before_anything_runs(monkeypatch,
     monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(UserError, match="--viewer mujoco: there is no display"):
         parse("play", ["--viewer", "mujoco"]).run()
+
+
+@pytest.mark.parametrize(
+    ("terminal", "display", "rerun", "out", "chosen"),
+    [
+        (True, True, True, None, "mujoco"),
+        (True, False, True, None, "web"),
+        (True, False, False, None, "film"),
+        (False, True, True, None, "film"),
+        (True, True, True, Path("a.mp4"), "film"),
+    ],
+)
+def test_the_viewer_is_what_the_place_has(monkeypatch, terminal, display, rerun, out, chosen):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: terminal))
+    monkeypatch.setattr(play, "find_spec", lambda name: name if rerun else None)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":0" if display else "")
+    assert play._chosen(out) == chosen

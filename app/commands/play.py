@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 WEB_PORT = 9090
 """Rerun's own, of its web viewer."""
 PRETRAINED_GENERATOR = PRETRAINED / "ddg"
+FILM = Path("runs/play.mp4")
 
 
 @dataclass(frozen=True)
@@ -58,14 +60,20 @@ class Play:
     generator: Path | None = None
     """Folder of a fitted generator (a run's ddg) for noise generator, instead of pretrained/ddg; a film then
     shows its depth beside the camera's."""
-    viewer: Literal["film", "mujoco", "rerun", "web"] = "film"
-    """film (a file), mujoco (MuJoCo's window), rerun (Rerun's), or web (Rerun in the browser, also of another
-    machine)."""
-    out: Path = Path("runs/play.mp4")
-    """The film: .mp4, .webm for browsers, .webp for pages; .rrd keeps what Rerun would show."""
+    viewer: Literal["auto", "film", "mujoco", "rerun", "web"] = "auto"
+    """film (a file), mujoco (MuJoCo's window), rerun (Rerun's), web (Rerun in the browser, also of another
+    machine), or auto: on a terminal mujoco if there is a display, or else web if Rerun is installed; a film
+    otherwise, and with --out."""
+    out: Path | None = None
+    """The film (runs/play.mp4 if this is not given): .mp4, .webm for browsers, .webp for pages; .rrd keeps
+    what Rerun would show."""
 
     def run(self) -> None:
         """Runs the trials, prints how each ended, and where the film is."""
+        chosen = _chosen(self.out) if self.viewer == "auto" else self.viewer
+        replace(self, viewer=chosen)._run()
+
+    def _run(self) -> None:
         from app.commands.student import config_of
         from evaluation.rig_trials import Series
 
@@ -81,14 +89,18 @@ class Play:
                 self._play_on(bench, series, viewer, noise.controls)
             else:
                 lifted = sum(_watched(bench, trial, viewer, noise.controls) for trial in trials)
-                print(f"{lifted} of {len(trials)} lifted and held: {self.out}", flush=True)
+                print(f"{lifted} of {len(trials)} lifted and held: {self._film}", flush=True)
         finally:
             bench.close()
             viewer.close()
 
     @property
     def _live(self) -> bool:
-        return self.viewer != "film" and self.out.suffix != ".rrd"
+        return self.viewer != "film" and self._film.suffix != ".rrd"
+
+    @property
+    def _film(self) -> Path:
+        return self.out or FILM
 
     def _viewer(self, noise: "_ChosenNoise") -> "Viewer":
         from deploy.video import Video
@@ -96,10 +108,10 @@ class Play:
 
         if self.generator or self.noise == "generator":
             _ = noise.generator  # what is wrong with it is said before anything runs
-        if self.out.suffix == ".rrd":
-            return Rerun(browser=False, file=self.out)
+        if self._film.suffix == ".rrd":
+            return Rerun(browser=False, file=self._film)
         if self.viewer == "film":
-            return Video(self.out, noise.generator if self.generator else None)
+            return Video(self._film, noise.generator if self.generator else None)
         if self.viewer != "web" and sys.platform == "linux" and not _has_display():
             raise UserError(f"--viewer {self.viewer}: there is no display here: choose web, or film.")
         if self.viewer == "mujoco":
@@ -179,6 +191,15 @@ def _noise_of(generator: Path) -> "NoiseModel":
         return source.frames(clean_mm[None], None, np.zeros(1, int), np.array([next(frames)]))[0]
 
     return noisy
+
+
+def _chosen(out: Path | None) -> Literal["film", "mujoco", "web"]:
+    """What --viewer auto means here. Elsewhere than on Linux MuJoCo's window needs a Python of its own."""
+    if out is not None or not sys.stdin.isatty():
+        return "film"
+    if sys.platform == "linux" and _has_display():
+        return "mujoco"
+    return "web" if find_spec("rerun") else "film"
 
 
 def _has_display() -> bool:
