@@ -23,7 +23,8 @@ class BraxPick(envs.Env):
     """`PickEnv` with Brax's `State`, whose `pipeline_state` is the `PhysicsState`.
 
     Args:
-      config, config_overrides: as `PickEnv` takes them.
+      config: as `PickEnv` takes it.
+      config_overrides: as `PickEnv` takes them.
     """
 
     def __init__(

@@ -203,7 +203,21 @@ def test_docstrings_describe_parameters_that_exist_one_by_one():
             given = {node.arg for node in ast.walk(function.args) if isinstance(node, ast.arg)}
             unknown = _documented(ast.get_docstring(function) or "") - given
             wrong += [_name(file, function, name) for name in sorted(unknown)]
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ClassDef):
+                unknown = _documented(ast.get_docstring(node) or "") - _taken_by(node)
+                wrong += [_name(file, node, name) for name in sorted(unknown)]
     assert wrong == []
+
+
+def _taken_by(node: ast.ClassDef) -> set[str]:
+    """Arguments of a class's __init__, its own or a dataclass's."""
+    fields = {child.target for child in node.body if isinstance(child, ast.AnnAssign)}
+    made = [child.args for child in node.body if isinstance(child, Function) and child.name == "__init__"]
+    arguments = {
+        argument.arg for args in made for argument in ast.walk(args) if isinstance(argument, ast.arg)
+    }
+    return arguments | {field.id for field in fields if isinstance(field, ast.Name)}
 
 
 def test_the_site_shows_every_page_and_every_package():

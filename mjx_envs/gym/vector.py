@@ -30,7 +30,9 @@ class PickVectorEnv(VectorEnv):
 
     Args:
       num_envs: N.
-      world, observation, render_mode: as for `PickEnv`.
+      world: as for `PickEnv`.
+      observation: as for `PickEnv`.
+      render_mode: as for `PickEnv`.
       autoreset_mode: when a new episode begins where one ended: NextStep, SameStep or Disabled.
     """
 
