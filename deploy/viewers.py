@@ -1,5 +1,7 @@
 """What a person watches a trial with: a film (deploy/video.py), Rerun, or MuJoCo's own viewer."""
 
+import contextlib
+import socket
 import sys
 import time
 import warnings
@@ -7,12 +9,16 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
+from urllib.parse import quote
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
 from deploy.interfaces import Filmed, Staged
 from deploy.loop import Step
 from deploy.video import millimetres
+
+WEB_PORT, GRPC_PORT = 9090, 9876
+"""Rerun's own, of its web viewer and of what that is fed from."""
 
 
 class Viewer(Protocol):
@@ -49,16 +55,19 @@ class Rerun:
         except ImportError as error:
             raise UserError(f"Rerun is not installed ({error}): pip install 'ddgrasp[view]'.") from error
         self._rr: Any = rerun
-        self.address = ""
+        self.url = ""
+        """Where a browser finds it."""
         rerun.init("ddgrasp play")
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
             rerun.save(file)
         elif browser:
-            self.address = rerun.serve_grpc()
-            rerun.serve_web_viewer(open_browser=False, connect_to=self.address)
+            address, port = rerun.serve_grpc(grpc_port=_free_port(GRPC_PORT)), _free_port(WEB_PORT)
+            rerun.serve_web_viewer(web_port=port, open_browser=False, connect_to=address)
+            self.url = f"http://localhost:{port}/?url={quote(address, safe='')}"
         else:
             rerun.spawn()
+        rerun.send_blueprint(_layout())
         self._steps = 0
 
     def begin(self, title: str) -> None:
@@ -94,6 +103,32 @@ class Rerun:
     def _note(self, text: str) -> None:
         self._rr.set_time("step", sequence=self._steps)
         self._rr.log("trials", self._rr.TextLog(text))
+
+
+def _layout() -> Any:
+    """Colour beside depth, what robot and policy do below, and how trials end."""
+    show = import_module("rerun.blueprint")
+    pictures = [show.Spatial2DView(origin=f"camera/{name}", name=name) for name in ("colour", "depth")]
+    curves = [
+        show.TimeSeriesView(origin=origin, name=name)
+        for origin, name in (
+            ("robot/joints_rad", "joints (rad)"),
+            ("robot/width_mm", "hand's width (mm)"),
+            ("policy/action", "action"),
+        )
+    ]
+    trials = show.TextLogView(origin="trials", name="trials")
+    rows = show.Vertical(show.Horizontal(*pictures), show.Horizontal(*curves, trials), row_shares=[3, 2])
+    return show.Blueprint(rows, show.TimePanel(state="collapsed", timeline="step"), collapse_panels=True)
+
+
+def _free_port(wanted: int) -> int:
+    """`wanted`, or another one if somebody has it."""
+    for port in (wanted, 0):
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("", port))
+            return probe.getsockname()[1]
+    raise UserError("--viewer web: no port is free for it here.")
 
 
 class MujocoWindow:

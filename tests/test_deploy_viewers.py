@@ -1,6 +1,7 @@
 """Watching a policy: films that OpenCV reads back, Rerun's absence, the command at its shortest."""
 
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from app.commands import parse, play
 from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import PRETRAINED
+from deploy import viewers
 from deploy.devices.rig_camera import StereoCamera
 from deploy.interfaces import Frame, RobotState
 from deploy.loop import Step
@@ -122,6 +124,14 @@ def test_without_rerun_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(UserError, match=r"pip install 'ddgrasp\[view\]'"):
         Rerun(browser=True)
+
+
+def test_a_port_that_somebody_has_is_not_taken():
+    with socket.socket() as taken:
+        taken.bind(("", 0))
+        port = taken.getsockname()[1]
+        assert viewers._free_port(port) != port
+    assert viewers._free_port(port) == port
 
 
 def test_the_pretrained_onnx_file_is_its_students():

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from deploy.viewers import Viewer
     from evaluation.rig_trials import Series
 
-WEB_PORT = 9090
-"""Rerun's own, of its web viewer."""
 PRETRAINED_GENERATOR = PRETRAINED / "ddg"
 FILM = Path("runs/play.mp4")
 
@@ -118,7 +116,7 @@ class Play:
             return MujocoWindow(noise.controls.key)
         viewer = Rerun(browser=self.viewer == "web")
         if self.viewer == "web":
-            print(f"http://localhost:{WEB_PORT}/?url={viewer.address}", flush=True)
+            print(viewer.url, flush=True)
         return viewer
 
     def _play_on(self, bench: "Bench", series: "Series", viewer: "Viewer", controls: Controls) -> None:
