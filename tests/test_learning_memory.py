@@ -10,6 +10,7 @@ from benchmarks.programs import PROGRAMS
 from ddg_jax import memory as ddg_memory
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
+from demos import memory as demos_memory
 from learning.memory import Need, check, compiled_bytes, traced_bytes
 from student_jax import memory as student_memory
 
@@ -60,6 +61,20 @@ def test_frames_of_the_paper_need_a_disk_not_memory():
     assert need.host < need.disk / 15
 
 
+def test_a_batch_of_demos_needs_its_pictures_once():
+    """On disk all steps of all environments; drawing them is what the table of programs says."""
+    config = PRESETS["debug"]
+    need, pixels = demos_memory.need(config), 90 * 160
+    assert need.disk == 6 * 45 * pixels * (2 + 3)
+    assert need.device == max(
+        traced_bytes(jitted, *arguments)
+        for jitted, arguments in (PROGRAMS[f"rendering: {name}"](config) for name in ("depth", "colour"))
+    )
+    blind = replace(config, demos=replace(config.demos, rgb=False))
+    assert demos_memory.need(blind).disk == 6 * 45 * pixels * 2
+    assert demos_memory.need(blind).device < need.device
+
+
 def test_more_than_there_is_is_refused_with_the_remedy(tmp_path):
     fits = Need("student", 10**6, 10**6, 10**6, "student.training.batch_size")
     check(fits, tmp_path / "not" / "there")
@@ -76,7 +91,7 @@ def test_a_batch_that_cannot_fit_is_refused_before_any_work(tmp_path):
 
     config = PRESETS["debug"]
     lines = check_memory(config, tmp_path)
-    assert [line.split(":")[0] for line in lines] == ["ddg", "student"]
+    assert [line.split(":")[0] for line in lines] == ["demos", "ddg", "student"]
     training = replace(config.student.training, batch_size=65_536)
     large = replace(config, student=replace(config.student, training=training))
     with pytest.raises(UserError, match="Stage student needs about .* lower student.training.batch_size"):

@@ -93,16 +93,18 @@ def check_devices(config: Config, run_dir: Path) -> None:
 
 
 def check_memory(config: Config, run_dir: Path) -> list[str]:
-    """What each unfinished stage that trains on pictures will take, a line for each; UserError if too much.
+    """What each unfinished stage that works on pictures will take, a line for each; UserError if too much.
 
-    Traces a training step of each, which the stages do as well.
+    Traces a step of each, which the stages do as well.
     """
     from ddg_jax import memory as ddg_memory
+    from demos import memory as demos_memory
     from learning import memory
     from student_jax import memory as student_memory
 
     lines = []
-    for stage, need_of in (("ddg", ddg_memory.need), ("student", student_memory.need)):
+    needs = {"demos": demos_memory.need, "ddg": ddg_memory.need, "student": student_memory.need}
+    for stage, need_of in needs.items():
         if not artifacts.is_finished(run_dir / stage):
             memory.check(need := need_of(config), run_dir)
             lines.append(str(need))
