@@ -111,3 +111,19 @@ def test_braxs_own_wrappers_take_it():
     assert (env.observation_size, env.action_size, env.backend) == (40, 8, "cpu")
     start, after = traced(wrapped, jax.ShapeDtypeStruct((2,), jnp.uint32))
     assert start == after
+
+
+def test_episodes_repeat_under_braxs_wrappers():
+    """AutoResetWrapper puts each episode's first state back: the same actions earn the same again."""
+    env = envs.create(brax_env.NAME, episode_length=3, batch_size=2, config_overrides=ON_CPU)
+    first = state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (3, 2, 8), minval=-1.0)
+    step, seen = jax.jit(env.step), []
+    for i in range(6):
+        state = step(state, actions[i % 3])
+        seen.append(state)
+    assert [s.done.tolist() for s in seen] == [[0, 0], [0, 0], [1, 1]] * 2
+    rewards = np.array([s.reward for s in seen])
+    np.testing.assert_array_equal(rewards[:3], rewards[3:])
+    assert np.abs(rewards).min() > 0 and (rewards[:, 0] != rewards[:, 1]).all()
+    np.testing.assert_array_equal(seen[2].obs, first.obs)
