@@ -41,7 +41,9 @@ def _cpu_seconds(run: Callable[[], object]) -> float:
 
 
 _OLD_EMITTERS = "fusion_emitters" in os.environ.get("XLA_FLAGS", "")
-AS_USERS = {"xla_cpu_use_fusion_emitters": True} if _OLD_EMITTERS else {}
+AS_USERS = (
+    {"xla_cpu_use_fusion_emitters": True, "xla_cpu_parallel_codegen_split_count": 32} if _OLD_EMITTERS else {}
+)
 """Options of a compilation that undo what conftest.py sets for speed."""
 
 
