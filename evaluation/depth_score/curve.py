@@ -97,7 +97,7 @@ def _point(
         methods, [extractor], simulated, ["sim_ddg_no_graft", "sim_ddg"], folder / "episodes", progress
     )
     samples = {**common, **collect(files).features[extractor.name]}
-    table = score_table.make_table(samples, config.score, config.seed)
+    table = score_table.make_table(samples, config.score, config.seed, progress)
     for figures in table.values():
         figures.pop("resampled_fid", None)
     point = {"trajectories": size, "frames": len(chosen), "steps": generator.config.training.steps, **table}

@@ -59,7 +59,7 @@ def run(job: Job) -> Artifact:
         folder = directory / name.replace(" ", "_")
         made = collect(score_episodes(methods, [extractor], simulated, [_DDG], folder, progress, label=name))
         samples = {**common.features[extractor.name], **made.features[extractor.name]}
-        compared = score_table.make_table(samples, config.score, config.seed)
+        compared = score_table.make_table(samples, config.score, config.seed, progress)
         rows[name] = _row(compared["ddg"], made, _DDG)
         rows[name]["frames_per_s"] = _frames_per_s(generator, simulated)
         floor = _row(compared["floor"], common, FLOOR)

@@ -53,8 +53,8 @@ def available_domains(methods: Methods) -> list[str]:
 def evaluate(scored: Scored, config: Config, text: str, progress: Progress) -> dict[str, Any]:
     """All numbers: a table per extractor, hole-level figures, targets judged by the first extractor."""
     tables = {}
-    for name in progress.track(config.score.features, "distances"):
-        tables[name] = score_table.make_table(scored.features[name], config.score, config.seed)
+    for name in config.score.features:
+        tables[name] = score_table.make_table(scored.features[name], config.score, config.seed, progress)
     first = tables[config.score.features[0]]
     samples = scored.features[config.score.features[0]]
     return {

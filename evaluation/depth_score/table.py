@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ddgrasp.config import ScoreConfig
+from ddgrasp.progress import Progress
 from evaluation.depth_score import holes, two_samples
 from evaluation.depth_score.domains import COLUMNS, DOMAINS, RAW, REFERENCES, Column
 from evaluation.depth_score.episodes import Scored
@@ -20,15 +21,18 @@ GRAFT_TARGET = 1.1
 Table = dict[str, Any]
 
 
-def make_table(samples: Mapping[str, Sample], config: ScoreConfig, seed: int) -> Table:
+def make_table(samples: Mapping[str, Sample], config: ScoreConfig, seed: int, progress: Progress) -> Table:
     """Column -> figures with intervals (see two_samples.compare), then the references that there are.
 
     The same resampled trajectories serve all columns, so that their ratios have intervals too. A column
     whose domains are missing says why.
     """
     drawn = _draw(samples, config, seed)
-    table: Table = {n: _compare(COLUMNS[n], samples, config, drawn) for n in config.columns}
-    table |= {n: _compare(c, samples, config, drawn) for n, c in REFERENCES.items() if c.sim in samples}
+    columns = {n: COLUMNS[n] for n in config.columns}
+    columns |= {n: c for n, c in REFERENCES.items() if c.sim in samples}
+    table: Table = {
+        n: _compare(columns[n], samples, config, drawn) for n in progress.track(list(columns), "distances")
+    }
     base = table.get("sim_gt", {})
     for figures in table.values():
         if "fid" in figures and "fid" in base:
