@@ -133,7 +133,7 @@ LAPTOP = Config(
         dagger=DaggerConfig(rounds=2, episodes=48, steps=400),
         head=HeadConfig(train_steps=3000),
     ),
-    evaluation=EvalConfig(student_trials=60, rig_trials=60),
+    evaluation=EvalConfig(student_trials=60),
 )
 """Everything trained here on two cores, the teacher from the guide (73 minutes of stage time on two AMD EPYC
 cores that two to four other jobs shared, 2026-11-21)."""

@@ -15,11 +15,12 @@ from ddgrasp.progress import Progress
 from deploy.policy import POLICY_FILE
 from deploy.timing import Timings
 from deploy.trial_log import TrialLog
-from deploy.trials import ENDS, TrialResult, lasting, plan, run_trials
+from deploy.trials import ENDS, TrialResult, lasting, plan, run_trials, tried
 from rig.film import Film, contact_sheet
 
 STAGE = "deploy"
 TRIALS_FILE = "trials.jsonl"
+_KINDS = (("seen", True), ("unseen", False))
 
 
 def run(job: Job) -> Artifact:
@@ -32,12 +33,13 @@ def run(job: Job) -> Artifact:
         for version in range(1, upgrades.VERSION)
     ]
     log = TrialLog(directory / TRIALS_FILE, header, earlier)
-    trials = plan(config)
+    rig = tried(config)
+    trials = plan(rig)
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(log.results))
-        simulated = lasting(config, contract.TRIAL_S), config.deploy.workers
+        simulated = lasting(rig, contract.TRIAL_S), config.deploy.workers
         # Latency is measured with the machine to itself, hence one process on the real clock.
-        for batch, (settings, workers) in ((False, simulated), (True, (config, 1))):
+        for batch, (settings, workers) in ((False, simulated), (True, (rig, 1))):
             todo = [t for t in trials if t.realtime is batch and (t.index, t.realtime) not in log.results]
             for result, film in run_trials(settings, policy_path, todo, workers):
                 log.append(result)
@@ -45,18 +47,21 @@ def run(job: Job) -> Artifact:
                 done = [r for r in log.results.values() if not r.realtime]
                 task.advance(success=sum(r.success for r in done) / max(len(done), 1))
     results = [log.results[(trial.index, trial.realtime)] for trial in trials]
-    return job.finish(metrics(results))
+    return job.finish(metrics(results, config.world.objects))
 
 
-def metrics(results: Sequence[TrialResult]) -> dict[str, Any]:
-    """What the report shows: success on the simulated clock, time keeping on the real one."""
+def metrics(results: Sequence[TrialResult], trained: Sequence[str]) -> dict[str, Any]:
+    """What the report shows: success on the simulated clock, objects `trained` on and others apart, and time
+    keeping on the real one."""
     simulated = [r for r in results if not r.realtime]
     real = [r for r in results if r.realtime]
     names = sorted({r.object_name for r in simulated})
+    apart = {kind: [r for r in simulated if (r.object_name in trained) == seen] for kind, seen in _KINDS}
     rows = [{"object": name, **_success(r for r in simulated if r.object_name == name)} for name in names]
     return {
         "student_rig": {
             "success": _success(simulated),
+            **{kind: _success(some) for kind, some in apart.items() if some},
             "per_object": {row["object"]: {k: row[k] for k in ("successes", "n")} for row in rows},
         },
         "holds": sum(r.holds for r in results),
@@ -75,6 +80,7 @@ def _header(config: Config, policy_path: Path) -> dict[str, Any]:
         "policy_sha256": hashlib.sha256(policy_path.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),
         "trial_s": contract.TRIAL_S,
+        "objects": list(tried(config).world.objects),
     } | ENDS
 
 

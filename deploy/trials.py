@@ -67,6 +67,13 @@ class TrialResult:
         return self.index, self.realtime
 
 
+def tried(config: Config) -> Config:
+    """`config` with the objects of a rig: those of training, then the ones that no list of training has."""
+    trained = config.world.objects
+    unseen = (name for name in contract.UNSEEN_OBJECTS if name not in trained)
+    return replace(config, world=replace(config.world, objects=(*trained, *unseen)))
+
+
 def plan(config: Config) -> list[Trial]:
     """Simulated-clock trials with the objects in turn, then a few on the real clock."""
     names = config.world.objects

@@ -27,7 +27,7 @@ from deploy import trials as rig_eval
 from deploy.clock import SimClock
 from deploy.devices.rig_robot import SimRobot
 from deploy.stage import TrialLog, metrics
-from deploy.trials import Trial, TrialResult, plan, run_trials
+from deploy.trials import Trial, TrialResult, plan, run_trials, tried
 from deploy_support import write_policy
 from evaluation.rig_trials import Series
 from job_support import make_job
@@ -124,8 +124,10 @@ def test_metrics_count_success_by_object_and_time_on_the_real_clock_alone():
         result(2, "cube", success=False),
         result(0, "cube", realtime=True, success=True, period_s=[0.1, 0.102], missed_deadlines=3),
     ]
-    values = metrics(results)
+    values = metrics(results, ["cube"])
     assert values["student_rig"]["success"] == {"successes": 1, "n": 3}
+    assert values["student_rig"]["seen"] == {"successes": 1, "n": 2}
+    assert values["student_rig"]["unseen"] == {"successes": 0, "n": 1}
     assert values["student_rig"]["per_object"] == {
         "apple": {"successes": 0, "n": 1},
         "cube": {"successes": 1, "n": 2},
@@ -137,6 +139,7 @@ def test_metrics_count_success_by_object_and_time_on_the_real_clock_alone():
 
 
 def test_plan_mixes_objects_and_keeps_real_time_apart():
+    assert tried(CONFIG).world.objects == (*CONFIG.world.objects, *contract.UNSEEN_OBJECTS)
     trials = plan(CONFIG)
     assert [(t.index, t.object_name, t.realtime) for t in trials] == [
         (0, "cube", False), (1, "apple", False), (2, "cube", False), (0, "cube", True),

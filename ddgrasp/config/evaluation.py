@@ -13,5 +13,6 @@ class EvalConfig(Section, name="evaluation"):
     """Episodes of the teacher in its own simulation."""
     student_trials: Count = 100
     """Episodes of the student on clean depth and on generated depth."""
-    rig_trials: Count = 60
-    """Episodes of the exported student in the pseudo-real rig."""
+    rig_trials: Count = 120
+    """Episodes of the exported student in the pseudo-real rig, the objects of training and the six unseen
+    ones in turn."""

@@ -23,6 +23,8 @@ MEANINGS: dict[str, Meaning] = {
     "student_clean": Meaning("student in its own simulation, depth without errors"),
     "student_ddg": Meaning("student in its own simulation, generated depth"),
     "student_rig": Meaning("exported student on the simulated rig"),
+    "seen": Meaning("objects that it was trained on", SHARE),
+    "unseen": Meaning("objects that it was not trained on", SHARE),
     "realtime_trials": Meaning("trials on the real clock, in which time is measured"),
     # teacher
     "saturated_actions": Meaning("joint actions at the end of their range", SHARE),

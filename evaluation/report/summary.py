@@ -120,8 +120,15 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         rows.append((stage.name, origin, _duration(entry["seconds"]), results[0]))
         rows.extend(("", "", "", result) for result in results[1:])
     if rig := _success(report, "student_rig"):
-        rows.append(("deploy", "", "", f"exported student in the pseudo-real rig: success {rig}"))
+        apart = _apart(report["student_rig"])
+        rows.append(("deploy", "", "", f"exported student in the pseudo-real rig: success {rig}{apart}"))
     return rows
+
+
+def _apart(rig: Mapping[str, Any]) -> str:
+    """Objects of training and others, each as a count."""
+    kinds = {kind: rig[kind] for kind in ("seen", "unseen") if kind in rig}
+    return "".join(f", {kind} {counts['successes']} of {counts['n']}" for kind, counts in kinds.items())
 
 
 def trial_run(report: Mapping[str, Any]) -> str:
