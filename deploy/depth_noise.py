@@ -203,10 +203,13 @@ class EpisodeNoise:
         return root * self._shared + rest * self._normals.draw(self._shape(self._count))
 
     def reset(self, cameras: Sequence[int] | None = None) -> None:
-        """Begins new episodes, of the given cameras or of all."""
+        """Begins new episodes, of the given cameras or of all. UserError for what is no list of cameras."""
         if self._shared is None:
             return
-        chosen = list(range(self._count)) if cameras is None else [int(number) for number in cameras]
+        try:
+            chosen = list(range(self._count)) if cameras is None else [int(number) for number in cameras]
+        except (TypeError, ValueError):
+            raise UserError(f"Cameras {cameras!r} are to be reset; expected numbers, as in [0, 2].") from None
         if not all(0 <= number < self._count for number in chosen):
             raise UserError(f"Cameras {chosen} are to be reset; there are 0 to {self._count - 1}.")
         if chosen:
