@@ -118,8 +118,8 @@ DEMO = Config(
     evaluation=EvalConfig(student_trials=60),
     score=ScoreConfig(trajectories=24, kid_subset_size=150, tsne_maps=3000),
 )
-"""For two cores within 45 minutes (23 on two AMD EPYC cores, 2026-11-22); the student starts from the
-pretrained one."""
+"""For two cores; the student starts from the pretrained one. 23 minutes on two AMD EPYC cores on 2026-11-22;
+not timed by itself since the generator takes six evaluations and the rig tries unseen objects."""
 
 LAPTOP = Config(
     preset="laptop",
@@ -136,7 +136,8 @@ LAPTOP = Config(
     evaluation=EvalConfig(student_trials=60),
 )
 """Everything trained here on two cores, the teacher from the guide (73 minutes of stage time on two AMD EPYC
-cores that two to four other jobs shared, 2026-11-21)."""
+cores that two to four other jobs shared, 2026-11-21, with a generator of before; today's is not yet fitted at
+this size)."""
 
 _FROM_NOTHING = TeacherConfig(
     start="nothing",
