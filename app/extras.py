@@ -5,8 +5,8 @@ import re
 from importlib.util import find_spec
 
 from ddgrasp.errors import UserError
+from ddgrasp.install import PROJECT, pip_install
 
-PROJECT = "ddgrasp"
 OTHERWISE_NAMED = {
     "cv2": "opencv-python-headless",
     "franky": "franky-control",
@@ -56,16 +56,18 @@ def check(command: str) -> None:
     """UserError if the extras that `command` needs are not installed."""
     needed = NEEDS.get(command, (TRAIN,))
     if any(find_spec(TELLS[extra]) is None for extra in needed):
-        more = _install(",".join(needed))
+        more = pip_install(",".join(needed))
         raise UserError(f"`ddgrasp {command}` needs more than is installed: {more}.")
+
+
+def check_fr3(what: str) -> None:
+    """UserError unless the FR3 rig, which `what` needs, and the driver of its arm are installed."""
+    if missing := [module for module in ("franky_sim", "franky") if find_spec(module) is None]:
+        raise UserError(f"{what} needs {' and '.join(missing)}: {pip_install('fr3')}.")
 
 
 def remedy(missing: str | None) -> str | None:
     """One line for an absent module of that name; None if no extra brings it."""
     if not missing or not (extras := bringing(missing)):
         return None
-    return f"{distribution(missing)} is not installed: {' or '.join(map(_install, extras))}."
-
-
-def _install(extra: str) -> str:
-    return f"pip install '{PROJECT}[{extra}]'"
+    return f"{distribution(missing)} is not installed: {' or '.join(map(pip_install, extras))}."

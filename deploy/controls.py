@@ -1,8 +1,8 @@
-"""What a person turns while a policy runs: the object and the depth it sees, by key or by typed line."""
+"""What a person turns while a policy runs: rig, object and the depth it sees, by key or by typed line."""
 
 import queue
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal, get_args
 
 from ddgrasp.errors import UserError, unknown_name
@@ -19,9 +19,10 @@ _POLL_S = 0.1
 class Controls:
     """One for a viewer; keys and lines may come from any thread."""
 
-    def __init__(self, objects: Sequence[str], noise: Noise = "camera"):
-        """`objects` are those that may be asked for; the first is where the keys start."""
-        self._objects = tuple(objects)
+    def __init__(self, objects: Mapping[str, Sequence[str]], rig: str, noise: Noise = "camera"):
+        """`objects` are those that may be asked for, by rig; the first of `rig` is where the keys start."""
+        self._known = {name: tuple(known) for name, known in objects.items()}
+        self.rig = rig
         self.noise: Noise = noise
         self.object_name = self._objects[0]
         self._asked: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -30,7 +31,12 @@ class Controls:
     @property
     def help(self) -> str:
         """What may be typed, one line."""
-        return f"Type an object's name, a noise ({', '.join(NOISES)}), or {QUIT} to end."
+        rigs = f", a rig ({', '.join(self._known)})" if len(self._known) > 1 else ""
+        return f"Type an object's name, a noise ({', '.join(NOISES)}){rigs}, or {QUIT} to end."
+
+    @property
+    def _objects(self) -> tuple[str, ...]:
+        return self._known[self.rig]
 
     @property
     def interrupts(self) -> bool:
@@ -72,10 +78,20 @@ class Controls:
         if word == QUIT:
             self.ended = True
             return "ending"
+        if word in self._known:
+            return self._change_rig(word)
         if word not in self._objects:
-            raise unknown_name("object or noise", word, (*self._objects, *NOISES, QUIT))
+            words = (*self._objects, *NOISES, *self._known, QUIT)
+            raise unknown_name("object, noise or rig", word, words)
         self._asked.put(word)
         return f"next: {word}"
+
+    def _change_rig(self, rig: str) -> str:
+        """Goes on there with the object that is before the arm now, if that rig has it."""
+        self.rig = rig
+        name = self.object_name if self.object_name in self._objects else self._objects[0]
+        self._asked.put(name)
+        return f"rig: {rig}, next: {name}"
 
     def listen(self, lines: Iterable[str], say: Callable[[str], None]) -> None:
         """Obeys every line of `lines`, in a thread that goes with the process."""

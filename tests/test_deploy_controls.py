@@ -12,11 +12,11 @@ from deploy.controls import DOWN, ENTER, UP, Controls
 from deploy.interfaces import Frame
 from deploy.treatment import TreatedCamera
 
-OBJECTS = ("apple", "banana", "can")
+OBJECTS = {"development": ("apple", "banana", "can"), "fr3": ("apple", "banana", "can", "milk")}
 
 
 def test_a_typed_object_interrupts_and_is_next():
-    controls = Controls(OBJECTS)
+    controls = Controls(OBJECTS, "development")
     assert not controls.interrupts and controls.next_object() is None
     assert controls.line(" Banana\n") == "next: banana"
     controls.line("can")
@@ -26,19 +26,32 @@ def test_a_typed_object_interrupts_and_is_next():
 
 
 def test_a_typed_noise_does_not_interrupt():
-    controls = Controls(OBJECTS)
+    controls = Controls(OBJECTS, "development")
     assert controls.noise == "camera"
     assert controls.line("none") == "noise: none"
     assert controls.noise == "none" and not controls.interrupts
 
 
+def test_a_typed_rig_interrupts_and_keeps_the_object_where_it_has_it():
+    controls = Controls(OBJECTS, "development")
+    controls.begin("can")
+    assert "a rig (development, fr3)" in controls.help
+    assert controls.line("fr3") == "rig: fr3, next: can"
+    assert controls.interrupts and controls.rig == "fr3" and controls.next_object() == "can"
+    controls.begin("milk")
+    assert controls.line("development") == "rig: development, next: apple"
+    with pytest.raises(UserError, match="'milk'"):
+        controls.line("milk")
+    assert "rig" not in Controls({"development": ("can",)}, "development").help
+
+
 def test_other_words_are_refused_with_what_there_is():
-    with pytest.raises(UserError, match="Unknown object or noise 'bananna'. Did you mean 'banana'"):
-        Controls(OBJECTS).line("bananna")
+    with pytest.raises(UserError, match="Unknown object, noise or rig 'bananna'. Did you mean 'banana'"):
+        Controls(OBJECTS, "development").line("bananna")
 
 
 def test_keys_go_round_objects_and_noises():
-    controls = Controls(OBJECTS)
+    controls = Controls(OBJECTS, "development")
     controls.begin("can")
     controls.key(DOWN)
     assert controls.next_object() == "apple"
@@ -55,7 +68,7 @@ def test_keys_go_round_objects_and_noises():
 
 
 def test_lines_are_obeyed_and_answered_as_they_come():
-    controls, said = Controls(OBJECTS), []
+    controls, said = Controls(OBJECTS, "development"), []
     controls.listen(io.StringIO("nonsense\n\ngenerator\nq\n"), said.append)
     started = time.monotonic()
     controls.wait(lambda: time.monotonic() - started < 30)
@@ -64,7 +77,7 @@ def test_lines_are_obeyed_and_answered_as_they_come():
 
 
 def test_waiting_ends_when_nobody_watches():
-    Controls(OBJECTS).wait(lambda: False)
+    Controls(OBJECTS, "development").wait(lambda: False)
 
 
 class _Camera:
@@ -86,7 +99,7 @@ class _Camera:
 
 
 def test_the_policy_sees_the_noise_that_is_chosen_now(tmp_path):
-    controls = Controls(OBJECTS)
+    controls = Controls(OBJECTS, "development")
     noise = _ChosenNoise(controls, tmp_path)
     noise.__dict__["generator"] = lambda clean_mm: clean_mm + 11  # a generator has a test of its own
     camera = TreatedCamera(_Camera(), noise)
@@ -102,4 +115,4 @@ def test_a_camera_that_knows_no_clean_depth_is_refused(tmp_path):
         def read(self) -> Frame: ...
 
     with pytest.raises(UserError, match="needs a simulation"):
-        TreatedCamera(Real(), _ChosenNoise(Controls(OBJECTS), tmp_path))
+        TreatedCamera(Real(), _ChosenNoise(Controls(OBJECTS, "development"), tmp_path))

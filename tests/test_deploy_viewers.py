@@ -5,7 +5,6 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -210,19 +209,21 @@ def test_without_a_display_a_window_is_refused_before_anything_runs(monkeypatch,
 
 
 @pytest.mark.parametrize(
-    ("terminal", "display", "rerun", "out", "chosen"),
+    ("terminal", "display", "rerun", "options", "chosen"),
     [
-        (True, True, True, None, "mujoco"),
-        (True, False, True, None, "web"),
-        (True, False, False, None, "film"),
-        (False, True, True, None, "film"),
-        (True, True, True, Path("a.mp4"), "film"),
+        (True, True, True, [], "mujoco"),
+        (True, False, True, [], "web"),
+        (True, False, False, [], "film"),
+        (False, True, True, [], "film"),
+        (True, True, True, ["--out", "a.mp4"], "film"),
+        (True, True, True, ["--generator", "pretrained/ddg"], "film"),
+        (True, True, True, ["--generator", "pretrained/ddg", "--noise", "generator"], "mujoco"),
     ],
 )
-def test_the_viewer_is_what_the_place_has(monkeypatch, terminal, display, rerun, out, chosen):
+def test_the_viewer_is_what_the_place_has(monkeypatch, terminal, display, rerun, options, chosen):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: terminal))
     monkeypatch.setattr(play, "find_spec", lambda name: name if rerun else None)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":0" if display else "")
-    assert play._chosen(out) == chosen
+    assert play._chosen(parse("play", options)._wants_film) == chosen

@@ -5,14 +5,16 @@ import itertools
 import os
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import tyro
 
+from app import extras
 from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
@@ -37,7 +39,7 @@ FILM = Path("runs/play.mp4")
 class Play:
     """Watch the pretrained student, or a policy of yours, grasp in simulation: a film, or live in a viewer.
 
-    In a viewer, object and noise can be changed as it runs, by typing their names on the terminal.
+    In a viewer, object, noise and rig can be changed as it runs, by typing their names on the terminal.
     """
 
     policy: Path | None = None
@@ -61,36 +63,42 @@ class Play:
     viewer: Literal["auto", "film", "mujoco", "rerun", "web"] = "auto"
     """film (a file), mujoco (MuJoCo's window), rerun (Rerun's), web (Rerun in the browser, also of another
     machine), or auto: on a terminal mujoco if there is a display, or else web if Rerun is installed; a film
-    otherwise, and with --out."""
+    otherwise, with --out, and with --generator unless that is the noise."""
     out: Path | None = None
     """The film (runs/play.mp4 if this is not given): .mp4, .webm for browsers, .webp for pages; .rrd keeps
     what Rerun would show."""
 
     def run(self) -> None:
         """Runs the trials, prints how each ended, and where the film is."""
-        chosen = _chosen(self.out) if self.viewer == "auto" else self.viewer
+        chosen = _chosen(self._wants_film) if self.viewer == "auto" else self.viewer
         replace(self, viewer=chosen)._run()
 
     def _run(self) -> None:
-        from app.commands.student import config_of
         from evaluation.rig_trials import Series
 
+        if self.rig == "fr3":
+            extras.check_fr3("--rig fr3")
         series = Series(self.rig, self.objects, self.trials, number=self.number, seconds=self.seconds)
         trials = series.plan()
-        noise = _ChosenNoise(Controls(series.known(), self.noise), self.generator or PRETRAINED_GENERATOR)
+        controls = Controls(_objects_by_rig(series), self.rig, self.noise)
+        noise = _ChosenNoise(controls, self.generator or PRETRAINED_GENERATOR)
         viewer = self._viewer(noise)
-        policy = self.policy or _pretrained()
-        config = series.configured(config_of(policy, None), policy)
-        bench = series.make(config, noise)(config, policy)
+        rigs = _Rigs(series, self.policy or _pretrained(), noise)
         try:
+            rigs.bench(self.rig)
             if self._live:
-                self._play_on(bench, series, viewer, noise.controls)
+                self._play_on(rigs, series.names(), viewer, controls)
             else:
-                lifted = sum(_watched(bench, trial, viewer, noise.controls) for trial in trials)
+                lifted = sum(_watched(rigs.bench(self.rig), trial, viewer, controls) for trial in trials)
                 print(f"{lifted} of {len(trials)} lifted and held: {self._film}", flush=True)
         finally:
-            bench.close()
+            rigs.close()
             viewer.close()
+
+    @property
+    def _wants_film(self) -> bool:
+        """Whether a film is meant: its file is named, or a generator to be seen beside the camera."""
+        return self.out is not None or (self.generator is not None and self.noise != "generator")
 
     @property
     def _live(self) -> bool:
@@ -119,20 +127,60 @@ class Play:
             print(viewer.url, flush=True)
         return viewer
 
-    def _play_on(self, bench: "Bench", series: "Series", viewer: "Viewer", controls: Controls) -> None:
-        """The trials, then those that are asked for, until Ctrl-C or the window's end."""
+    def _play_on(self, rigs: "_Rigs", names: Sequence[str], viewer: "Viewer", controls: Controls) -> None:
+        """Trials with `names`, then with what is asked for, until Ctrl-C or the window's end."""
         controls.listen(sys.stdin, lambda text: print(text, flush=True))
         print(f"{controls.help} {KEYS}." if self.viewer == "mujoco" else controls.help, flush=True)
-        planned = itertools.chain.from_iterable([name] * self.trials for name in series.names())
-        tried: Counter[str] = Counter()
+        planned = itertools.chain.from_iterable([name] * self.trials for name in names)
+        tried: Counter[tuple[str, str]] = Counter()
         with contextlib.suppress(KeyboardInterrupt):
             while viewer.watched() and not controls.ended:
                 name = controls.next_object() or next(planned, None)
                 if name is None:
                     controls.wait(viewer.watched)
                     continue
-                _watched(bench, series.trial(name, tried[name]), viewer, controls)
-                tried[name] += 1
+                series = rigs.series(rig := controls.rig)
+                if name in series.known():
+                    _watched(rigs.bench(rig), series.trial(name, tried[rig, name]), viewer, controls)
+                    tried[rig, name] += 1
+
+
+class _Rigs:
+    """The rigs that were asked for, each made when it is first asked for."""
+
+    def __init__(self, series: "Series", policy: Path, noise: "_ChosenNoise"):
+        self._series, self._policy, self._noise = series, policy, noise
+        self._benches: dict[str, Bench] = {}
+
+    def series(self, rig: str) -> "Series":
+        """The trials, on that rig."""
+        from evaluation.rig_trials import RigName
+
+        return replace(self._series, rig=cast(RigName, rig))
+
+    def bench(self, rig: str) -> "Bench":
+        """What runs them there."""
+        from app.commands.student import config_of
+
+        if rig not in self._benches:
+            series = self.series(rig)
+            config = series.configured(config_of(self._policy, None), self._policy)
+            self._benches[rig] = series.make(config, self._noise)(config, self._policy)
+        return self._benches[rig]
+
+    def close(self) -> None:
+        """Ends them all."""
+        for bench in self._benches.values():
+            bench.close()
+
+
+def _objects_by_rig(series: "Series") -> dict[str, tuple[str, ...]]:
+    """What each rig that can run here has to grasp, that of `series` first."""
+    others = {"development", "fr3"} - {series.rig}
+    with contextlib.suppress(UserError):
+        extras.check_fr3("")
+        return {rig: replace(series, rig=rig).known() for rig in (series.rig, *others)}
+    return {series.rig: series.known()}
 
 
 class _ChosenNoise:
@@ -191,9 +239,9 @@ def _noise_of(generator: Path) -> "NoiseModel":
     return noisy
 
 
-def _chosen(out: Path | None) -> Literal["film", "mujoco", "web"]:
+def _chosen(film: bool) -> Literal["film", "mujoco", "web"]:
     """What --viewer auto means here. Elsewhere than on Linux MuJoCo's window needs a Python of its own."""
-    if out is not None or not sys.stdin.isatty():
+    if film or not sys.stdin.isatty():
         return "film"
     if sys.platform == "linux" and _has_display():
         return "mujoco"

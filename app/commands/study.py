@@ -2,12 +2,12 @@
 
 import sys
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from app import extras
 from app.commands.base import FromPreset
-from app.commands.checks import check_config_values, check_devices, check_memory
+from app.commands.checks import check_config_values, check_devices, check_networks
 from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.config.checks import Count, Range
@@ -15,8 +15,6 @@ from ddgrasp.errors import UserError
 
 if TYPE_CHECKING:
     from app.table2 import Study
-
-_FR3_MODULES = ("franky_sim", "franky")
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class StudyTable2(FromPreset):
         study = self.planned()
         table2.check_place(study, self.resume)
         if not results.has_students(self.out, study.rows):
-            need = check_memory(study.config, self.out / results.SHARED)
+            need = check_networks(study.config, self.out / results.SHARED)
             print(*need, sep="\n", file=sys.stderr, flush=True)
         made = table2.run(study)
         print(*(self.out / name for name in (table2.STUDY_JSON, table2.STUDY_HTML)), sep="\n")
@@ -76,8 +74,8 @@ class StudyTable2(FromPreset):
         names = rows.chosen(self.rows, self.table)
         series = Series(self.rig, self.objects, self.trials, self.split, self.number)
         series.names()
-        if self.rig == "fr3" and (missing := [name for name in _FR3_MODULES if find_spec(name) is None]):
-            raise UserError(f"--rig fr3 needs {' and '.join(missing)}: pip install 'ddgrasp[fr3]'.")
+        if self.rig == "fr3":
+            extras.check_fr3("--rig fr3")
         config = rows.shared_config(self.config)
         check_config_values(config)
         left_out = {} if self.rows else _impossible(config, names)
