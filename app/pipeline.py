@@ -86,7 +86,7 @@ def make(
     if artifacts.is_finished(directory):
         artifact = artifacts.read_artifact(directory)
         artifacts.check_config(artifact, config)
-        progress.note(f"finished before ({artifact.manifest.seconds:.0f} s, {artifact.manifest.origin})")
+        progress.note(f"finished before ({artifact.manifest.seconds:.0f} s{_origin(artifact)})")
     else:
         artifact = _work(job, leads)
     _check_parents(artifact, parents)
@@ -102,8 +102,12 @@ def _work(job: Job, leads: bool) -> Artifact:
             artifact = importlib.import_module(job.stage.module).run(job)
         finally:
             progress.close()
-    progress.note(f"finished in {artifact.manifest.seconds:.0f} s ({artifact.manifest.origin})")
+    progress.note(f"finished in {artifact.manifest.seconds:.0f} s{_origin(artifact)}")
     return artifact
+
+
+def _origin(artifact: Artifact) -> str:
+    return ", loaded" if artifact.manifest.origin == "loaded" else ""
 
 
 def _create(directory: Path) -> None:

@@ -1,7 +1,6 @@
 """Stage `ddg`: recordings -> a fitted generator, its statistics and its pictures."""
 
 from dataclasses import replace
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ddg_jax import data
+from ddg_jax import data, start
 from ddg_jax.distil import distil
 from ddg_jax.inverse_depth import invert
 from ddg_jax.prior import Prior, make_prior
@@ -18,11 +17,9 @@ from ddg_jax.sample import Generator, grafted, predict
 from ddg_jax.train import fit
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE, DDGConfig
-from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
-from ddgrasp.shipped import shipped
 from learning.params import Params
 from sensors.statistics import stats
 
@@ -94,21 +91,8 @@ def fitted_generator(
 
 def _loaded(config: DDGConfig) -> Params:
     """Parameters of `config.init_from`'s fitted network, refused if network or depth space are others."""
-    source = shipped(config.init_from)
-    generator = Generator.load(source / STAGE if (source / STAGE).is_dir() else source, sampler="ddim")
-    for name in (
-        "depth.height_px", "depth.width_px", "depth.representation", "training.hole_loss", "depth.surface",
-        "depth.near_m", "depth.far_m", "prior.source", "unet.space_to_depth", "unet.widths", "unet.blocks",
-        "unet.attention_heads", "unet.position", "diffusion.steps", "diffusion.schedule",
-        "diffusion.log_snr_shift",
-    ):  # fmt: skip
-        there, here = map(attrgetter(name), (generator.config, config))
-        if there != here:
-            raise UserError(
-                f"The generator in {source} has ddg.{name} {there!r}, this configuration {here!r}: "
-                "use the same value, or fit a new one (empty ddg.init_from)."
-            )
-    return generator.params
+    start.check(config)
+    return Generator.load(start.folder(config), sampler="ddim").params
 
 
 def _score(generator: Generator, frames: data.Frames, progress: Progress) -> dict[str, Any]:

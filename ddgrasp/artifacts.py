@@ -173,11 +173,6 @@ def config_hash(config: Config, stage: str) -> str:
     return _hash(_relevant(to_json(config), stage))
 
 
-def config_hash_of_version(version: int, config: Config, stage: str) -> str:
-    """`config_hash` as an earlier version of the fields had it: recorded by what was begun then."""
-    return _hash(_relevant(upgrades.downgraded(to_json(config), version), stage))
-
-
 def check_config(artifact: Artifact, config: Config) -> None:
     """UserError that names both values if `artifact` was made with another configuration than `config`."""
     _check_same_config(artifact.directory, artifact.manifest.stage, artifact.manifest.config, config)

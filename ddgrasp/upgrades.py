@@ -171,36 +171,6 @@ def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     return made
 
 
-def downgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
-    """The JSON of a configuration of this version with the fields of an earlier one: what its hashes were
-    over. Values of fields that it lacked are lost."""
-    made = copy.deepcopy(dict(config))
-    if version < 10:
-        _drop(made, _ADDED_AFTER_9)
-    if version < 9:
-        _drop(made, _ADDED_AFTER_8)
-    if version < 8:
-        _drop(made, _ADDED_AFTER_7)
-    if version < 7:
-        _drop(made, _ADDED_AFTER_6)
-    if version < 6:
-        _drop(made, _ADDED_AFTER_5)
-    if version < 5:
-        _drop(made, _ADDED_AFTER_4)
-    if version < 4:
-        _drop(made, _ADDED_AFTER_3)
-    if version < 3:
-        _drop(made, _ADDED_AFTER_2)
-        teacher = made["teacher"]
-        start = teacher.pop("start")
-        teacher["init_from"] = "" if start in ("nothing", "guide") else start
-        if start == "nothing":
-            teacher["clone_rounds"] = 0
-    if version < 2:
-        _flatten(made)
-    return made
-
-
 def _name_start(teacher: dict[str, Any]) -> None:
     """Version 2 said by two fields what a policy starts from."""
     source, rounds = teacher.pop("init_from", ""), teacher.get("clone_rounds", _CLONE_ROUNDS)
@@ -219,18 +189,6 @@ def _drop(config: dict[str, Any], names: Iterable[str]) -> None:
     for name in names:
         section, field = _section_of(config, name)
         section.pop(field, None)
-
-
-def _flatten(made: dict[str, Any]) -> None:
-    """Fields of version 2 as version 1 had them."""
-    for name, value in _DROPPED_AFTER_1.items():
-        section, field = _section_of(made, name)
-        section[field] = value
-    _drop(made, _ADDED_AFTER_1)
-    for section, groups in _GROUPS_OF_2.items():
-        taken = {group: made[section].pop(group) for group in groups}
-        for group, fields in groups.items():
-            made[section] |= {old: taken[group][new] for new, old in fields.items()}
 
 
 def _grouped(flat: Mapping[str, Any], groups: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:

@@ -283,6 +283,8 @@ def _device(name: str) -> tuple[str, int]:
 
 
 def _open(path: Path, kind: str, number: int, threads: int) -> ort.InferenceSession:
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: give the file, {path / 'generator.onnx'} if it is there.")
     if not path.is_file():
         raise UserError(f"{path}: no such file; {names.REMEDY}.")
     providers: list[Any] = ["CPUExecutionProvider"]

@@ -39,7 +39,7 @@ class Event:
     time_s: float
     """Since the loop's start."""
     kind: str
-    """hold, recover, missed, retry, empty, fault, stop."""
+    """hold, recover, missed, retry, done, empty, fault, stop."""
     reason: str
 
     def __str__(self) -> str:
@@ -217,7 +217,7 @@ class ControlLoop:
             return action
         assert self._retry is not None
         if self._retry.begun:
-            self._log("retry", self._retry.begun)
+            self._log("done" if self._retry.done else "retry", self._retry.begun)
         self._policy.restart()
         return instead
 

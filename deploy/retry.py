@@ -56,6 +56,8 @@ class Retry:
         """Start of an episode, or the arm was held: what was before does not count."""
         self.begun = ""
         """Why it took over in the last call, empty if it did not."""
+        self.done = False
+        """Whether that was because nothing is left to do."""
         self._forget()
         self._closed_once = False
         self._lifted_steps = 0
@@ -63,7 +65,7 @@ class Retry:
 
     def __call__(self, state: Float[np.ndarray, "8"]) -> Float[np.ndarray, "8"] | None:
         """(8,) action for the state (8,), None where the policy is to act."""
-        self.begun = ""
+        self.begun, self.done = "", False
         grip_m = grip_position(state[STATE.arm].astype(np.float64))
         self._places.append(grip_m)
         self._widths.append(float(state[STATE.width][0]))
@@ -93,7 +95,7 @@ class Retry:
         self._lifted_steps += 1
         if self._lifted_steps == DONE_STEPS:
             self._stay_rad = np.array(state[STATE.arm])
-            self.begun = "what was grasped is lifted; stays there"
+            self.begun, self.done = "what was grasped is lifted; stays there", True
         return None if self._stay_rad is None else _towards(self._stay_rad, state, CLOSE)
 
     def _look(self, grip_m: Float[np.ndarray, "3"]) -> None:

@@ -28,6 +28,8 @@ from deploy.policy import OnnxPolicy
 from deploy.record import ENDED, REPORT_FILE, DeploymentRecord, verdict
 from deploy.setup import loop_settings, safety_filter, speed_notice
 
+_TOO_SLOW = "the loop did not keep its rate: this machine is too busy or too slow for the policy and devices"
+
 
 def deploy(
     config: Config, policy_path: Path, options: SessionOptions, say: Callable[[str], None] = print
@@ -53,6 +55,8 @@ def _run(
         seed=config.seed,
         execute_steps=config.deploy.execute_steps or None,
     )
+    if options.robot == "franka" and not (options.yes or options.dry_run or sys.stdin.isatty()):
+        raise UserError("robot 'franka' asks before it moves, and nobody can be asked here: give --yes.")
     place = standing(config, options)
     if place.line:
         say(place.line)
@@ -182,6 +186,7 @@ def describe(report: LoopReport) -> str:
         *rows,
         f"{report.steps} steps, {report.timings.missed_deadlines} missed deadlines, {report.holds} holds",
         f"{report.clock_s:.1f} s on the loop's clock took {report.machine_s:.1f} s of this machine's time",
+        *([_TOO_SLOW] if report.timings.missed_deadlines > report.steps / 2 else []),
         f"safety filter: {safety}",
         *([f"ended by: {report.fault}"] if report.fault else []),
     ])  # fmt: skip

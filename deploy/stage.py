@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts, contract, upgrades
+from ddgrasp import artifacts, contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
@@ -27,12 +27,7 @@ def run(job: Job) -> Artifact:
     """Run the trials that are not in trials.jsonl yet, then write the manifest."""
     config, directory, progress = job.config, job.directory, job.progress
     policy_path = job.parents["export"].directory / POLICY_FILE
-    header = _header(config, policy_path)
-    earlier = [
-        header | {"config_hash": artifacts.config_hash_of_version(version, config, STAGE)}
-        for version in range(1, upgrades.VERSION)
-    ]
-    log = TrialLog(directory / TRIALS_FILE, header, earlier)
+    log = TrialLog(directory / TRIALS_FILE, _header(config, policy_path))
     rig = tried(config)
     trials = plan(rig)
     with progress.task("trials", len(trials)) as task:

@@ -2,7 +2,6 @@
 
 import json
 import os
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,17 +14,16 @@ from deploy.trials import TrialResult
 class TrialLog:
     """Finished trials on disk, one JSON line each behind a header; a torn last line is dropped."""
 
-    def __init__(self, path: Path, header: dict[str, Any], earlier: Sequence[dict[str, Any]] = ()):
+    def __init__(self, path: Path, header: dict[str, Any]):
         """Read what is there. Raises UserError if it belongs to another policy or configuration.
 
         Args:
             header: what the trials belong to: the policy and the configuration.
-            earlier: the same as earlier versions wrote it.
         """
         self._path = path
         self.results: dict[tuple[int, bool], TrialResult] = {}
         lines = _complete_lines(path)
-        if lines and lines[0] not in (header, *earlier):
+        if lines and lines[0] != header:
             raise UserError(
                 f"{path} holds trials of another policy or configuration: delete {path.parent} to start "
                 "them anew, or choose another --out."

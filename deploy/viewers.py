@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
+from ddgrasp.install import pip_install
 from deploy.interfaces import Filmed, Staged
 from deploy.loop import Step
 from deploy.video import millimetres
@@ -53,7 +54,7 @@ class Rerun:
         try:
             rerun = import_module("rerun")
         except ImportError as error:
-            raise UserError(f"Rerun is not installed ({error}): pip install 'ddgrasp[view]'.") from error
+            raise UserError(f"Rerun is not installed ({error}): {pip_install('view')}.") from error
         self._rr: Any = rerun
         self.url = ""
         """Where a browser finds it."""

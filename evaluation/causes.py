@@ -16,6 +16,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_json, atomic_write_text, read_json
+from ddgrasp.install import pip_install
 from ddgrasp.progress import Progress
 from deploy.changes import Change
 from deploy.fr3_trials import Fr3Bench
@@ -90,7 +91,7 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
         if name not in ROWS:
             raise unknown_name("row", name, (*ROWS, EVERYTHING))
         if missing := [module for module in ROWS[name].needs if find_spec(module) is None]:
-            raise UserError(f"row {name!r} needs {' and '.join(missing)}: pip install 'ddgrasp[fr3]'.")
+            raise UserError(f"row {name!r} needs {' and '.join(missing)}: {pip_install('fr3')}.")
     needed = {*asked, *(ROWS[name].against for name in asked), REFERENCE}
     return tuple(name for name in ROWS if name in needed)
 

@@ -197,7 +197,7 @@ SHAPES: dict[str, ObjectSpec] = {
         ObjectSpec(
             "ring", 17, mass_kg=0.035, friction=0.7, rgb=(0.30, 0.22, 0.20), rest_height_m=0.011,
             grasp_symmetry=8, capsules=_torus(ring_m=0.018, radius_m=0.011),
-            source="58 mm across, 22 mm thick, with a hole; " + _MADE_UP,
+            source="58 mm across the corners of its octagon, 22 mm thick, with a hole; " + _MADE_UP,
         ),
         ObjectSpec(
             "tin", 18, mass_kg=0.180, friction=0.5, rgb=(0.20, 0.40, 0.65), rest_height_m=0.035,

@@ -8,7 +8,6 @@ keyed by seed, phase and step, so a resumed plan goes the way an uninterrupted o
 import json
 import shutil
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import numpy as np
 from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_json
 from ddgrasp.progress import Progress
-from ddgrasp.shipped import shipped
 from demos.rollout import Roller
 from demos.store import EpisodeStore
 from learning.loop import Metrics, run_steps
@@ -26,11 +24,11 @@ from learning.params import load_params, save_params
 from learning.prefetch import Prefetched
 from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
-from student_jax import frames_io, head, pretrained_encoder, train
+from student_jax import frames_io, head, pretrained_encoder, start, train
 from student_jax.act import SourceCamera, StudentActor
 from student_jax.data import Window
 from student_jax.depth_source import DepthSource
-from student_jax.policy import PARAMS_FILE, init_params, told_the_change
+from student_jax.policy import PARAMS_FILE, init_params
 
 PLAN = "plan.json"
 CHECKPOINTS = "checkpoints"
@@ -100,10 +98,7 @@ class Trainer:
             return
         self.params = init_params(jax.random.key(self._config.seed), self._student, self._profile)
         if self._student.init_from:
-            source = shipped(self._student.init_from)
-            source = source if (source / PARAMS_FILE).exists() else source / "student"
-            upgrade = partial(told_the_change, self._student)
-            self.params = load_params(source / PARAMS_FILE, self.params, upgrade)
+            self.params = start.load(self._student, self.params)
         else:
             self.params["encoder"] = pretrained_encoder.load_into(self.params["encoder"], self._student)
 

@@ -167,6 +167,8 @@ def test_what_is_no_number_is_refused(generator, scene):
 
 
 def test_files_that_are_no_generators_are_refused(tmp_path):
+    with pytest.raises(UserError, match=r"ddg is a folder: give the file, .*ddg/generator\.onnx"):
+        DepthGenerator("pretrained/ddg")
     with pytest.raises(UserError, match="no such file; make one with `ddgrasp ddg export`"):
         DepthGenerator(tmp_path / "generator.onnx")
     (tmp_path / "generator.onnx").write_bytes(b"no")

@@ -248,6 +248,8 @@ def test_no_server_at_the_host():
 def test_ports_that_are_taken_are_refused(rig):
     with pytest.raises(UserError, match=rf"{HOST}:1337 \(robot\) cannot be used"):
         Fr3Rig(HOST, primitive("cube"))
+    with pytest.raises(UserError, match="--host 'not.a.host' is no address of this machine"):
+        Fr3Rig("not.a.host", primitive("cube"))
     with pytest.raises(UserError, match="--speed is 0"):
         Fr3Rig("127.0.0.13", primitive("cube"), speed=0.0)
 

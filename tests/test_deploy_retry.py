@@ -45,7 +45,7 @@ def test_a_low_open_hand_that_stands_still_closes_once_then_goes_up_to_the_start
     assert told(retry, LOW, OPEN, STILL_STEPS) == [None] * STILL_STEPS
     action = retry(state(LOW, OPEN))
     assert action is not None and closes(action) and not action[ACTION.arm].any()
-    assert retry.begun == "the open hand has stood still for 1 s; closes"
+    assert retry.begun == "the open hand has stood still for 1 s; closes" and not retry.done
     assert all(closes(a) for a in told(retry, LOW, HOLDING, CLOSING_STEPS - 1))
     assert not retry.begun, "said once"
     assert told(retry, LOW, OPEN, STILL_STEPS) == [None] * STILL_STEPS, "the policy has it again"
@@ -85,7 +85,7 @@ def test_a_hand_that_has_lifted_something_stays_there_until_it_has_lost_it():
     assert told(retry, lifted, HOLDING, DONE_STEPS - 1) == [None] * (DONE_STEPS - 1)
     action = retry(state(lifted, HOLDING))
     assert action is not None and closes(action) and not action[ACTION.arm].any()
-    assert retry.begun == "what was grasped is lifted; stays there"
+    assert retry.begun == "what was grasped is lifted; stays there" and retry.done
     drifted = lifted + 0.02
     action = retry(state(drifted, HOLDING))
     assert action is not None and not retry.begun

@@ -210,6 +210,7 @@ def test_the_page_has_every_row_tried_or_not(study, tmp_path):
     html = page.render(study, picture)
     assert "10 / 1 of 20" in html and "Monocular left out: no &lt;weights&gt;" in html
     assert html.count("data:image/png;base64,") == 1
+    assert "Trials: development rig, development seed 0" in page.render(study, b"")
     text = page.describe(study, "development-development-0")
     assert "Sim GT" in text and "p (Holm) 0.0234" in text and "Inpaint" not in text
     assert TABLES["main"].title in text and TABLES["ripple"].title not in text + html

@@ -87,13 +87,13 @@ def test_more_than_there_is_is_refused_with_the_remedy(tmp_path):
 
 
 def test_a_batch_that_cannot_fit_is_refused_before_any_work(tmp_path):
-    from app.commands.checks import check_memory
+    from app.commands.checks import check_networks
 
     config = PRESETS["debug"]
-    lines = check_memory(config, tmp_path)
+    lines = check_networks(config, tmp_path)
     assert [line.split(":")[0] for line in lines] == ["demos", "ddg", "student"]
     training = replace(config.student.training, batch_size=65_536)
     large = replace(config, student=replace(config.student, training=training))
     with pytest.raises(UserError, match="Stage student needs about .* lower student.training.batch_size"):
-        check_memory(large, tmp_path)
+        check_networks(large, tmp_path)
     assert not list(tmp_path.iterdir())

@@ -84,6 +84,15 @@ def test_float_depth_is_metres_unless_its_size_says_otherwise(tmp_path):
     np.testing.assert_array_equal(Recording.open(tmp_path / "right" / "desk").depth_mm(1), depth_mm(1))
 
 
+def test_a_recording_that_is_there_stays(tmp_path):
+    root = make_folder(tmp_path / "desk", frames=2)
+    run(root, "--out", tmp_path / "out")
+    make_folder(tmp_path / "other" / "desk", frames=1)
+    with pytest.raises(UserError, match=r"out/desk exists already: delete it, or give another --out"):
+        run(tmp_path / "other", "--out", tmp_path / "out")
+    assert len(Recording.open(tmp_path / "out" / "desk")) == 2
+
+
 def test_what_is_not_a_number_is_a_hole(tmp_path):
     root = make_folder(tmp_path / "desk", frames=1)
     metres = depth_mm(0).astype(np.float32) / 1000

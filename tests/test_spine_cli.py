@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 from app.commands import COMMANDS, parse
-from app.commands.checks import CHECKPOINTS, check_config_values
+from app.commands.checks import CHECKPOINTS, check_config_values, check_networks, stage_folder
 from app.commands.parsing import HELP_ALL
+from ddgrasp import artifacts
 from ddgrasp.errors import UserError
+from ddgrasp.install import pip_install
 from ddgrasp.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
@@ -237,6 +239,37 @@ def test_a_start_is_found_in_a_run_and_in_a_stage_folder(tmp_path, monkeypatch):
     for folder in (tmp_path, tmp_path / "student"):
         config = _with("student", init_from=str(folder))
         assert check_config_values(config) is config
+
+
+def test_a_start_of_another_network_is_refused_before_any_stage(tmp_path):
+    demo = PRESETS["demo"]
+    unet = dataclasses.replace(demo.ddg.unet, widths=(8, 16, 24))
+    ddg = dataclasses.replace(demo.ddg, unet=unet, init_from="pretrained/ddg")
+    with pytest.raises(UserError, match=r"ddg has ddg\.unet\.widths .* configuration \(8, 16, 24\)"):
+        check_config_values(dataclasses.replace(demo, ddg=ddg))
+    head = dataclasses.replace(demo.student.head, chunk=demo.student.head.chunk + 1)
+    student = dataclasses.replace(demo.student, head=head, init_from="pretrained/student")
+    with pytest.raises(UserError, match=r"student/params\.msgpack does not fit this configuration's network"):
+        check_networks(dataclasses.replace(demo, student=student), tmp_path)
+
+
+def test_a_fitted_generator_is_found_in_a_run_and_in_its_folder(tmp_path):
+    ddg = artifacts.finish(tmp_path / "ddg", "ddg", PRESETS["debug"], seconds=1.0, metrics={}).directory
+    assert stage_folder("--model", tmp_path, "ddg") == stage_folder("--model", ddg, "ddg") == ddg
+    with pytest.raises(UserError, match=r"--model is nowhere, which does not exist: give a run"):
+        stage_folder("--model", Path("nowhere"), "ddg")
+    with pytest.raises(UserError, match="holds no finished stage: give a run that has made demos"):
+        stage_folder("--demos", tmp_path, "demos")
+
+
+def test_what_is_absent_is_brought_to_the_python_that_runs(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / ".venv"))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / ".venv" / "bin" / "python"))
+    monkeypatch.setenv("VIRTUAL_ENV", str(tmp_path / ".venv"))
+    assert pip_install("view") == "pip install 'ddgrasp[view]'"
+    monkeypatch.delenv("VIRTUAL_ENV")
+    assert pip_install("view") == ".venv/bin/python -m pip install 'ddgrasp[view]'"
 
 
 def test_the_checkpoints_are_those_the_stages_write():

@@ -12,7 +12,7 @@ from ddgrasp.config.checks import kinds
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.scaling import KEPT, SCALED, scaled, value_of
-from evaluation.report.summary import trial_run
+from evaluation.report.summary import TESTS_PRESET, trial_run
 
 SIZE = re.compile(
     r"_px$|_percent$|_size$|width|heads|channels|keypoints|features$|stride|space_to_depth|hidden|blocks$"
@@ -83,5 +83,7 @@ def test_a_factor_out_of_bounds_is_refused(value, message):
 def test_help_and_report_say_what_a_scaled_run_is():
     assert "--scale 0.001" in describe_commands()
     assert trial_run({"preset": "paper", "scale": 1.0}) == ""
+    assert "Preset debug" in trial_run({"preset": TESTS_PRESET, "scale": 1.0})
+    assert TESTS_PRESET in PRESETS
     assert "preset paper times 0.001" in trial_run({"preset": "paper", "scale": 0.001})
     assert Config("test").scale == 1

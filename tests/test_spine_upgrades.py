@@ -1,4 +1,4 @@
-"""Manifests, started stages and trial logs of earlier versions are read, accepted and continued."""
+"""Manifests and started stages of earlier versions are read, accepted and continued."""
 
 import dataclasses
 import json
@@ -11,7 +11,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json, read_json, to_json
 from ddgrasp.presets import PRESETS
 from ddgrasp.stages import ON_REQUEST, STAGES
-from deploy.stage import STAGE, TrialLog
+from upgrades_support import config_hash_of_version, downgraded
 
 ROOT = Path(__file__).parents[1]
 
@@ -28,7 +28,7 @@ def _as_before(config):
 
 
 CONFIG = _as_before(PRESETS["camera"])
-FLAT = upgrades.downgraded(to_json(CONFIG), 1)
+FLAT = downgraded(to_json(CONFIG), 1)
 ALL_STAGES = [stage.name for stage in (*STAGES, *ON_REQUEST)]
 
 
@@ -44,7 +44,7 @@ def write_version_1(directory: Path, stage: str, config=FLAT) -> None:
 def of_version_2(name: str) -> dict:
     """A preset's JSON, the fields that version 2 lacked at what it did."""
     value = to_json(PRESETS[name])
-    return json.loads(json.dumps(upgrades.upgraded(upgrades.downgraded(value, 2), 2)))
+    return json.loads(json.dumps(upgrades.upgraded(downgraded(value, 2), 2)))
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
@@ -52,7 +52,7 @@ def test_version_1_and_back_loses_nothing(name):
     value = of_version_2(name)
     if name not in ("paper", "ppo", "ppo_paper"):  # these use fields that version 2 lacked
         assert value == json.loads(json.dumps(to_json(_as_before(PRESETS[name]))))
-    flat = json.loads(json.dumps(upgrades.downgraded(value, 1)))
+    flat = json.loads(json.dumps(downgraded(value, 1)))
     assert {"train_steps", "widths", "prior", "sample_batch"} <= flat["ddg"].keys()
     assert {"input_height_px", "head_batch_size", "dagger_teacher_share"} <= flat["student"].keys()
     assert flat["deploy"]["franka_host"] == "172.16.0.2" and flat["world"]["random"]["crop_px"] == 24
@@ -79,7 +79,7 @@ def test_fields_named_by_hand_arrive_where_they_belong():
 
 
 def test_the_paper_presets_picture_of_version_1_becomes_one_that_an_encoder_takes():
-    flat = upgrades.downgraded(to_json(PRESETS["paper"]), 1)
+    flat = downgraded(to_json(PRESETS["paper"]), 1)
     flat["student"] |= {"input_height_px": 225, "input_width_px": 290}
     student = artifacts.config_from_json(upgrades.upgraded(flat, 1)).student
     assert student == _as_before(PRESETS["paper"]).student
@@ -95,13 +95,13 @@ def test_the_paper_presets_picture_of_version_1_becomes_one_that_an_encoder_take
     ],
 )
 def test_what_a_teacher_of_version_2_started_from_is_named(rounds, source, start):
-    old = json.loads(json.dumps(upgrades.downgraded(to_json(CONFIG), 2)))
+    old = json.loads(json.dumps(downgraded(to_json(CONFIG), 2)))
     assert "start" not in old["teacher"] and "gripper_std" not in old["teacher"] and "scale" not in old
     old["teacher"] |= {"clone_rounds": rounds, "init_from": source}
     config = artifacts.config_from_json(upgrades.upgraded(old, 2))
     assert (config.teacher.start, config.teacher.clone_rounds) == (start, 8)
     assert config.world.reward.distance == "funnel" and config.teacher.target_kl == 0.0
-    again = upgrades.downgraded(to_json(config), 2)["teacher"]
+    again = downgraded(to_json(config), 2)["teacher"]
     assert again["init_from"] == source and (again["clone_rounds"] == 0) == (start == "nothing")
 
 
@@ -134,22 +134,11 @@ def test_a_stage_begun_by_version_1_goes_on(tmp_path):
         artifacts.begin(directory, "student", other)
 
 
-def test_a_trial_log_of_version_1_goes_on(tmp_path):
-    policy = {"policy_sha256": "a"}
-    old = policy | {"config_hash": artifacts.config_hash_of_version(1, CONFIG, STAGE)}
-    new = policy | {"config_hash": artifacts.config_hash(CONFIG, STAGE)}
-    path = tmp_path / "trials.jsonl"
-    TrialLog(path, old)
-    TrialLog(path, new, [old])
-    assert json.loads(path.read_text().splitlines()[0]) == new
-    TrialLog(path, new)
-
-
 def test_the_hash_of_version_1_is_the_one_that_version_recorded():
     """The pretrained teacher's manifest holds it; nothing of what a teacher depends on was added since."""
     manifest = read_json(ROOT / "pretrained" / "teacher" / artifacts.MANIFEST)
     config = artifacts.config_from_json(upgrades.upgraded(manifest["config"], 1))
-    assert artifacts.config_hash_of_version(1, config, "teacher") == manifest["config_hash"]
+    assert config_hash_of_version(1, config, "teacher") == manifest["config_hash"]
 
 
 @pytest.mark.parametrize(("stage", "preset"), [("teacher", "laptop"), ("student", "demo")])

@@ -3,6 +3,7 @@
 import dataclasses
 import email
 import importlib.util
+import os
 import re
 import shutil
 import subprocess
@@ -69,6 +70,7 @@ def run(installed: Path, folder: Path, code: str) -> str:
         capture_output=True,
         text=True,
         timeout=300,
+        env={name: value for name, value in os.environ.items() if name != "VIRTUAL_ENV"},
     )
     assert done.returncode == 0, done.stderr
     return done.stdout

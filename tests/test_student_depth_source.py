@@ -35,6 +35,7 @@ from learning.params import save_params
 from student_jax import frames_io
 from student_jax.act import SourceCamera
 from student_jax.depth_source import GeneratorSource, SenseSource, make_source
+from upgrades_support import downgraded
 
 CONFIG = Config(
     preset="test",
@@ -235,7 +236,7 @@ def test_the_rigs_camera_looks_at_clean_depth_in_colour(demos, tmp_path):
 
 
 def test_students_from_before_there_was_a_choice_were_trained_on_learned_depth():
-    flat = upgrades.downgraded(artifacts.to_json(with_source("dextrah")), 1)
+    flat = downgraded(artifacts.to_json(with_source("dextrah")), 1)
     assert "depth_source" not in flat["student"]
     assert upgrades.upgraded(flat, 1)["student"]["depth_source"] == "learned"
 

@@ -15,7 +15,7 @@ import tyro
 from app import pipeline
 from app.commands.base import DEFAULT_PRESET, Command, FromPreset
 from app.commands.calibrate import Calibrate, CalibrateBoard
-from app.commands.checks import check_config_values, check_devices, check_memory, check_options
+from app.commands.checks import check_config_values, check_devices, check_networks, check_options
 from app.commands.dataset import DemosExport
 from app.commands.ddg import DDGDistil, DDGExport, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordFr3, RecordImport, RecordRealsense, SensorsCompare
@@ -47,7 +47,7 @@ class Run(FromPreset):
         check_config_values(self.config)
         check_devices(self.config, self.out)
         pipeline.check_place(self.out, resume=self.resume)
-        print(*check_memory(self.config, self.out), sep="\n", file=sys.stderr, flush=True)
+        print(*check_networks(self.config, self.out), sep="\n", file=sys.stderr, flush=True)
         report = pipeline.run(self.config, self.out, resume=self.resume)
         print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
         print_summary(report)

@@ -40,12 +40,15 @@ def _is_stated(kind: Any) -> bool:
 
 def check_config_values(config: Config) -> Config:
     """`config` if the names and files in it exist; UserError with the remedy otherwise."""
+    from ddg_jax import start
     from ddg_jax.prior import make_prior
     from student_jax.depth_source import check_source
 
     check_objects(config.world)
     for stage in ("ddg", "student"):
         _check_start(stage, f"{stage}.init_from", getattr(config, stage).init_from)
+    if config.ddg.init_from:
+        start.check(config.ddg)
     if config.teacher.starts_from_file:
         _check_start("teacher", "teacher.start", config.teacher.start, "nothing, guide, or ")
     check_source(config, make_prior(config.ddg))
@@ -81,6 +84,16 @@ def check_data(option: str, path: Path) -> None:
         raise UserError(f"{option} is {path}, which does not exist: give a recording or a folder of them.")
 
 
+def stage_folder(option: str, path: Path, stage: str) -> Path:
+    """The finished `stage` that `path` is, or that lies in the run `path`; UserError if there is none."""
+    source = shipped(path)
+    found = [folder for folder in (source, source / stage) if artifacts.is_finished(folder)]
+    if found:
+        return found[0]
+    trouble = "holds no finished stage" if source.exists() else "does not exist"
+    raise UserError(f"{option} is {path}, which {trouble}: give a run that has made {stage}, or its folder.")
+
+
 def check_devices(config: Config, run_dir: Path) -> None:
     """UserError if pictures cannot be drawn here, or the teacher, unless it is finished, not be trained."""
     from mjx_envs.render.batch_render import check_renderer
@@ -92,8 +105,9 @@ def check_devices(config: Config, run_dir: Path) -> None:
         check(config)
 
 
-def check_memory(config: Config, run_dir: Path) -> list[str]:
-    """What each unfinished stage that works on pictures will take, a line for each; UserError if too much.
+def check_networks(config: Config, run_dir: Path) -> list[str]:
+    """What each unfinished stage that works on pictures will take, a line for each; UserError if it is too
+    much, or if the student would start from another network.
 
     Traces a step of each, which the stages do as well.
     """
@@ -101,7 +115,10 @@ def check_memory(config: Config, run_dir: Path) -> list[str]:
     from demos import memory as demos_memory
     from learning import memory
     from student_jax import memory as student_memory
+    from student_jax import start
 
+    if not artifacts.is_finished(run_dir / "student"):
+        start.check(config)
     lines = []
     needs = {"demos": demos_memory.need, "ddg": ddg_memory.need, "student": student_memory.need}
     for stage, need_of in needs.items():

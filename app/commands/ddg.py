@@ -5,7 +5,7 @@ from pathlib import Path
 
 from app import pipeline
 from app.commands.base import OneStage
-from app.commands.checks import check_config_values, check_data
+from app.commands.checks import check_config_values, check_data, stage_folder
 from ddgrasp import artifacts
 from ddgrasp.config.checks import Count, Seed, Steps, Text
 from ddgrasp.config.ddg import Sampler
@@ -36,7 +36,7 @@ class DDGSample:
     """Draw recorded frames beside what a fitted noise model makes of them, as a PNG."""
 
     model: Path
-    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
     data: Path
     """A recording, or a folder of them."""
     out: Path = Path()
@@ -52,12 +52,8 @@ class DDGSample:
         from ddgrasp.progress import Progress
 
         check_data("--data", self.data)
-        progress = Progress(name="ddg sample")
-        print(
-            sample_folder(
-                self.model, self.data, self.out, seed=self.seed, progress=progress, count=self.count
-            )
-        )
+        model, progress = _fitted(self.model), Progress(name="ddg sample")
+        print(sample_folder(model, self.data, self.out, seed=self.seed, progress=progress, count=self.count))
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ class DDGDistil:
     """Distil a fitted noise model to few network evaluations per map."""
 
     model: Path
-    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
     data: Path
     """The recordings it was fitted on: a recording, or a folder of them."""
     out: Path
@@ -80,12 +76,12 @@ class DDGDistil:
     def run(self) -> None:
         """Distils the model into the run's folder ddg."""
         check_data("--data", self.data)
-        fitted = artifacts.read_artifact(self.model)
+        fitted = artifacts.read_artifact(_fitted(self.model))
         config = artifacts.config_from_json(fitted.manifest.config)
         training = config.ddg.training
         ddg = replace(
             config.ddg,
-            init_from=str(self.model.resolve()),
+            init_from=str(fitted.directory.resolve()),
             sampling=replace(config.ddg.sampling, sampler="progressive", steps=self.evaluations),
             training=training if self.steps is None else replace(training, distil_steps=self.steps),
         )
@@ -99,9 +95,9 @@ class DDGGenerate:
     """Give all demos the camera's artefacts: a stream in constant memory, over all devices."""
 
     model: Path
-    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
     demos: Path
-    """Stage directory of collected demos, for example runs/demo/demos."""
+    """A run with collected demos, or its folder demos."""
     out: Path
     """Directory of a run; the depth goes to its folder noisy."""
     seed: Seed = 0
@@ -111,7 +107,11 @@ class DDGGenerate:
 
     def run(self) -> None:
         """Writes depth.zarr episode by episode and prints how much of it is invalid."""
-        parents = {"ddg": artifacts.read_artifact(self.model), "demos": artifacts.read_artifact(self.demos)}
+        demos = stage_folder("--demos", self.demos, "demos")
+        parents = {
+            "ddg": artifacts.read_artifact(_fitted(self.model)),
+            "demos": artifacts.read_artifact(demos),
+        }
         config = artifacts.config_from_json(parents["ddg"].manifest.config)
         config = replace(config, seed=self.seed)
         stage = get_stage("noisy")
@@ -128,7 +128,7 @@ class DDGThresholds:
     """Holes, flicker and error over thresholds of a fitted noise model's mask: a table, JSON, a PNG."""
 
     model: Path
-    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
     data: Path
     """A recording, or a folder of them; its last frames are used."""
     out: Path = Path()
@@ -144,8 +144,8 @@ class DDGThresholds:
         from ddgrasp.progress import Progress
 
         check_data("--data", self.data)
-        progress = Progress(name="thresholds")
-        rows = thresholds.analyse(self.model, self.data, self.out, progress, count=self.count, seed=self.seed)
+        model, progress = _fitted(self.model), Progress(name="thresholds")
+        rows = thresholds.analyse(model, self.data, self.out, progress, count=self.count, seed=self.seed)
         print(f"{thresholds.table(rows)}\n{self.out / thresholds.FILE}.png")
 
 
@@ -154,7 +154,7 @@ class DDGExport:
     """Write a fitted noise model as one ONNX file for any simulator: clean depth in, a camera's depth out."""
 
     model: Path
-    """Stage directory of a fitted model, for example runs/demo/ddg."""
+    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
     out: Path = Path("generator.onnx")
     """The file."""
     data: Path | None = None
@@ -173,7 +173,7 @@ class DDGExport:
         if self.data is not None:
             check_data("--data", self.data)
         measured = export_generator(
-            self.model,
+            _fitted(self.model),
             self.out,
             data=self.data,
             licence=self.licence,
@@ -185,3 +185,7 @@ class DDGExport:
             f"the pixels grafted otherwise, inverse depth elsewhere within "
             f"{measured.inverse_depth_per_m:.1e} 1/m"
         )
+
+
+def _fitted(model: Path) -> Path:
+    return stage_folder("--model", model, "ddg")

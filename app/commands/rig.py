@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from ddgrasp.config.checks import Range, Seed
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
+from ddgrasp.install import pip_install
 from deploy.devices.options import RIG_HOST
 
 
@@ -55,7 +56,7 @@ class RigPictures:
     def run(self) -> None:
         """Writes the picture and prints where it is."""
         if find_spec("franky_sim") is None:
-            raise UserError("pictures of the FR3 rig need franky-sim: pip install 'ddgrasp[fr3]'.")
+            raise UserError(f"pictures of the FR3 rig need franky-sim: {pip_install('fr3')}.")
         from evaluation.rig_sheet import draw
 
         atomic_write_bytes(self.out, draw(self.object_name))

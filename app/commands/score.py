@@ -59,7 +59,7 @@ class DDGScore(Scoring):
     fit_frames: Count = 80
     """Frames that --real is fitted on."""
     score_frames: Count = 40
-    """Frames that --real is scored on, the last ones."""
+    """Frames that --real is scored on, the last ones; 16 or more."""
 
     def run(self) -> None:
         """Scores the run's generator on the rig, or one fitted on a real camera."""

@@ -1,5 +1,6 @@
 """ddgrasp student, export, deploy: the policy."""
 
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -121,7 +122,10 @@ class Deploy:
     """What `ddgrasp calibrate` wrote, if it is not runs/calibration/calibration.json."""
 
     def run(self) -> None:
-        """Runs the loop until the time is over, Ctrl-C or a fault, and prints how it kept time."""
+        """Runs the loop until the time is over, Ctrl-C or a fault, and prints how it kept time.
+
+        Raises SystemExit(1) after a fault.
+        """
         from deploy.session import SessionOptions, deploy, describe
 
         if self.robot == "sim":  # what else there is to grasp, no configuration knows
@@ -130,7 +134,10 @@ class Deploy:
             self.robot, self.camera, self.recording, self.object_name, self.seconds,
             dry_run=self.dry_run, yes=self.yes, host=self.host, out=self.out, calibration=self.calibration,
         )  # fmt: skip
-        print(describe(deploy(self.config, self.policy, options)))
+        report = deploy(self.config, self.policy, options)
+        print(describe(report))
+        if report.fault:
+            sys.exit(1)
 
 
 def config_of(policy: Path, preset: str | None) -> Config:

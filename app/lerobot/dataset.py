@@ -17,6 +17,7 @@ from app.lerobot.steps import COLOUR, DEPTH, Features, Storage, features, frames
 from ddgrasp import contract
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_text, new_folder
+from ddgrasp.install import pip_install
 from ddgrasp.progress import Progress
 
 FARTHEST_MM = 4095
@@ -73,7 +74,7 @@ def load_lerobot() -> Any:
     except ImportError as error:
         raise UserError(
             f"LeRobot datasets need lerobot 0.6 or newer, on Python 3.12 or newer ({error}): "
-            "pip install 'ddgrasp[lerobot]'."
+            f"{pip_install('lerobot')}."
         ) from error
     return library
 

@@ -18,6 +18,7 @@ from ddgrasp import contract
 from ddgrasp.config.deploy import FrankaConfig
 from ddgrasp.contract import HOME_RAD
 from ddgrasp.errors import UserError
+from ddgrasp.install import pip_install
 from deploy import kinematics
 from deploy.devices import franka_faults
 from deploy.devices.franka_hand import FrankaHand
@@ -248,4 +249,4 @@ def load_franky() -> Any:
     try:
         return importlib.import_module("franky")
     except ImportError as error:
-        raise UserError(f"robot 'franka' needs franky ({error}): pip install 'ddgrasp[franka]'.") from error
+        raise UserError(f"robot 'franka' needs franky ({error}): {pip_install('franka')}.") from error

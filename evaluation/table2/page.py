@@ -12,6 +12,7 @@ from ddgrasp import contract
 from evaluation import wilson
 from evaluation.report.figures import to_png
 from evaluation.report.html import image, page, table
+from evaluation.table2.results import describe_set
 from evaluation.table2.rows import DEPLOYED, ROWS, TABLES, TRAINING
 
 _COLUMNS = (
@@ -83,7 +84,7 @@ def render(study: Mapping[str, Any], picture: bytes) -> str:
         ),
     ]
     for name in study["sets"]:
-        body.append(f"<h2>{escape(name)}</h2>")
+        body.append(f"<h2>Trials: {escape(describe_set(name))}</h2>")
         for key in _begun(study["sets"][name]["rows"]):
             of = TABLES[key]
             body.append(f"<h3>{of.title}, reference {ROWS[of.reference].title}</h3>")

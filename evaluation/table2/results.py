@@ -31,6 +31,12 @@ def set_name(series: Series) -> str:
     return f"{series.rig}-{series.split}-{series.number}"
 
 
+def describe_set(name: str) -> str:
+    """What `set_name` made, in words."""
+    rig, split, number = name.rsplit("-", 2)
+    return f"{rig} rig, {split} seed {number}"
+
+
 def row_folder(out: Path, set_of_trials: str, row: str) -> Path:
     """Where a row's trials lie."""
     return out / TRIALS / set_of_trials / row

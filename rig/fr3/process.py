@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from types import TracebackType
 
 from ddgrasp.errors import UserError
+from ddgrasp.install import pip_install
 from mjx_envs.scene import HOME_RAD
 from rig.fr3.channel import PORT, Channel
 from rig.fr3.scene import SceneObject
@@ -49,7 +50,7 @@ class Fr3Rig:
         if not 0.0 < speed <= 1.0:
             raise UserError(f"--speed is {speed:g}; expected above 0 and at most 1, real time.")
         if find_spec("franky_sim") is None:
-            raise UserError("the FR3 rig needs franky-sim: pip install 'ddgrasp[fr3]'.")
+            raise UserError(f"the FR3 rig needs franky-sim: {pip_install('fr3')}.")
         check_ports(host)
         self.host = host
         given = {"host": host, "seed": seed, "speed": speed, "q_rad": list(q_rad), "with_board": with_board}
@@ -147,6 +148,11 @@ def check_ports(host: str) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind((host, port))
+            except (socket.gaierror, UnicodeError) as error:
+                raise UserError(
+                    f"--host {host!r} is no address of this machine: give a loopback one, 127.0.0.1 to "
+                    "127.255.255.254."
+                ) from error
             except OSError as error:
                 raise UserError(
                     f"{host}:{port} ({purpose}) cannot be used ({os.strerror(error.errno or 0)}): stop what "

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
+from ddgrasp.install import pip_install
 from rig.meshes.convex import convex_parts
 from rig.meshes.objects import MeshObject, get_mesh_object
 from rig.meshes.solids import Part, Vector, union
@@ -176,7 +177,7 @@ def _rest_turn(
 def _check_libraries() -> None:
     missing = [name for name in ("manifold3d", "networkx") if find_spec(name) is None]
     if missing:
-        raise UserError(f"Mesh objects need {' and '.join(missing)}: pip install 'ddgrasp[fr3]'.")
+        raise UserError(f"Mesh objects need {' and '.join(missing)}: {pip_install('fr3')}.")
 
 
 def _check_closed(name: str, part: Part) -> None:

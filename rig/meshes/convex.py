@@ -14,6 +14,7 @@ from jaxtyping import Float64
 
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path, user_cache
+from ddgrasp.install import pip_install
 from rig.meshes.solids import Part
 
 SHIPPED = Path(__file__).with_name("convex.npz")
@@ -51,7 +52,7 @@ def _decompose(part: Part) -> list[Hull]:
         import coacd
     except ImportError:
         raise UserError(
-            f"{part.name!r} is not convex and CoACD is not installed: pip install 'ddgrasp[fr3]'."
+            f"{part.name!r} is not convex and CoACD is not installed: {pip_install('fr3')}."
         ) from None
     coacd.set_log_level("error")
     mesh = _simplified(part.mesh)

@@ -39,8 +39,10 @@ def import_recording(source: Source, path: Path) -> Imported:
     """Writes the usable frames of `source` to a recording at `path`, which appears only when complete.
 
     Raises:
-        UserError: no usable frame, or depth whose median cannot be a D4xx's in that unit.
+        UserError: `path` exists, no usable frame, or depth whose median cannot be a D4xx's in that unit.
     """
+    if path.exists():
+        raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
     skipped, medians_m, size, frames = [], [], None, 0
     with RecordingWriter(path, source.meta) as writer:
         for frame in source.frames():

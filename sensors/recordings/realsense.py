@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ddgrasp.errors import UserError
+from ddgrasp.install import pip_install
 from sensors.recordings.sources import RawFrame, Source
 
 END_OF_FILE_MS = 2000
@@ -63,9 +64,7 @@ def load_pyrealsense2() -> Any:
     try:
         return importlib.import_module("pyrealsense2")
     except ModuleNotFoundError as error:
-        raise UserError(
-            f"RealSense needs pyrealsense2 ({error}): pip install 'ddgrasp[realsense]'."
-        ) from error
+        raise UserError(f"RealSense needs pyrealsense2 ({error}): {pip_install('realsense')}.") from error
     except ImportError as error:
         raise UserError(
             f"pyrealsense2 cannot be loaded ({error}): install the library it names, for libusb on Debian or "

@@ -1,0 +1,39 @@
+"""What a generator starts from (`ddg.init_from`): where it is, and whether its network is the one asked for.
+
+Imports no JAX, so that a command can say it before it begins.
+"""
+
+from operator import attrgetter
+from pathlib import Path
+
+from ddgrasp import artifacts
+from ddgrasp.config import DDGConfig
+from ddgrasp.errors import UserError
+from ddgrasp.shipped import shipped
+
+_THE_SAME = (
+    "depth.height_px", "depth.width_px", "depth.representation", "training.hole_loss", "depth.surface",
+    "depth.near_m", "depth.far_m", "prior.source", "unet.space_to_depth", "unet.widths", "unet.blocks",
+    "unet.attention_heads", "unet.position", "diffusion.steps", "diffusion.schedule",
+    "diffusion.log_snr_shift",
+)  # fmt: skip
+"""Values that a fitted network cannot be used without: its shape, and what its numbers stand for."""
+
+
+def folder(config: DDGConfig) -> Path:
+    """The stage's folder that `config.init_from` names, itself or in a run."""
+    source = shipped(config.init_from)
+    return source / "ddg" if (source / "ddg").is_dir() else source
+
+
+def check(config: DDGConfig) -> None:
+    """UserError if what `config.init_from` holds has another network or depth space than `config`."""
+    source = folder(config)
+    fitted = artifacts.config_from_json(artifacts.read_manifest(source).config).ddg
+    for name in _THE_SAME:
+        there, here = map(attrgetter(name), (fitted, config))
+        if there != here:
+            raise UserError(
+                f"The generator in {source} has ddg.{name} {there!r}, this configuration {here!r}: "
+                "use the same value, or fit a new one (empty ddg.init_from)."
+            )
