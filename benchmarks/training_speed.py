@@ -20,7 +20,7 @@ def generator(config: Config, steps: int) -> dict[str, float]:
     jitted, (static, _, *batch) = PROGRAMS["generator: train step"](config)
     state = ddg_train.init_state(config.ddg, jax.random.key_data(jax.random.key(0)))
     params = jax.tree.map(jnp.array, state.params)
-    rate = _steps_per_s(partial(jitted, static), state, _filled(batch), steps)
+    rate = _steps_per_s(partial(jitted, static), state, filled(batch), steps)
     draw = PROGRAMS[f"sampler: {config.ddg.sampling.sampler}"](config)
     frames = config.ddg.sampling.batch_size * _calls_per_s(draw, params, max(1, steps // 10))
     return {"train_steps_per_s": rate, "sampled_frames_per_s": frames}
@@ -32,11 +32,11 @@ def student(config: Config, steps: int) -> dict[str, float]:
     params = init_params(jax.random.key(0), config.student, config.world.profile)
     trained, frozen = student_train.split(config.student, params)
     state = student_train.init_state(config.student, static[-1], 0, trained)
-    rate = _steps_per_s(partial(jitted, *static), state, (frozen, *_filled((batch,))), steps)
+    rate = _steps_per_s(partial(jitted, *static), state, (frozen, *filled((batch,))), steps)
     return {"train_steps_per_s": rate, "train_frames_per_s": rate * config.student.training.batch_size}
 
 
-def _filled(shapes: Any) -> Any:
+def filled(shapes: Any) -> Any:
     """Arrays of these shapes with plausible values: small floats, metres in the depth, whole numbers low."""
     rng = np.random.default_rng(0)
 
@@ -66,7 +66,7 @@ def _steps_per_s(step: Any, state: Any, batch: Any, steps: int) -> float:
 def _calls_per_s(program: Program, params: Any, calls: int) -> float:
     """Of `calls` calls of a sampler, whose second argument `params` takes the place of."""
     jitted, (key, _, *rest) = program
-    arguments = (*_filled((key,)), params, *_filled(tuple(rest)))
+    arguments = (*filled((key,)), params, *filled(tuple(rest)))
     jax.block_until_ready(jitted(*arguments))
     start = time.perf_counter()
     for _ in range(calls):

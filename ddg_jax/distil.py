@@ -28,6 +28,7 @@ from ddg_jax.train import (
 from ddgrasp.config import DDGConfig
 from ddgrasp.progress import Progress
 from learning import diffusion
+from learning.convolutions import compiler_options
 from learning.loop import run_steps
 from learning.params import Params, load_params, save_params
 from learning.train_state import TrainState, first_state, updated
@@ -105,7 +106,7 @@ def _round(
     return jax.tree.map(np.asarray, state.ema)
 
 
-@partial(jax.jit, static_argnums=0, donate_argnums=1)
+@partial(jax.jit, static_argnums=0, donate_argnums=1, compiler_options=compiler_options())
 def distil_step(
     config: DDGConfig,
     state: TrainState,

@@ -26,6 +26,7 @@ from ddgrasp.depth import resize_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import shipped
 from learning import diffusion
+from learning.convolutions import compiler_options
 from learning.params import Params, load_params, save_params
 
 PARAMS_FILE = "params.msgpack"
@@ -254,6 +255,12 @@ def batch_size(config: DDGConfig) -> int:
     return config.sampling.batch_size * jax.local_device_count()
 
 
+_sample_here = jax.jit(
+    sample, static_argnums=(0,), static_argnames=("steps",), compiler_options=compiler_options()
+)
+"""`sample`, which other programs contain, as a program of its own."""
+
+
 def predict(
     key: Key[Array, ""],
     generator: Generator,
@@ -275,7 +282,7 @@ def predict(
     parts = []
     for start in range(0, len(c), size):
         now = slice(start, start + size)
-        x = sample(
+        x = _sample_here(
             config,
             key,
             params,

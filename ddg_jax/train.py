@@ -28,6 +28,7 @@ from ddgrasp.arrays import AnyArray
 from ddgrasp.config import CROSS_ENTROPY, SQUARED, UNIFORM, DDGConfig
 from ddgrasp.progress import Progress
 from learning import diffusion
+from learning.convolutions import compiler_options
 from learning.loop import run_steps
 from learning.optimizers import adamw
 from learning.params import Params
@@ -179,7 +180,7 @@ def step_keys(state: TrainState) -> Key[Array, "3"]:
     return jax.random.split(step_key(state, ahead=1), 3)
 
 
-@partial(jax.jit, static_argnums=0, donate_argnums=1)
+@partial(jax.jit, static_argnums=0, donate_argnums=1, compiler_options=compiler_options())
 def train_step(
     config: DDGConfig, state: TrainState, x_0: Float[AnyArray, "B H W C"], c: Float[AnyArray, "B H W"]
 ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:

@@ -15,6 +15,7 @@ from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.depth import to_metres
+from learning.convolutions import compiler_options
 from learning.diffusion import q_sample
 from learning.optimizers import adamw
 from learning.train_state import TrainState, first_state, step_key, updated
@@ -136,7 +137,7 @@ def aux_losses(seen: Aux, target: Aux) -> dict[str, Float[Array, ""]]:
     }
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3)
+@partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=3, compiler_options=compiler_options())
 def train_step(
     config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, frozen: dict, batch: Batch
 ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:

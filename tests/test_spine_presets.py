@@ -53,8 +53,8 @@ def test_the_generator_its_training_step_and_its_sampler(name):
     batch, size = config.training.batch_size, (config.depth.height_px, config.depth.width_px)
     maps = (*size, representation.channels(config))
     state = jax.eval_shape(partial(ddg_train.init_state, config), key_data())
-    step = partial(ddg_train.train_step, config)
-    trained, metrics = jax.eval_shape(step, state, shape(batch, *maps), shape(batch, *size))
+    step = ddg_train.train_step.eval_shape
+    trained, metrics = step(config, state, shape(batch, *maps), shape(batch, *size))
     assert sizes(trained.params) == sizes(state.params)
     assert metrics["loss"].shape == ()
 
@@ -86,9 +86,8 @@ def test_the_student_its_training_steps_and_its_sampler(name):
     steps = max(1, student.training.steps)
     trained, frozen = student_train.split(student, params)
     start = jax.eval_shape(partial(student_train.init_state, student, steps, 0), trained)
-    after, terms = jax.eval_shape(
-        partial(student_train.train_step, student, profile, steps), start, frozen, batch
-    )
+    step = student_train.train_step.eval_shape
+    after, terms = step(student, profile, steps, start, frozen, batch)
     assert sizes(after.params) == sizes(trained)
     assert ("action" in terms) == (student.training.action_weight > 0)
 
