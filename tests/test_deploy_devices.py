@@ -11,17 +11,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from app.commands import parse
 from ddgrasp import contract
 from ddgrasp.config import CAMERAS, ROBOTS, FrankaConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
+from deploy import session
 from deploy.clock import SimClock
 from deploy.devices import registry
 from deploy.devices.franka_robot import FrankaRobot
 from deploy.devices.options import Setup
 from deploy.devices.realsense_camera import RealSenseCamera
 from deploy.devices.replay_camera import ReplayCamera
-from deploy.loop import ControlLoop, LoopSettings
+from deploy.loop import ControlLoop, LoopReport, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.safety import SafetyFilter, SafetyLimits
 from deploy.session import SessionOptions, deploy, for_devices
@@ -265,3 +267,25 @@ def test_sigterm_holds_and_stops_the_robot_as_ctrl_c_does(tmp_path, monkeypatch)
     assert said[-2].endswith("stop: interrupted; the robot holds position")
     assert said[-1] == f"report: {next(tmp_path.glob('*/report.json'))}"
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_deployment_that_a_fault_ended_exits_with_1_and_one_that_kept_no_rate_says_so(monkeypatch, capsys):
+    report = LoopReport(0.1, steps=10)
+    monkeypatch.setattr(session, "deploy", lambda *_: report)
+    command = parse("deploy", ["--policy", "policy.onnx"])
+    command.run()
+    assert "did not keep its rate" not in capsys.readouterr().out
+    report.fault, report.timings.missed_deadlines = "lost connection", 9
+    with pytest.raises(SystemExit) as stop:
+        command.run()
+    said = capsys.readouterr().out
+    assert stop.value.code == 1
+    assert "ended by: lost connection" in said and "did not keep its rate" in said
+
+
+def test_an_arm_is_not_asked_for_where_nobody_can_answer(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: False))
+    policy, said = write_policy(tmp_path / "policy.onnx", describe()), []
+    with pytest.raises(UserError, match="nobody can be asked here: give --yes"):
+        deploy(get_preset("debug"), policy, SessionOptions("franka", "realsense"), said.append)
+    assert said == []
