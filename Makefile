@@ -60,7 +60,7 @@ bench-surfaces: setup  ## surfaces made of recorded depth against the truth (ARG
 bench-noise: setup  ## depth noise of simulators beside a generator (ARGS="RECORDING --generator FILE.onnx")
 	$(BIN)/python -m benchmarks.simulator_noise $(ARGS)
 
-bench-convolutions: setup  ## training steps and sampler as jaxlib prefers and as compiled here, on a CPU
+bench-convolutions: setup  ## training steps and sampler as jaxlib prefers and by Eigen, on a CPU
 	$(BIN)/python -m benchmarks.convolutions $(ARGS)
 
 bench-costs: setup  ## FLOPs and bytes of every stage of preset paper, and what an H100 needs for them

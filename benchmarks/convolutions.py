@@ -1,4 +1,6 @@
-"""Programs with convolutions on a CPU, compiled as jaxlib 0.10 prefers and as this project does, in turns.
+"""Programs on a CPU, compiled as jaxlib 0.10 prefers and by Eigen alone, in turns.
+
+Training steps of generator and student and the sampler are compiled by Eigen in this project, others are not.
 
     python -m benchmarks.convolutions --rounds 6
 
@@ -53,12 +55,12 @@ def main() -> None:
     if compiler_options() is None:
         print("Nothing to compare: this jaxlib is not 0.10, or compiles for an accelerator.")
         return
-    print(f"{'ms a call':<24}{'preferred':>10}{'as here':>10}{'ratio':>8}")
+    print(f"{'ms a call':<24}{'preferred':>10}{'Eigen':>10}{'ratio':>8}")
     for name in options.programs:
         times = milliseconds(PROGRAMS[name](get_preset(options.preset)), options.rounds)
-        preferred, here = np.median(times, axis=0)
+        preferred, eigen = np.median(times, axis=0)
         ratio = np.median(times[:, 0] / times[:, 1])
-        print(f"{name:<24}{preferred:>10.0f}{here:>10.0f}{ratio:>8.2f}", flush=True)
+        print(f"{name:<24}{preferred:>10.0f}{eigen:>10.0f}{ratio:>8.2f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -82,56 +82,41 @@ _GROUPS_OF_2: dict[str, dict[str, dict[str, str]]] = {
 _DROPPED_AFTER_1 = {"world.random.crop_px": 24}
 """Fields of version 1 that version 2 lacks, with the value that they had."""
 
-_ADDED_AFTER_1 = {"student.depth_source": "learned"}
-"""Fields that version 1 lacked, with what it did."""
-
-
-_ADDED_AFTER_2 = {
-    "scale": 1.0,
-    "world.renderer": "jax",
-    "deploy.clock": "machine",
-    "deploy.arm_lower_m": [-0.55, -0.80, 0.0],
-    "deploy.arm_upper_m": [0.95, 0.80, 1.30],
-    "deploy.franka.model": "fr3",
-    "deploy.franka.kernel": "realtime",
-    "deploy.franka.start_dynamics": 0.05,
-    "deploy.franka.contact_torque_nm": 20.0,
-    "deploy.franka.contact_force_n": 30.0,
-    "deploy.franka.load_kg": 0.0,
-    "deploy.franka.stiffness_nm_rad": 400.0,
-    "world.random.pregrasp_turn_rad": 0.0,
-    "world.random.held_share": 0.0,
-    "world.reward.distance": "funnel",
-    "world.reward.grasp_switch": "touch",
-    "teacher.target_kl": 0.0,
-    "teacher.gripper_std": 0.15,
-    "teacher.min_std": 0.01,
-    "teacher.pregrasp_turn_rad": 0.0,
-    "teacher.held_share": 0.0,
-    "teacher.settle_from": 1.0,
+_ADDED_AFTER: dict[int, dict[str, Any]] = {
+    1: {"student.depth_source": "learned"},
+    2: {
+        "scale": 1.0,
+        "world.renderer": "jax",
+        "deploy.clock": "machine",
+        "deploy.arm_lower_m": [-0.55, -0.80, 0.0],
+        "deploy.arm_upper_m": [0.95, 0.80, 1.30],
+        "deploy.franka.model": "fr3",
+        "deploy.franka.kernel": "realtime",
+        "deploy.franka.start_dynamics": 0.05,
+        "deploy.franka.contact_torque_nm": 20.0,
+        "deploy.franka.contact_force_n": 30.0,
+        "deploy.franka.load_kg": 0.0,
+        "deploy.franka.stiffness_nm_rad": 400.0,
+        "world.random.pregrasp_turn_rad": 0.0,
+        "world.random.held_share": 0.0,
+        "world.reward.distance": "funnel",
+        "world.reward.grasp_switch": "touch",
+        "teacher.target_kl": 0.0,
+        "teacher.gripper_std": 0.15,
+        "teacher.min_std": 0.01,
+        "teacher.pregrasp_turn_rad": 0.0,
+        "teacher.held_share": 0.0,
+        "teacher.settle_from": 1.0,
+    },
+    3: {"ddg.graft.window_px": 0.0},
+    4: {"student.head.closing_steps": 0, "student.training.unseen_share": 0.0},
+    5: {"student.training.edge_noise_px": 0.0},
+    6: {"student.training.demo_stretch_steps": 0},
+    7: {"student.picture.fill_holes": False},
+    8: {"ddg.unet.position": False},
+    9: {"deploy.retry": False},
 }
-"""Fields that version 2 lacked, with what it did."""
-
-_ADDED_AFTER_3 = {"ddg.graft.window_px": 0.0}
-"""Fields that version 3 lacked, with what it did."""
-
-_ADDED_AFTER_4 = {"student.head.closing_steps": 0, "student.training.unseen_share": 0.0}
-"""Fields that version 4 lacked, with what it did."""
-
-_ADDED_AFTER_5 = {"student.training.edge_noise_px": 0.0}
-"""Fields that version 5 lacked, with what it did."""
-
-_ADDED_AFTER_6 = {"student.training.demo_stretch_steps": 0}
-"""Fields that version 6 lacked, with what it did."""
-
-_ADDED_AFTER_7 = {"student.picture.fill_holes": False}
-"""Fields that version 7 lacked, with what it did."""
-
-_ADDED_AFTER_8 = {"ddg.unet.position": False}
-"""Fields that version 8 lacked, with what it did."""
-
-_ADDED_AFTER_9 = {"deploy.retry": False}
-"""Fields that version 9 lacked, with what it did."""
+"""Version -> the fields that it lacked and the next one has, with what it did."""
 
 _CLONE_ROUNDS = 8
 """What stands in a configuration that does not clone: version 2 wrote 0."""
@@ -145,29 +130,15 @@ def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     made = copy.deepcopy(dict(config))
     if version < 2:
         _drop(made, _DROPPED_AFTER_1)
-        _add(made, _ADDED_AFTER_1)
+        _add(made, _ADDED_AFTER[1])
         for section, groups in _GROUPS_OF_2.items():
             if section in made:
                 made[section] = _grouped(made[section], groups)
         _trim_picture(made.get("student", {}).get("picture", {}))
-    if version < 3:
-        _add(made, _ADDED_AFTER_2)
-        if "teacher" in made:
-            _name_start(made["teacher"])
-    if version < 4:
-        _add(made, _ADDED_AFTER_3)
-    if version < 5:
-        _add(made, _ADDED_AFTER_4)
-    if version < 6:
-        _add(made, _ADDED_AFTER_5)
-    if version < 7:
-        _add(made, _ADDED_AFTER_6)
-    if version < 8:
-        _add(made, _ADDED_AFTER_7)
-    if version < 9:
-        _add(made, _ADDED_AFTER_8)
-    if version < 10:
-        _add(made, _ADDED_AFTER_9)
+    for lacking in range(max(version, 2), VERSION):
+        _add(made, _ADDED_AFTER[lacking])
+    if version < 3 and "teacher" in made:
+        _name_start(made["teacher"])
     return made
 
 

@@ -88,8 +88,8 @@ class Controls:
 
     def _change_rig(self, rig: str) -> str:
         """Goes on there with the object that is before the arm now, if that rig has it."""
-        self.rig = rig
-        name = self.object_name if self.object_name in self._objects else self._objects[0]
+        name = self.object_name if self.object_name in self._known[rig] else self._known[rig][0]
+        self.rig, self.object_name = rig, name
         self._asked.put(name)
         return f"rig: {rig}, next: {name}"
 

@@ -40,6 +40,8 @@ def test_a_typed_rig_interrupts_and_keeps_the_object_where_it_has_it():
     assert controls.interrupts and controls.rig == "fr3" and controls.next_object() == "can"
     controls.begin("milk")
     assert controls.line("development") == "rig: development, next: apple"
+    controls.key(DOWN)  # goes on from what that rig has, before the trial begins
+    assert controls.object_name == "banana"
     with pytest.raises(UserError, match="'milk'"):
         controls.line("milk")
     assert "rig" not in Controls({"development": ("can",)}, "development").help

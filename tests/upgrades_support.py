@@ -19,7 +19,7 @@ def _flatten(made: dict[str, Any]) -> None:
     for name, value in upgrades._DROPPED_AFTER_1.items():
         section, field = upgrades._section_of(made, name)
         section[field] = value
-    upgrades._drop(made, upgrades._ADDED_AFTER_1)
+    upgrades._drop(made, upgrades._ADDED_AFTER[1])
     for section, groups in upgrades._GROUPS_OF_2.items():
         taken = {group: made[section].pop(group) for group in groups}
         for group, fields in groups.items():
@@ -30,22 +30,9 @@ def downgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     """The JSON of a configuration of this version with the fields of an earlier one: what its hashes were
     over. Values of fields that it lacked are lost."""
     made = copy.deepcopy(dict(config))
-    if version < 10:
-        upgrades._drop(made, upgrades._ADDED_AFTER_9)
-    if version < 9:
-        upgrades._drop(made, upgrades._ADDED_AFTER_8)
-    if version < 8:
-        upgrades._drop(made, upgrades._ADDED_AFTER_7)
-    if version < 7:
-        upgrades._drop(made, upgrades._ADDED_AFTER_6)
-    if version < 6:
-        upgrades._drop(made, upgrades._ADDED_AFTER_5)
-    if version < 5:
-        upgrades._drop(made, upgrades._ADDED_AFTER_4)
-    if version < 4:
-        upgrades._drop(made, upgrades._ADDED_AFTER_3)
+    for lacking in range(max(version, 2), upgrades.VERSION):
+        upgrades._drop(made, upgrades._ADDED_AFTER[lacking])
     if version < 3:
-        upgrades._drop(made, upgrades._ADDED_AFTER_2)
         teacher = made["teacher"]
         start = teacher.pop("start")
         teacher["init_from"] = "" if start in ("nothing", "guide") else start

@@ -176,11 +176,8 @@ class _Rigs:
 
 def _objects_by_rig(series: "Series") -> dict[str, tuple[str, ...]]:
     """What each rig that can run here has to grasp, that of `series` first."""
-    others = {"development", "fr3"} - {series.rig}
-    with contextlib.suppress(UserError):
-        extras.check_fr3("")
-        return {rig: replace(series, rig=rig).known() for rig in (series.rig, *others)}
-    return {series.rig: series.known()}
+    others = set() if extras.lacks_fr3() else {"development", "fr3"} - {series.rig}
+    return {rig: replace(series, rig=rig).known() for rig in (series.rig, *others)}
 
 
 class _ChosenNoise:
