@@ -1,8 +1,9 @@
 """How a CPU computes convolutions: on jaxlib 0.10 by Eigen, which is faster here than the library it prefers.
 
-XLA hands convolutions to YNNPACK there. In turns in one process, two AMD EPYC cores beside a training: a
-training step of the student takes 1.33 times as long with it, of the generator 1.33, drawing six evaluations
-1.45 (`docs/accelerators.md`); the student's forward pass as long, PPO's gradient steps a little less long.
+XLA hands convolutions to YNNPACK there. On two AMD EPYC cores a training step of the student takes 1.3 times
+as long with it, of the generator 1.3 to 1.5, drawing generated depth 1.4; the student's forward pass and
+PPO's gradient steps as long, to within what was measured twice (`benchmarks/convolutions.py`,
+`docs/accelerators.md`).
 """
 
 import importlib.metadata
