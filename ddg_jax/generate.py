@@ -23,6 +23,7 @@ from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from demos.store import EpisodeStore
+from mjx_envs.views import Views
 
 STORE = "depth.zarr"
 """`data/depth_mm` with artefacts; episodes and steps of the demo store."""
@@ -37,6 +38,8 @@ class Clip:
     depth_mm: UInt16[np.ndarray, "T H W"]
     rgb: UInt8[np.ndarray, "T h w 3"] | None = None
     """For priors that need it in simulation."""
+    views: Views | None = None
+    """What the frames are of, where it is known."""
 
 
 def noisy_episodes(

@@ -19,6 +19,7 @@ from mjx_envs import randomize
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.physics.interface import warn_of_dropped
 from mjx_envs.render.visual import Viewer
+from mjx_envs.views import Views, observed
 from ppo.policy import TeacherPolicy
 
 Actor = Callable[["Scene"], np.ndarray]
@@ -40,6 +41,8 @@ class Scene:
     """Object in the hand."""
     step: int
     rgb: UInt8[np.ndarray, "B H W 3"] | None = None
+    views: Views | None = None
+    """What the pictures are of."""
 
 
 @dataclass
@@ -55,6 +58,10 @@ class Episodes:
     success: Bool[np.ndarray, " B"]
     object_index: Int[np.ndarray, " B"]
     T_world_cam: Float[np.ndarray, "B 4 4"]
+    variant: Int[np.ndarray, " B"]
+    """See `Views`."""
+    size: Float[np.ndarray, " B"]
+    """See `Views`."""
     depth_mm: Spool | None = None
     """Clean, (B, H, W) uint16 a step; None unless kept."""
     rgb: Spool | None = None
@@ -131,6 +138,7 @@ class Roller:
             success=success,
             object_index=np.asarray(state.info["episode"].object_index),
             T_world_cam=np.asarray(cameras),
+            **self._objects(state),
         )
 
     def programs(self) -> dict[str, tuple[Any, tuple[Any, ...]]]:
@@ -161,7 +169,15 @@ class Roller:
         geoms = self._pose(state)
         depth_mm = np.asarray(self._draw_depth(geoms, cameras))
         rgb = np.asarray(self._draw_rgb(geoms, cameras)) if self._with_rgb else None
-        return Scene(depth_mm=depth_mm, step=t, rgb=rgb, **seen)
+        views = observed(seen["observation"], T_world_cam=np.asarray(cameras), **self._objects(state))
+        return Scene(depth_mm=depth_mm, step=t, rgb=rgb, views=views, **seen)
+
+    def _objects(self, state) -> dict[str, np.ndarray]:
+        """`variant` (B,) and `size` (B,), see `Views`."""
+        episode = state.info["episode"]
+        variant = np.asarray(episode.variant)
+        size = np.asarray(episode.rest_height) / self.env.table.rest_height[variant]
+        return {"variant": variant, "size": size.astype(np.float32)}
 
     def _begin_batch(self, key):
         k_env, k_cam = jax.random.split(key)
@@ -233,5 +249,7 @@ def successful(episodes: Episodes) -> Iterator[tuple[dict[str, np.ndarray], dict
             {
                 "object_index": np.asarray(episodes.object_index[i], np.int32),
                 "T_world_cam": episodes.T_world_cam[i].astype(np.float32),
+                "variant": np.asarray(episodes.variant[i], np.int32),
+                "size": np.asarray(episodes.size[i], np.float32),
             },
         )

@@ -35,7 +35,7 @@ class ObjectTable:
         self.other_variant = np.arange(len(specs))
         self.other_variant[turning] = len(specs) + np.arange(len(turning))
         specs += [specs[i].in_other_pose() for i in turning]
-        self.names = tuple(names)
+        self.names, self.variants = tuple(names), tuple(specs)
         models = [spec.model(self.layout) for spec in specs]
         self.model = ObjectModel(*(np.stack(values) for values in zip(*models, strict=True)))
         self.rest_height = np.array([s.rest_height_m for s in specs])

@@ -38,7 +38,7 @@ class SourceCamera:
         """(B, H, W) uint16 with artefacts."""
         count = len(scene.depth_mm)
         episode, frame = self._first + np.arange(count), np.full(count, scene.step)
-        return self._source.frames(scene.depth_mm, scene.rgb, episode, frame)
+        return self._source.frames(scene.depth_mm, scene.rgb, episode, frame, scene.views)
 
 
 class StudentActor:

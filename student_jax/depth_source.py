@@ -1,8 +1,8 @@
 """Where the student's depth comes from in training: clean depth in, depth as a camera would report it out.
 
 `student.depth_source` names one: `learned` is the run's fitted generator, `learned_ungrafted` its own map,
-`monocular` a network on colour (`ddg_jax/monocular.py`), the others are the camera models of
-`ddg_jax/sensor.py`.
+`monocular` a network on colour (`ddg_jax/monocular.py`), `rig` the rig's own camera before the scene
+(`student_jax/rig_source.py`), the others are the camera models of `ddg_jax/sensor.py`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,10 +25,13 @@ from ddgrasp.config import Config, SensorConfig
 from ddgrasp.depth import to_metres, to_millimetres
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
+from mjx_envs.views import Views
 from sensors.models.sense import Sense
 
 LEARNED = ("learned", "learned_ungrafted")
 """Sources that are the run's generator."""
+VIEWED = ("variant", "size", "T_world_cam")
+"""What demos say of each episode that its pictures are of (`mjx_envs.views.Views`)."""
 _BATCH = 16
 """Frames that a camera model gets at once: one size, compiled once."""
 
@@ -43,6 +46,11 @@ class DepthSource(Protocol):
     @property
     def needs_rgb(self) -> bool:
         """Whether it must be given colour."""
+        ...
+
+    @property
+    def needs_views(self) -> bool:
+        """Whether it must be given what the pictures are of."""
         ...
 
     def episodes(
@@ -62,6 +70,7 @@ class DepthSource(Protocol):
         rgb: UInt8[np.ndarray, "B H W 3"] | None,
         episode: Int[np.ndarray, " B"],
         frame: Int[np.ndarray, " B"],
+        views: Views | None = None,
     ) -> UInt16[np.ndarray, "B H W"]:
         """(B, H, W) uint16 millimetres of B frames that have nothing to do with each other.
 
@@ -70,6 +79,7 @@ class DepthSource(Protocol):
           rgb: (B, H, W, 3) uint8, where `needs_rgb`.
           episode: (B,) number of each frame's episode.
           frame: (B,) its number within that.
+          views: of B pictures, where `needs_views`.
         """
         ...
 
@@ -82,6 +92,7 @@ class GeneratorSource:
     key: Key[jax.Array, ""]
     grafting: bool = True
     """Off: the generator's own map, as in the paper's ablation (IV-C)."""
+    needs_views: bool = False
 
     @property
     def needs_rgb(self) -> bool:
@@ -100,6 +111,7 @@ class GeneratorSource:
         rgb: UInt8[np.ndarray, "B H W 3"] | None,
         episode: Int[np.ndarray, " B"],
         frame: Int[np.ndarray, " B"],
+        views: Views | None = None,
     ) -> UInt16[np.ndarray, "B H W"]:
         """See `DepthSource`."""
         rgb = rgb if self.needs_rgb else None
@@ -113,6 +125,7 @@ class MonocularSource:
 
     network: MonocularDepth
     needs_rgb: bool = True
+    needs_views: bool = False
 
     def episodes(
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
@@ -120,7 +133,7 @@ class MonocularSource:
         """See `DepthSource`."""
         for i in range(first, len(lengths)):
             clip = read(i)
-            assert clip.rgb is not None  # `check_colour` sees to it
+            assert clip.rgb is not None  # `check_demos` sees to it
             yield self.network(clip.depth_mm, clip.rgb)
 
     def frames(
@@ -129,6 +142,7 @@ class MonocularSource:
         rgb: UInt8[np.ndarray, "B H W 3"] | None,
         episode: Int[np.ndarray, " B"],
         frame: Int[np.ndarray, " B"],
+        views: Views | None = None,
     ) -> UInt16[np.ndarray, "B H W"]:
         """See `DepthSource`."""
         assert rgb is not None
@@ -142,6 +156,7 @@ class SenseSource:
     sense: Sense
     key: Key[jax.Array, ""]
     needs_rgb: bool = False
+    needs_views: bool = False
 
     def episodes(
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
@@ -158,6 +173,7 @@ class SenseSource:
         rgb: UInt8[np.ndarray, "B H W 3"] | None,
         episode: Int[np.ndarray, " B"],
         frame: Int[np.ndarray, " B"],
+        views: Views | None = None,
     ) -> UInt16[np.ndarray, "B H W"]:
         """See `DepthSource`."""
         colour = rgb if self.needs_rgb else None
@@ -186,6 +202,10 @@ def make_source(config: Config, ddg: Path) -> DepthSource:
         return GeneratorSource(Generator.load(ddg), key, grafting=name == "learned")
     if name == "monocular":
         return MonocularSource(MonocularDepth(config.ddg))
+    if name == "rig":
+        from student_jax.rig_source import RigSource
+
+        return RigSource(config)
     sensor = SensorConfig(name=name, stereo=config.record.stereo)
     return SenseSource(make_sensor(sensor, config.world.profile), key, name in BY_COLOUR)
 
@@ -206,13 +226,26 @@ def check_source(config: Config, prior: Prior) -> None:
         )
 
 
-def check_colour(source: DepthSource, demos: EpisodeStore) -> None:
-    """UserError if `source` needs colour that the demos lack."""
+def check_demos(source: DepthSource, demos: EpisodeStore) -> None:
+    """UserError if `source` needs colour, or what pictures are of, and the demos lack it."""
     if source.needs_rgb and "rgb" not in demos.fields:
         raise UserError(
             f"{demos.path} holds no colour, which the student's depth source needs: collect demos with "
             "--demos.rgb, or take another student.depth_source."
         )
+    if source.needs_views and not _has_views(demos):
+        raise UserError(
+            f"{demos.path} does not say which object of which size its pictures show, as demos do since "
+            "2026-11-25: collect them again, or take another student.depth_source than 'rig'."
+        )
+
+
+def _has_views(demos: EpisodeStore) -> bool:
+    try:
+        sizes = demos.episodes(VIEWED[1])
+    except UserError:
+        return False
+    return bool(np.all(sizes > 0))  # 0 where a collection went on that was begun without
 
 
 @partial(jax.jit, static_argnums=0)

@@ -14,8 +14,9 @@ from ddgrasp.progress import Progress
 from demos.rollout import Episodes
 from demos.spool import Spool
 from demos.store import EpisodeStore
+from mjx_envs.views import Views, observed
 from student_jax.data import DepthInWindow, Frames, Window, make_frames
-from student_jax.depth_source import DepthSource, check_colour
+from student_jax.depth_source import VIEWED, DepthSource, check_demos
 
 CACHE = "frames.zarr"
 _COLUMNS = ("state", "action", "observation", "held")
@@ -34,9 +35,9 @@ def add_noisy_demos(
 
     A share of `config.student.training.clean_share` keeps clean depth. Steps long after the grasp are left
     out, those beside a demo's stretch if one is configured, and what lies outside of the `window` if one is
-    given. UserError if the source needs colour that the demos lack.
+    given. UserError if the source needs what the demos lack.
     """
-    check_colour(source, demos)
+    check_demos(source, demos)
     training = config.student.training
     begins = [0, *demos.ends.tolist()]
     useful = [
@@ -52,7 +53,8 @@ def add_noisy_demos(
     def read(i: int) -> Clip:
         rows = rows_of(chosen[i])
         rgb = demos.steps("rgb", *rows) if source.needs_rgb else None
-        return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb)
+        views = _views(demos, chosen[i], rows) if source.needs_views else None
+        return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb, views)
 
     done = int(np.sum(~keep_clean[: len(frames)]))
     noisy = source.episodes([len(stretches[i]) for i in chosen], read, done)
@@ -68,6 +70,13 @@ def add_noisy_demos(
                 steps["depth_mm"] = window.cut(steps["depth_mm"])
             frames.append(steps, {"from_demo": np.bool_(True)})
             task.advance()
+
+
+def _views(demos: EpisodeStore, number: int, rows: tuple[int, int]) -> Views:
+    """What `rows` of demo `number` show."""
+    observation = demos.steps("observation", *rows)
+    fixed = (np.repeat(demos.episodes(name)[[number]], len(observation), axis=0) for name in VIEWED)
+    return observed(observation, *fixed)
 
 
 def useful_steps(held: Bool[np.ndarray, " T"], held_steps: int) -> int:

@@ -50,6 +50,7 @@ def episodes_of(rng: np.random.Generator, lengths=(12, 5)) -> tuple[Episodes, Sp
         state=state, action=np.zeros((*shape, 8), np.float32), observation=np.zeros((*shape, 40), np.float32),
         held=held, length=np.array(lengths), success=np.ones(count, bool),
         object_index=np.zeros(count, int), T_world_cam=np.tile(np.eye(4), (count, 1, 1)),
+        variant=np.zeros(count, int), size=np.ones(count),
     ), seen  # fmt: skip
 
 

@@ -27,7 +27,7 @@ Stem = Literal["conv7", "space_to_depth"]
 Norm = Literal["group", "none"]
 Pooling = Literal["spatial_softmax", "tokens", "mean"]
 Conditioning = Literal["film", "concat"]
-Source = Literal[Sensor, "learned_ungrafted", "monocular"]
+Source = Literal[Sensor, "learned_ungrafted", "monocular", "rig"]
 """Every camera model is a depth source; so are others (student_jax/depth_source.py)."""
 STEM_STRIDE = 4
 """Picture pixels per side and position after the encoder's stem; sizes must be multiples of it."""
@@ -247,8 +247,9 @@ class StudentConfig(Section, name="student"):
     depth_source: Source = "learned"
     """What gives the demos' clean depth a camera's artefacts: learned (the run's generator),
     learned_ungrafted (its own map instead of grafted depth), ideal (nothing), dextrah, kinect, stereo (the
-    rig's camera on the clean picture) or monocular (depth from colour, by a network with weights); the last
-    two need demos.rgb."""
+    rig's camera on the clean picture), monocular (depth from colour, by a network with weights) or rig (the
+    rig's camera before the scene, which a robot's camera cannot be asked for: a bound); stereo and monocular
+    need demos.rgb."""
 
     def check(self) -> None:
         """See `Section.check`."""

@@ -1,0 +1,134 @@
+"""The rig's camera before the scenes of training: the rig's own frames, of the scenes that demos are of."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from ddgrasp.config import (
+    Config,
+    PictureConfig,
+    RandomConfig,
+    StudentConfig,
+    StudentTrainingConfig,
+    WorldConfig,
+)
+from ddgrasp.errors import UserError
+from ddgrasp.layout import QPOS
+from ddgrasp.progress import Progress
+from demos.rollout import Roller, successful
+from demos.store import EpisodeStore
+from mjx_envs.views import Views
+from ppo.policy import TeacherPolicy
+from rig.camera import camera_pose, make_camera
+from rig.world import make_world
+from student_jax import frames_io
+from student_jax.act import SourceCamera
+from student_jax.depth_source import check_demos, make_source
+from student_jax.rig_source import RigSource
+
+CONFIG = Config(
+    preset="test",
+    seed=3,
+    world=WorldConfig(
+        objects=("apple", "block", "can"),
+        camera_scale=0.125,
+        episode_steps=3,
+        random=RandomConfig(other_pose_share=0.5),
+    ),
+    student=StudentConfig(
+        depth_source="rig",
+        picture=PictureConfig(height_px=32, width_px=40),
+        training=StudentTrainingConfig(clean_share=0.0, crop_shift_px=2),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def still() -> TeacherPolicy:
+    """The arm keeps its pose."""
+    layer = np.zeros((40, 16), np.float32), np.zeros(16, np.float32)
+    return TeacherPolicy(np.zeros(40, np.float32), np.ones(40, np.float32), [layer])
+
+
+@pytest.fixture(scope="module")
+def roller(still) -> Roller:
+    return Roller(CONFIG, still, 12)
+
+
+def test_a_frame_is_what_the_rigs_own_camera_takes_of_the_scene():
+    upright = replace(CONFIG.world, random=replace(CONFIG.world.random, other_pose_share=0.0))
+    world, rng = make_world(upright), np.random.default_rng(0)
+    camera, ideal = (make_camera(CONFIG, world, ideal) for ideal in (False, True))
+    source, clean = make_source(CONFIG, Path()), RigSource(CONFIG, ideal=True)
+    for index, name in enumerate(CONFIG.world.objects):
+        world.reset(index, name)
+        lying_m = world.data.qpos[QPOS.object_pos][2]
+        world.step(0.5)
+        view = Views(
+            world.data.qpos[None].copy(),
+            np.array([index]),
+            np.array([lying_m / world.objects[name].rest_height_m]),
+            camera_pose(CONFIG, rng)[None],
+        )
+        number, blank = np.array([index]), np.zeros((1, 1, 1), np.uint16)
+        (seen,), (rendered,) = (s.frames(blank, None, number, number, view) for s in (source, clean))
+        draw = np.random.default_rng([CONFIG.seed, 0x626F756E, index, index])
+        taken = camera.depth_mm(world.data, view.T_world_cam[0], draw, name)
+        np.testing.assert_array_equal(rendered, ideal.clean_mm(world.data, view.T_world_cam[0]))
+        np.testing.assert_array_equal(seen, taken)
+        assert 0.6 < np.mean(seen > 0) < 1.0 and np.any(seen != rendered)
+
+
+def test_a_rollout_s_views_are_of_what_it_shows(roller):
+    """Objects of any size in either rest pose: the same surfaces to the millimetre or two."""
+    camera, scenes = SourceCamera(RigSource(CONFIG, ideal=True)), []
+
+    def actor(scene):
+        scenes.append((scene.depth_mm.astype(int), camera(scene).astype(int), scene.views))
+        return scene.expert
+
+    episodes = roller.run(jax.random.PRNGKey(0), actor)
+    assert len(set(episodes.variant.tolist())) > 3 and np.ptp(episodes.size) > 0.03
+    for shown, again, views in scenes:
+        np.testing.assert_array_equal(views.variant, episodes.variant)
+        assert np.mean(np.abs(shown - again) > 2) < 2e-4
+        other = replace(views, size=1.2 * views.size)
+        assert np.mean(np.abs(shown - _clean(other)) > 2) > 1e-3
+
+
+def _clean(views: Views) -> np.ndarray:
+    blank, number = np.zeros((len(views), 1, 1), np.uint16), np.arange(len(views))
+    return RigSource(CONFIG, ideal=True).frames(blank, None, number, number, views).astype(int)
+
+
+@pytest.fixture(scope="module")
+def episodes(still, tmp_path_factory) -> list:
+    """What demos keep of rollouts that all count as successful."""
+    roller = Roller(CONFIG, still, 3, keep=tmp_path_factory.mktemp("spool"))
+    made = roller.run(jax.random.PRNGKey(1), lambda scene: scene.expert)
+    return list(successful(replace(made, success=np.ones(3, bool))))
+
+
+def test_demos_say_what_their_pictures_are_of(episodes, tmp_path):
+    store, frames = (EpisodeStore(tmp_path / name, create=True) for name in ("demos", "frames"))
+    for steps, episode in episodes:
+        store.append(steps, episode)
+    frames_io.add_noisy_demos(store, frames, RigSource(CONFIG, ideal=True), CONFIG, Progress(quiet=True))
+    off_mm = np.abs(frames.steps("depth_mm").astype(int) - store.steps("depth_mm"))
+    assert frames.ends.tolist() == store.ends.tolist() and np.mean(off_mm > 2) < 2e-4
+
+
+@pytest.mark.parametrize("went_on", [False, True])
+def test_demos_that_do_not_say_it_are_refused_in_one_line(went_on, episodes, tmp_path):
+    """Neither do those that were begun before demos said it."""
+    store = EpisodeStore(tmp_path / "demos", create=True)
+    steps, said = episodes[0]
+    store.append(steps, {name: said[name] for name in ("object_index", "T_world_cam")})
+    if went_on:
+        store.append(steps, said)
+    with pytest.raises(UserError, match=r"does not say which object .* collect them again") as error:
+        check_demos(RigSource(CONFIG), store)
+    assert "\n" not in str(error.value)
