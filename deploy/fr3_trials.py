@@ -82,14 +82,14 @@ class Fr3Runner:
 
         Raises UserError if the connection is lost again and again (`Fr3Lab.repeated`).
         """
-        report, success, film = self.lab.repeated(lambda: self._attempt(trial, watch))
-        return result(trial, success, report), film
+        report, success, filming = self.lab.repeated(lambda: self._attempt(trial, watch))
+        return result(trial, success, report, filming.object_m), filming.film()
 
     def close(self) -> None:
         """Ends the rig."""
         self.lab.close()
 
-    def _attempt(self, trial: Trial, watch: Watch | None) -> tuple[LoopReport, bool, Film]:
+    def _attempt(self, trial: Trial, watch: Watch | None) -> tuple[LoopReport, bool, Filming]:
         """Raises RobotError if the connection is lost; any other fault is in the report."""
         config, draw = self._config, self.draw(trial)
         rig = self.lab.with_object(trial.object_name, config.seed)
@@ -110,7 +110,7 @@ class Fr3Runner:
             raise KeyboardInterrupt
         if report.fault.startswith(LOST):
             raise RobotError(report.fault)
-        return report, camera.success() and not report.fault, filming.film()
+        return report, camera.success() and not report.fault, filming
 
     def draw(self, trial: Trial) -> PlacedDraw:
         """What chance decides about `trial`."""

@@ -194,3 +194,7 @@ class Judge(Protocol):
 
 class RigCamera(Filmed, Judge, Protocol):
     """What a trial is filmed with and judged by."""
+
+    def object_m(self) -> Float[np.ndarray, "3"]:
+        """(3,) the object's position in the robot's base frame, metres."""
+        ...

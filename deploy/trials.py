@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -60,6 +60,9 @@ class TrialResult:
     act_s: list[float]
     latency_s: list[float]
     period_s: list[float]
+    object_m: list[list[float]] = field(default_factory=list)
+    """Where the object was at every control step, metres in the robot's base frame; empty on the real clock,
+    and in logs of before 2026-11-25."""
 
     @property
     def key(self) -> tuple[int, bool]:
@@ -177,7 +180,7 @@ class Rig:
         if report.interrupted:
             raise KeyboardInterrupt
         robot.catch_up()
-        return result(trial, bool(self._world.success()), report), filming.film()
+        return result(trial, bool(self._world.success()), report, filming.object_m), filming.film()
 
     def watch_policy(self, watch: WatchPolicy) -> None:
         """From now on `watch` is told of everything that the policy is given."""
@@ -222,17 +225,21 @@ def run_trials(
 
 
 class Filming:
-    """Collects pictures, shows every step to who watches, and ends a trial that has succeeded."""
+    """Collects pictures and where the object is, shows every step to who watches, and ends a trial that has
+    succeeded."""
 
     def __init__(self, camera: RigCamera, every: int, watch: Watch | None = None):
         self._camera, self._every, self._watch = camera, every, watch
         self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
+        self.object_m: list[list[float]] = []
+        """Its position after each step, metres."""
 
     def look(self, step: Step) -> bool | None:
         """Takes the picture if it is due; what the loop's `on_step` is called with. True ends the trial, as
         success does."""
         if step.index % self._every == 0 and step.frame is not None:
             self._columns.append((step.index, self._camera.picture(), step.frame.depth))
+        self.object_m.append([round(float(x), 4) for x in self._camera.object_m()])
         told = self._watch is not None and self._watch(step, self._camera)
         return told or self._camera.success()
 
@@ -244,8 +251,10 @@ class Filming:
         return Film(steps, np.stack(rgb), np.stack(depth))
 
 
-def result(trial: Trial, success: bool, report: LoopReport) -> TrialResult:
-    """What came of `trial`, from the loop's report and the rig's verdict."""
+def result(
+    trial: Trial, success: bool, report: LoopReport, object_m: Sequence[Sequence[float]]
+) -> TrialResult:
+    """What came of `trial`, from the loop's report, the rig's verdict and where the object went."""
     timings = report.timings
     seconds: dict[str, Any] = {
         name: [round(value, 6) for value in getattr(timings, name)]
@@ -260,6 +269,7 @@ def result(trial: Trial, success: bool, report: LoopReport) -> TrialResult:
         safety=report.safety.as_dict(),
         events=[str(event) for event in report.events],
         **seconds,
+        object_m=[list(place) for place in object_m if np.isfinite(place).all()],
     )
 
 

@@ -26,6 +26,7 @@ from deploy_support import constant_bias, describe, write_policy
 from evaluation import rig_trials
 from evaluation.rig_trials import Series
 from mjx_envs.camera import nominal_camera
+from mjx_envs.objects import get_object
 from mjx_envs.scene import HOME_RAD
 from rig import seeds
 from rig.fr3 import scene
@@ -150,7 +151,11 @@ def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):
     table = rig_trials.run(config, policy, series, out, 0, Progress(quiet=True))
     assert (table["all"]["successes"], table["all"]["n"], table["faults"]) == (0, 2, 0)
     lines = (out / rig_trials.TRIALS_FILE).read_text().splitlines()
-    assert len(lines) == 3 and all(json.loads(line)["steps"] == 5 for line in lines[1:])
+    kept = [json.loads(line) for line in lines[1:]]
+    assert len(lines) == 3 and all(trial["steps"] == len(trial["object_m"]) == 5 for trial in kept)
+    lying_m = [trial["object_m"][-1] for trial in kept]
+    assert table["failures"] == {"never touched": {"cube": 2}} and lying_m[0] != lying_m[1]
+    assert all(abs(z - get_object("cube").rest_height_m) < 0.002 for _, _, z in lying_m)
     assert sorted(path.name for path in out.glob("*.png")) == [
         "cube-4000-failure.png",
         "cube-4001-failure.png",

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
+from ddgrasp.layout import QPOS
 from deploy.devices.options import Setup
 from deploy.devices.rig_robot import SimRobot
 from deploy.interfaces import Frame, Robot
@@ -63,6 +64,10 @@ class StereoCamera:
         """See Judge."""
         self._catch_up()
         return self._world.success()
+
+    def object_m(self) -> Float[np.ndarray, "3"]:
+        """See RigCamera."""
+        return self._world.data.qpos[QPOS.object_pos].copy()
 
     def picture(self) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour picture of the scene as it stands, from the same place (for people)."""

@@ -8,7 +8,7 @@ from typing import Any
 from ddgrasp.files import atomic_write_text, read_json
 from deploy.trial_log import read_results
 from deploy.trials import TrialResult
-from evaluation import wilson
+from evaluation import failure_causes, wilson
 from evaluation.paired import mcnemar_exact
 from evaluation.report.html import REPORT_HTML, contents, film, heading, page, table
 from evaluation.rig_trials import TABLE_FILE, TRIALS_FILE
@@ -57,8 +57,11 @@ def write(trials: Trials) -> Path:
         "<p class=note>Success: the object at the lift target, held there; rate of n trials, Wilson 95 % "
         "interval.</p>",
         table(("object", "success"), _rows(trials.table)),
-        *_films(trials.folder, _SECTIONS[1], "failure"),
-        *_films(trials.folder, _SECTIONS[2], "success"),
+        heading(_SECTIONS[1]),
+        *_causes(trials.table.get("failures", {})),
+        *_films(trials.folder, "failure"),
+        heading(_SECTIONS[2]),
+        *_films(trials.folder, "success"),
         heading(_SECTIONS[3]),
         table(("setting", "value"), [(k, str(v)) for k, v in trials.table["series"].items()]),
     ]
@@ -108,10 +111,18 @@ def _pair(first: Trials, other: Trials) -> str:
     return f"{won} won, {lost} lost of {len(both)}, p {mcnemar_exact(won, lost):.2g}"
 
 
-def _films(folder: Path, title: str, outcome: str) -> list[str]:
+def _causes(failures: dict[str, dict[str, int]]) -> list[str]:
+    """None for a table of before 2026-11-25, which does not count them."""
+    if not failures:
+        return []
+    note = "<p class=note>By where the object was from step to step.</p>"
+    return [note, table(("cause", "trials", "objects"), failure_causes.rows(failures))]
+
+
+def _films(folder: Path, outcome: str) -> list[str]:
     strips = sorted(folder.glob(f"*-{outcome}.png"))
     parts = [f"<h3>{strip.stem}</h3>{_film(strip)}" for strip in strips]
-    return [heading(title), *(parts or ["<p>No film.</p>"])]
+    return parts or ["<p>No film.</p>"]
 
 
 def _film(strip: Path) -> str:
