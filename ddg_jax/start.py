@@ -9,7 +9,7 @@ from pathlib import Path
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
-from ddgrasp.shipped import shipped
+from ddgrasp.shipped import holding, shipped
 
 _THE_SAME = (
     "depth.height_px", "depth.width_px", "depth.representation", "training.hole_loss", "depth.surface",
@@ -22,8 +22,7 @@ _THE_SAME = (
 
 def folder(config: DDGConfig) -> Path:
     """The stage's folder that `config.init_from` names, itself or in a run."""
-    source = shipped(config.init_from)
-    return source / "ddg" if (source / "ddg").is_dir() else source
+    return holding(config.init_from, artifacts.MANIFEST, "ddg") or shipped(config.init_from)
 
 
 def check(config: DDGConfig) -> None:

@@ -1,4 +1,5 @@
-"""What comes with this project beside its code: `pretrained/`, of a clone or of an installed wheel."""
+"""Where an earlier result is that somebody names: in `pretrained/`, of a clone or of an installed wheel, in a
+run, or in a folder of its own."""
 
 from pathlib import Path
 
@@ -18,3 +19,9 @@ def shipped(path: Path | str) -> Path:
     if path.parts[:1] != (NAME,) or path.exists():
         return path
     return PRETRAINED.joinpath(*path.parts[1:])
+
+
+def holding(path: Path | str, file: str, stage: str) -> Path | None:
+    """The folder with `file`: `path`, or else the folder of `stage` in the run `path`; None without one."""
+    source = shipped(path)
+    return next((folder for folder in (source, source / stage) if (folder / file).is_file()), None)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.errors import UserError
-from ddgrasp.shipped import shipped
+from ddgrasp.shipped import holding
 from learning.params import load_params, save_params
 
 PARAMS_FILE = "policy.msgpack"
@@ -74,10 +74,8 @@ def from_learner(normalizer: Normalizer, policy_params: Mapping[str, Any]) -> Te
 
 def find(directory: Path | str) -> Path:
     """The parameter file in a stage directory, a run directory or a pretrained folder; UserError if none."""
-    directory = shipped(directory)
-    for candidate in (directory / PARAMS_FILE, directory / "teacher" / PARAMS_FILE):
-        if candidate.exists():
-            return candidate
+    if found := holding(directory, PARAMS_FILE, "teacher"):
+        return found / PARAMS_FILE
     raise UserError(f"{directory} holds no teacher ({PARAMS_FILE}): train one with `ddgrasp teacher train`.")
 
 

@@ -3,7 +3,7 @@
 from functools import partial
 
 from ddgrasp.config import Config, StudentConfig
-from ddgrasp.shipped import shipped
+from ddgrasp.shipped import holding, shipped
 from learning.params import Params, load_params
 from student_jax.policy import PARAMS_FILE, param_shapes, told_the_change
 
@@ -13,8 +13,7 @@ def load(config: StudentConfig, network: Params) -> Params:
 
     Raises UserError if they do not fit it.
     """
-    source = shipped(config.init_from)
-    source = source if (source / PARAMS_FILE).exists() else source / "student"
+    source = holding(config.init_from, PARAMS_FILE, "student") or shipped(config.init_from)
     return load_params(source / PARAMS_FILE, network, partial(told_the_change, config))
 
 

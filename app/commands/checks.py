@@ -13,7 +13,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config, ScoreConfig, WorldConfig
 from ddgrasp.config.checks import Range, check_value, kinds
 from ddgrasp.errors import UserError
-from ddgrasp.shipped import PRETRAINED, shipped
+from ddgrasp.shipped import PRETRAINED, holding, shipped
 
 CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
 """File that a folder a stage starts from must hold, itself or in a folder named after the stage. Named here
@@ -86,11 +86,9 @@ def check_data(option: str, path: Path) -> None:
 
 def stage_folder(option: str, path: Path, stage: str) -> Path:
     """The finished `stage` that `path` is, or that lies in the run `path`; UserError if there is none."""
-    source = shipped(path)
-    found = [folder for folder in (source, source / stage) if artifacts.is_finished(folder)]
-    if found:
-        return found[0]
-    trouble = "holds no finished stage" if source.exists() else "does not exist"
+    if found := holding(path, artifacts.MANIFEST, stage):
+        return found
+    trouble = "holds no finished stage" if shipped(path).exists() else "does not exist"
     raise UserError(f"{option} is {path}, which {trouble}: give a run that has made {stage}, or its folder.")
 
 
@@ -130,8 +128,8 @@ def check_networks(config: Config, run_dir: Path) -> list[str]:
 
 def _check_start(stage: str, option: str, folder: str, others: str = "") -> None:
     """UserError unless `folder` is empty or holds the stage's checkpoint; `others` might be given instead."""
-    source, file = shipped(folder), CHECKPOINTS[stage]
-    if not folder or any(path.is_file() for path in (source / file, source / stage / file)):
+    file = CHECKPOINTS[stage]
+    if not folder or holding(folder, file, stage):
         return
     pretrained = Path(folder).parts[:1] == ("pretrained",)
     remedy = (
@@ -139,5 +137,5 @@ def _check_start(stage: str, option: str, folder: str, others: str = "") -> None
         if pretrained
         else f"give {others}a run or pretrained folder" + ("" if others else ", or nothing")
     )
-    trouble = f"holds no {file}" if source.exists() else "does not exist"
+    trouble = f"holds no {file}" if shipped(folder).exists() else "does not exist"
     raise UserError(f"{option} is {folder!r}, which {trouble}: {remedy}.")

@@ -11,7 +11,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import DEPTH, DPM_SOLVER, SQUARED, UNIFORM, Config, DDGConfig
 from ddgrasp.config.student import Source
 from ddgrasp.errors import UserError, unknown_name
-from ddgrasp.shipped import shipped
+from ddgrasp.shipped import holding, shipped
 from evaluation.treatments import RECORDED, TreatmentName
 
 PAPER_THRESHOLD = -0.2
@@ -133,8 +133,7 @@ def shared_config(config: Config) -> Config:
 
 def _check_clean(start: str) -> None:
     """UserError unless the student there was trained on clean depth alone, from nothing."""
-    folder = shipped(start)
-    folder = folder if artifacts.is_finished(folder) else folder / "student"
+    folder = holding(start, artifacts.MANIFEST, "student") or shipped(start)
     student = artifacts.read_manifest(folder).config["student"]
     training = student["training"]
     seen = {"student.depth_source": student["depth_source"], "student.init_from": student["init_from"]}
