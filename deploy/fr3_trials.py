@@ -83,7 +83,7 @@ class Fr3Runner:
         Raises UserError if the connection is lost again and again (`Fr3Lab.repeated`).
         """
         report, success, filming = self.lab.repeated(lambda: self._attempt(trial, watch))
-        return result(trial, success, report, filming.object_m), filming.film()
+        return result(trial, success, report, filming.object_pos_m), filming.film()
 
     def close(self) -> None:
         """Ends the rig."""

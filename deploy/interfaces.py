@@ -195,6 +195,6 @@ class Judge(Protocol):
 class RigCamera(Filmed, Judge, Protocol):
     """What a trial is filmed with and judged by."""
 
-    def object_m(self) -> Float[np.ndarray, "3"]:
+    def object_pos_m(self) -> Float[np.ndarray, "3"]:
         """(3,) the object's position in the robot's base frame, metres."""
         ...

@@ -66,7 +66,6 @@ class RecordingBench:
 
 def _report(result: TrialResult) -> dict[str, Any]:
     """What `LoopReport.as_dict` says of a deployment, as far as a trial's result knows it."""
-    faults = [event.split(" fault: ", 1)[1] for event in result.events if " fault: " in event]
     timings = Timings(
         result.sense_s,
         result.infer_s,
@@ -78,7 +77,7 @@ def _report(result: TrialResult) -> dict[str, Any]:
     return {
         "steps": result.steps,
         "holds": result.holds,
-        "fault": next(iter(faults), ""),
+        "fault": result.fault,
         "safety": result.safety,
         "events": result.events,
         **timings.summary(contract.CONTROL_DT_S),

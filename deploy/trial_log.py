@@ -49,6 +49,11 @@ def read_results(path: Path) -> list[TrialResult]:
     return [TrialResult(**line) for line in _complete_lines(path)[1:]]
 
 
+def read_header(path: Path) -> dict[str, Any]:
+    """What the trials in a log belong to; empty if there is no log."""
+    return next(iter(_complete_lines(path)), {})
+
+
 def _line(value: dict[str, Any]) -> str:
     return json.dumps(value, allow_nan=False) + "\n"
 

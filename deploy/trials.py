@@ -30,6 +30,8 @@ from rig.film import Film
 
 _STREAM = 0x526967
 """Keeps the trials' random numbers apart from every other stage's ("Rig")."""
+_FAULT = " fault: "
+"""Between the time and the words of an event that is one."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +62,20 @@ class TrialResult:
     act_s: list[float]
     latency_s: list[float]
     period_s: list[float]
-    object_m: list[list[float]] = field(default_factory=list)
-    """Where the object was at every control step, metres in the robot's base frame; empty on the real clock,
-    and in logs of before 2026-11-25."""
+    object_pos_m: list[list[float]] = field(default_factory=list)
+    """(steps, 3) where the object was at each step's frame, metres in the robot's base frame; empty on the
+    real clock, and in logs of before 2026-11-25."""
 
     @property
     def key(self) -> tuple[int, bool]:
         """Identifies the trial."""
         return self.index, self.realtime
+
+    @property
+    def fault(self) -> str:
+        """What made the robot end the trial; "" if it did not."""
+        faults = [event.split(_FAULT, 1)[1] for event in self.events if _FAULT in event]
+        return next(iter(faults), "")
 
 
 def tried(config: Config) -> Config:
@@ -180,7 +188,7 @@ class Rig:
         if report.interrupted:
             raise KeyboardInterrupt
         robot.catch_up()
-        return result(trial, bool(self._world.success()), report, filming.object_m), filming.film()
+        return result(trial, bool(self._world.success()), report, filming.object_pos_m), filming.film()
 
     def watch_policy(self, watch: WatchPolicy) -> None:
         """From now on `watch` is told of everything that the policy is given."""
@@ -225,21 +233,21 @@ def run_trials(
 
 
 class Filming:
-    """Collects pictures and where the object is, shows every step to who watches, and ends a trial that has
-    succeeded."""
+    """Collects pictures and the object's trajectory, shows every step to who watches, and ends a trial that
+    has succeeded."""
 
     def __init__(self, camera: RigCamera, every: int, watch: Watch | None = None):
         self._camera, self._every, self._watch = camera, every, watch
         self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
-        self.object_m: list[list[float]] = []
-        """Its position after each step, metres."""
+        self.object_pos_m: list[list[float]] = []
+        """As each step's frame has it, see `TrialResult`."""
 
     def look(self, step: Step) -> bool | None:
         """Takes the picture if it is due; what the loop's `on_step` is called with. True ends the trial, as
         success does."""
         if step.index % self._every == 0 and step.frame is not None:
             self._columns.append((step.index, self._camera.picture(), step.frame.depth))
-        self.object_m.append([round(float(x), 4) for x in self._camera.object_m()])
+        self.object_pos_m.append([round(float(x), 4) for x in self._camera.object_pos_m()])
         told = self._watch is not None and self._watch(step, self._camera)
         return told or self._camera.success()
 
@@ -252,9 +260,9 @@ class Filming:
 
 
 def result(
-    trial: Trial, success: bool, report: LoopReport, object_m: Sequence[Sequence[float]]
+    trial: Trial, success: bool, report: LoopReport, object_pos_m: Sequence[Sequence[float]]
 ) -> TrialResult:
-    """What came of `trial`, from the loop's report, the rig's verdict and where the object went."""
+    """What came of `trial`, from the loop's report, the rig's verdict and the object's trajectory."""
     timings = report.timings
     seconds: dict[str, Any] = {
         name: [round(value, 6) for value in getattr(timings, name)]
@@ -269,7 +277,7 @@ def result(
         safety=report.safety.as_dict(),
         events=[str(event) for event in report.events],
         **seconds,
-        object_m=[list(place) for place in object_m if np.isfinite(place).all()],
+        object_pos_m=[list(place) for place in object_pos_m if np.isfinite(place).all()],
     )
 
 

@@ -18,6 +18,7 @@ from ddgrasp.progress import Progress
 from deploy.changes import Change
 from deploy.policy import POLICY_FILE
 from deploy.trials import Rig
+from evaluation.failure_modes import LIFTED_M, MOVED_M
 from evaluation.rig_trials import Series
 from mjx_envs.grasp_math import HAND_DOWN
 
@@ -26,10 +27,6 @@ if TYPE_CHECKING:
 
 FAR_M, NEAR_M = 0.15, 0.08
 """Distance of hand and grasp beyond which the hand is far, and within which it is near."""
-MOVED_M = 0.005
-"""An object that is this far from where it lay has been touched."""
-CARRIED_M = 0.03
-"""An object that is this high above where it lay is in the hand."""
 
 
 @dataclass
@@ -107,7 +104,7 @@ def errors(seen: Seen, aux: "Aux") -> Errors:
         held=1 / (1 + np.exp(-aux.held_logit)),
         distance_m=np.linalg.norm(to_grasp, axis=1),
         touched=np.maximum.accumulate(np.linalg.norm(at - lay, axis=1) > MOVED_M),
-        carried=at[:, 2] - lay[2] > CARRIED_M,
+        carried=at[:, 2] - lay[2] > LIFTED_M,
     )
 
 

@@ -22,7 +22,7 @@ from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
 from deploy.trial_log import TrialLog
 from deploy.trials import ENDS, Bench, Rig, Trial, TrialResult, lasting, run_trials
-from evaluation import failure_causes, wilson
+from evaluation import failure_modes, wilson
 from evaluation.treatments import RECORDED, TreatmentName, make_treatment
 from rig import seeds
 from rig.film import Film, contact_sheet
@@ -163,7 +163,7 @@ def _keep(out: Path, result: TrialResult, film: Film) -> None:
 
 def tabulate(results: Sequence[TrialResult]) -> dict[str, Any]:
     """Success with Wilson intervals by object and in total: of all, seen, unseen and other objects; failures
-    by cause (`evaluation.failure_causes.count`)."""
+    by mode (`evaluation.failure_modes.count`)."""
     names = tuple(dict.fromkeys(result.object_name for result in results))
     groups = {
         "seen": contract.SEEN_OBJECTS,
@@ -177,8 +177,8 @@ def tabulate(results: Sequence[TrialResult]) -> dict[str, Any]:
     return {
         "objects": {name: _success(r for r in results if r.object_name == name) for name in names},
         **{group: row for group, row in rows.items() if row["n"]},
-        "faults": sum(any(" fault: " in event for event in result.events) for result in results),
-        "failures": failure_causes.count(results),
+        "faults": sum(bool(result.fault) for result in results),
+        "failures": failure_modes.count(results),
     }
 
 
@@ -186,8 +186,7 @@ def describe(table: dict[str, Any]) -> str:
     """The table as text."""
     rows = {**table["objects"], **{k: table[k] for k in ("seen", "unseen", "other", "all") if k in table}}
     lines = [f"{name:<12} {wilson.describe(row)}" for name, row in rows.items()]
-    why = failure_causes.describe(table)
-    return "\n".join([*lines, *[why] * bool(why), f"ended by a fault of the robot: {table['faults']}"])
+    return "\n".join([*lines, f"failures: {failure_modes.describe(table['failures'])}"])
 
 
 def _trained() -> tuple[str, ...]:

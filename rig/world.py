@@ -1,6 +1,7 @@
 """The pseudo-real rig's world: one Franka in MuJoCo's own C engine, at half the training's time step.
 
-It stands in for reality: no stage that trains a student sees its ground truth. JAX-free.
+It stands in for reality: nothing that trains a student sees its ground truth, but for the bound that
+`student.depth_source rig` is. JAX-free.
 """
 
 from collections.abc import Sequence

@@ -27,7 +27,7 @@ from ppo.policy import TeacherPolicy
 from student_jax import frames_io, head, pretrained_encoder, start, train
 from student_jax.act import SourceCamera, StudentActor
 from student_jax.data import Window
-from student_jax.depth_source import DepthSource
+from student_jax.depth_source import DepthSource, check_demos
 from student_jax.policy import PARAMS_FILE, init_params
 
 PLAN = "plan.json"
@@ -61,6 +61,7 @@ class Trainer:
 
     def run(self, demos: EpisodeStore) -> None:
         """Every phase that is not finished; `params` is then the student."""
+        check_demos(self._source, demos)
         self._restore()
         self._phase("poses", self._fit_on_poses)
         frames_io.add_noisy_demos(

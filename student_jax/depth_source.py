@@ -1,7 +1,7 @@
 """Where the student's depth comes from in training: clean depth in, depth as a camera would report it out.
 
 `student.depth_source` names one: `learned` is the run's fitted generator, `learned_ungrafted` its own map,
-`monocular` a network on colour (`ddg_jax/monocular.py`), `rig` the rig's own camera before the scene
+`monocular` a network on colour (`ddg_jax/monocular.py`), `rig` the development rig's camera before the scene
 (`student_jax/rig_source.py`), the others are the camera models of `ddg_jax/sensor.py`.
 """
 
@@ -27,6 +27,7 @@ from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
 from mjx_envs.views import Views
 from sensors.models.sense import Sense
+from student_jax.rig_source import RigSource
 
 LEARNED = ("learned", "learned_ungrafted")
 """Sources that are the run's generator."""
@@ -203,8 +204,6 @@ def make_source(config: Config, ddg: Path) -> DepthSource:
     if name == "monocular":
         return MonocularSource(MonocularDepth(config.ddg))
     if name == "rig":
-        from student_jax.rig_source import RigSource
-
         return RigSource(config)
     sensor = SensorConfig(name=name, stereo=config.record.stereo)
     return SenseSource(make_sensor(sensor, config.world.profile), key, name in BY_COLOUR)
@@ -233,19 +232,21 @@ def check_demos(source: DepthSource, demos: EpisodeStore) -> None:
             f"{demos.path} holds no colour, which the student's depth source needs: collect demos with "
             "--demos.rgb, or take another student.depth_source."
         )
-    if source.needs_views and not _has_views(demos):
-        raise UserError(
-            f"{demos.path} does not say which object of which size its pictures show, as demos do since "
-            "2026-11-25: collect them again, or take another student.depth_source than 'rig'."
-        )
+    if source.needs_views:
+        check_views(demos)
 
 
-def _has_views(demos: EpisodeStore) -> bool:
+def check_views(demos: EpisodeStore) -> None:
+    """UserError if `demos` do not say what their pictures are of."""
     try:
         sizes = demos.episodes(VIEWED[1])
     except UserError:
-        return False
-    return bool(np.all(sizes > 0))  # 0 where a collection went on that was begun without
+        sizes = np.zeros(1)
+    if not np.all(sizes > 0):  # 0 where a collection went on that was begun without
+        raise UserError(
+            f"{demos.path} does not say which object of which size its pictures show, as demos do since "
+            "2026-11-25: collect new ones for student.depth_source 'rig', in another --out."
+        )
 
 
 @partial(jax.jit, static_argnums=0)

@@ -16,7 +16,7 @@ from demos.spool import Spool
 from demos.store import EpisodeStore
 from mjx_envs.views import Views, observed
 from student_jax.data import DepthInWindow, Frames, Window, make_frames
-from student_jax.depth_source import VIEWED, DepthSource, check_demos
+from student_jax.depth_source import VIEWED, DepthSource
 
 CACHE = "frames.zarr"
 _COLUMNS = ("state", "action", "observation", "held")
@@ -35,9 +35,8 @@ def add_noisy_demos(
 
     A share of `config.student.training.clean_share` keeps clean depth. Steps long after the grasp are left
     out, those beside a demo's stretch if one is configured, and what lies outside of the `window` if one is
-    given. UserError if the source needs what the demos lack.
+    given. The demos must have what the source needs (`depth_source.check_demos`).
     """
-    check_demos(source, demos)
     training = config.student.training
     begins = [0, *demos.ends.tolist()]
     useful = [

@@ -1,10 +1,9 @@
-"""The rig's own camera before the scenes of training: what no generator can be nearer to than it itself.
+"""The development rig's own camera before the scenes of training, which no generator can be nearer to.
 
-For the upper bound of Table II alone. It looks at the rig's geometry and materials, which no other stage
-that trains a student may know.
+For the upper bound of Table II alone. It looks at the rig's geometry and materials, which no other depth
+source may know.
 """
 
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import Int, UInt8, UInt16
 
 from ddg_jax.generate import Clip
+from ddgrasp import cores
 from ddgrasp.config import Config
 from mjx_envs import scene
 from mjx_envs.object_spec import ObjectSpec, SlotLayout
@@ -36,7 +36,7 @@ class RigSource:
         self._config, self._ideal = config, ideal
         self._table = ObjectTable(config.world.objects)
         self._own = threading.local()
-        self._threads = ThreadPoolExecutor(os.cpu_count() or 1)
+        self._threads = ThreadPoolExecutor(cores.available())
 
     def episodes(
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0

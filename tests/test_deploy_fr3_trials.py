@@ -152,8 +152,8 @@ def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):
     assert (table["all"]["successes"], table["all"]["n"], table["faults"]) == (0, 2, 0)
     lines = (out / rig_trials.TRIALS_FILE).read_text().splitlines()
     kept = [json.loads(line) for line in lines[1:]]
-    assert len(lines) == 3 and all(trial["steps"] == len(trial["object_m"]) == 5 for trial in kept)
-    lying_m = [trial["object_m"][-1] for trial in kept]
+    assert len(lines) == 3 and all(trial["steps"] == len(trial["object_pos_m"]) == 5 for trial in kept)
+    lying_m = [trial["object_pos_m"][-1] for trial in kept]
     assert table["failures"] == {"never touched": {"cube": 2}} and lying_m[0] != lying_m[1]
     assert all(abs(z - get_object("cube").rest_height_m) < 0.002 for _, _, z in lying_m)
     assert sorted(path.name for path in out.glob("*.png")) == [

@@ -190,7 +190,7 @@ def test_sim_robot_moves_one_period_per_period_and_holds_where_it_is():
 def test_trial_is_repeatable_and_fits_the_loop(policy):
     trial = Trial(1, "apple")
     (first, film), (again, _) = (next(run_trials(CONFIG, policy, [trial], 0)) for _ in range(2))
-    outcome = ("success", "steps", "holds", "safety", "events")
+    outcome = ("success", "steps", "holds", "safety", "events", "object_pos_m")
     assert [getattr(first, n) for n in outcome] == [getattr(again, n) for n in outcome]
     assert first.steps == first.safety["commands"] == 4 and first.holds == 0
     assert film.steps == (0, 2)
@@ -206,6 +206,9 @@ def test_a_trial_ends_with_success():
     rig = series.make(CONFIG)(series.configured(config_of(student, None), student), student)
     ended, _ = rig.run(series.trial("apple", 0))
     assert ended.success and 20 < ended.steps < 0.75 * contract.TRIAL_S * contract.CONTROL_HZ
+    height_m = np.array(ended.object_pos_m)[:, 2]
+    assert len(height_m) == ended.steps and height_m[0] < 0.05
+    assert height_m[-1] == pytest.approx(contract.LIFT_TARGET_M[2], abs=contract.LIFT_TOLERANCE_M)
 
 
 def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):

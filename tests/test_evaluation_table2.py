@@ -1,8 +1,10 @@
 """Table II: statistics against known values, its rows, its tables from outcomes made up for the purpose."""
 
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from app import cli
@@ -12,9 +14,12 @@ from ddgrasp import artifacts
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json
 from ddgrasp.presets import get_preset
+from demos.stage import STORE
+from demos.store import EpisodeStore
 from deploy.trial_log import TrialLog
 from deploy.trials import TrialResult
 from evaluation import paired, rig_trials
+from evaluation.failure_modes import MODES
 from evaluation.rig_trials import Series
 from evaluation.table2 import page, results, rows
 from evaluation.table2.rows import ROWS, TABLES
@@ -161,7 +166,9 @@ def write_row(out: Path, series: Series, row: str, wins: dict[str, list[bool]]) 
     """The trials of a row as `rig_trials.run` leaves them."""
     folder = results.row_folder(out, results.set_name(series), row)
     folder.mkdir(parents=True)
-    log = TrialLog(folder / rig_trials.TRIALS_FILE, {"row": row})
+    log = TrialLog(
+        folder / rig_trials.TRIALS_FILE, {"policy_sha256": hashlib.sha256(row.encode()).hexdigest()}
+    )
     for place, (name, successes) in enumerate(wins.items()):
         for i, success in enumerate(successes):
             log.append(outcome(1000 * place + i, name, success))
@@ -211,9 +218,22 @@ def test_the_page_has_every_row_tried_or_not(study, tmp_path):
     assert "10 / 1 of 20" in html and "Monocular left out: no &lt;weights&gt;" in html
     assert html.count("data:image/png;base64,") == 1
     assert "Trials: development rig, development seed 0" in page.render(study, b"")
+    (sim_gt,) = (line for line in page.mode_rows(study, "development-development-0") if line[0] == "Sim GT")
+    assert dict(zip(MODES, sim_gt[1:], strict=True)) == dict.fromkeys(MODES, "") | {"not recorded": "10"}
+    assert "<th>lifted and lost</th>" in html
     text = page.describe(study, "development-development-0")
     assert "Sim GT" in text and "p (Holm) 0.0234" in text and "Inpaint" not in text
     assert TABLES["main"].title in text and TABLES["ripple"].title not in text + html
+
+
+def test_trials_of_another_policy_than_the_row_has_now_are_not_shown(study, tmp_path):
+    """As after a change of what the row's student is trained on."""
+    for row, made in (("ddg", b"ddg"), ("rand_noise", b"another")):
+        policy = tmp_path / results.STUDENTS / ROWS[row].student / "export" / "policy.onnx"
+        policy.parent.mkdir(parents=True)
+        policy.write_bytes(made)
+    (of,) = results.collect(tmp_path)["sets"].values()
+    assert set(of["rows"]) == {"ddg", "sim_gt"} and len(of["tables"]["main"]) == 1
 
 
 def test_a_study_without_trials_has_a_page(tmp_path):
@@ -271,6 +291,18 @@ def test_a_table_without_its_network_is_made_without_that_row_which_is_said(tmp_
 def test_without_colour_there_are_the_rows_that_need_none(tmp_path):
     study = command("--out", str(tmp_path), "--demos.no-rgb").planned()
     assert set(study.left_out) == {"monocular"} and "upper_bound" in study.rows
+
+
+def test_demos_that_do_not_say_what_they_show_leave_the_upper_bound_out(tmp_path):
+    """They are there and finished, from before demos said it."""
+    demos = tmp_path / results.SHARED / "demos"
+    old = EpisodeStore(demos / STORE, create=True)
+    old.append({"held": np.zeros(2, bool)}, {"object_index": np.int32(0)})
+    artifacts.finish(demos, "demos", LAPTOP, seconds=1, metrics={})
+    study = command("--out", str(tmp_path), "--demos.no-rgb").planned()
+    assert "does not say which object of which size" in study.left_out["upper_bound"]
+    with pytest.raises(UserError, match=r"collect new ones for student.depth_source 'rig', in another --out"):
+        command("--out", str(tmp_path), "--rows", "upper_bound").planned()
 
 
 def test_a_study_is_continued_only_with_its_own_configuration(tmp_path):

@@ -21,8 +21,10 @@ CONFIG = Config(preset="debug")
 
 
 def _result(index: int, name: str, success: bool, missed: int = 0) -> TrialResult:
+    """The object is pushed 5 cm away."""
     times = {name: [0.01] * 3 for name in ("sense_s", "infer_s", "act_s", "latency_s", "period_s")}
     made = {"safety": {"commands": 3}, "events": [], "holds": 0, "steps": 3, "realtime": False}
+    made["object_pos_m"] = [[0.5, 0.0, 0.02], [0.55, 0.0, 0.02]]
     return TrialResult(
         index=index, object_name=name, success=success, missed_deadlines=missed, **made, **times
     )
@@ -102,6 +104,7 @@ def test_trials_open_with_success_and_show_both_kinds_of_film(trials, capsys):
     assert page.index("Failures") < page.index("cube-0-failure") < page.index("cube-0-success")
     assert page.count("data:image/webp") == 2
     assert "<td>can</td><td>0.0 % of 2" in page
+    assert "<td>not lifted</td><td>3</td><td>cube 1, can 2</td>" in page
 
 
 def test_a_film_cut_short_is_named(trials):

@@ -6,7 +6,7 @@ import pytest
 
 from app.commands import parse
 from ddgrasp.errors import UserError
-from ddgrasp.shipped import PRETRAINED, shipped
+from ddgrasp.shipped import PRETRAINED, holding, shipped
 from ppo import policy
 
 ROOT = Path(__file__).parents[1]
@@ -47,3 +47,17 @@ def test_commands_and_stages_find_it_from_any_folder(tmp_path, monkeypatch):
     assert command.config.preset == "demo"
     played = parse("play", ["--generator", "pretrained/ddg", "--out", "pretrained/ddg"])
     assert (played.generator, played.out) == (PRETRAINED / "ddg", Path("pretrained/ddg"))
+
+
+def test_a_stage_is_found_by_its_file_in_its_folder_or_in_a_run(tmp_path, monkeypatch):
+    assert holding(tmp_path, "params", "ddg") is None
+    (tmp_path / "ddg").mkdir()
+    assert holding(tmp_path, "params", "ddg") is None
+    (tmp_path / "ddg" / "params").touch()
+    assert (
+        holding(tmp_path, "params", "ddg") == holding(tmp_path / "ddg", "params", "ddg") == tmp_path / "ddg"
+    )
+    (tmp_path / "params").touch()
+    assert holding(tmp_path, "params", "ddg") == tmp_path
+    monkeypatch.chdir(tmp_path)
+    assert holding("pretrained/ddg", "manifest.json", "ddg") == PRETRAINED / "ddg"

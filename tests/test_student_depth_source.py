@@ -34,7 +34,7 @@ from demos.store import EpisodeStore
 from learning.params import save_params
 from student_jax import frames_io
 from student_jax.act import SourceCamera
-from student_jax.depth_source import GeneratorSource, SenseSource, make_source
+from student_jax.depth_source import GeneratorSource, SenseSource, check_demos, make_source
 from upgrades_support import downgraded
 
 CONFIG = Config(
@@ -232,7 +232,7 @@ def test_the_rigs_camera_looks_at_clean_depth_in_colour(demos, tmp_path):
     assert np.median(np.abs(seen.astype(int) - depth)[seen > 0]) < 20
     assert np.mean(source.frames(depth, dark, number, number) > 0) < np.mean(seen > 0) - 0.2
     with pytest.raises(UserError, match=r"holds no colour, .* --demos.rgb"):
-        training_depth(settings, source, demos, tmp_path)
+        check_demos(source, demos)
 
 
 def test_students_from_before_there_was_a_choice_were_trained_on_learned_depth():

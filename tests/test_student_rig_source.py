@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from ddg_jax.generate import Clip
 from ddgrasp.config import (
     Config,
     PictureConfig,
@@ -20,13 +21,14 @@ from ddgrasp.layout import QPOS
 from ddgrasp.progress import Progress
 from demos.rollout import Roller, successful
 from demos.store import EpisodeStore
-from mjx_envs.views import Views
+from mjx_envs.randomize import ObjectTable
+from mjx_envs.views import Views, observed
 from ppo.policy import TeacherPolicy
 from rig.camera import camera_pose, make_camera
 from rig.world import make_world
 from student_jax import frames_io
 from student_jax.act import SourceCamera
-from student_jax.depth_source import check_demos, make_source
+from student_jax.depth_source import VIEWED, check_demos, make_source
 from student_jax.rig_source import RigSource
 
 CONFIG = Config(
@@ -73,9 +75,10 @@ def test_a_frame_is_what_the_rigs_own_camera_takes_of_the_scene():
             np.array([lying_m / world.objects[name].rest_height_m]),
             camera_pose(CONFIG, rng)[None],
         )
-        number, blank = np.array([index]), np.zeros((1, 1, 1), np.uint16)
-        (seen,), (rendered,) = (s.frames(blank, None, number, number, view) for s in (source, clean))
-        draw = np.random.default_rng([CONFIG.seed, 0x626F756E, index, index])
+        episode, frame = np.array([index]), np.array([7])
+        blank = np.zeros((1, 1, 1), np.uint16)
+        (seen,), (rendered,) = (s.frames(blank, None, episode, frame, view) for s in (source, clean))
+        draw = np.random.default_rng([CONFIG.seed, 0x626F756E, index, 7])
         taken = camera.depth_mm(world.data, view.T_world_cam[0], draw, name)
         np.testing.assert_array_equal(rendered, ideal.clean_mm(world.data, view.T_world_cam[0]))
         np.testing.assert_array_equal(seen, taken)
@@ -91,9 +94,13 @@ def test_a_rollout_s_views_are_of_what_it_shows(roller):
         return scene.expert
 
     episodes = roller.run(jax.random.PRNGKey(0), actor)
+    objects, names = (
+        ObjectTable(CONFIG.world.objects),
+        [CONFIG.world.objects[i] for i in episodes.object_index],
+    )
     assert len(set(episodes.variant.tolist())) > 3 and np.ptp(episodes.size) > 0.03
     for shown, again, views in scenes:
-        np.testing.assert_array_equal(views.variant, episodes.variant)
+        assert [objects.variants[v].name for v in views.variant] == names
         assert np.mean(np.abs(shown - again) > 2) < 2e-4
         other = replace(views, size=1.2 * views.size)
         assert np.mean(np.abs(shown - _clean(other)) > 2) > 1e-3
@@ -121,6 +128,24 @@ def test_demos_say_what_their_pictures_are_of(episodes, tmp_path):
     assert frames.ends.tolist() == store.ends.tolist() and np.mean(off_mm > 2) < 2e-4
 
 
+def test_noise_hangs_on_a_frame_s_numbers_alone_however_it_is_asked_for(episodes):
+    """Episode by episode, going on from the second, all frames in a batch by many threads, one by one."""
+    source, clips = RigSource(CONFIG), []
+    for number, (steps, said) in enumerate(episodes):
+        fixed = (np.repeat(np.asarray(said[name])[None], 3, axis=0) for name in VIEWED)
+        views = observed(steps["observation"], *fixed)
+        clips.append(Clip(number, steps["depth_mm"], None, views))
+    whole = list(source.episodes([3, 3, 3], clips.__getitem__))
+    np.testing.assert_array_equal(whole[1:], list(source.episodes([3, 3, 3], clips.__getitem__, 1)))
+    for clip, expected in zip(clips, whole, strict=True):
+        backwards = [2, 1, 0]
+        views = Views(*(values[backwards] for values in vars(clip.views).values()))
+        number = np.full(3, clip.number), np.array(backwards)
+        seen = source.frames(clip.depth_mm, None, *number, views)
+        np.testing.assert_array_equal(seen, expected[backwards])
+    assert np.any(whole[0][0] != whole[0][1])
+
+
 @pytest.mark.parametrize("went_on", [False, True])
 def test_demos_that_do_not_say_it_are_refused_in_one_line(went_on, episodes, tmp_path):
     """Neither do those that were begun before demos said it."""
@@ -129,6 +154,6 @@ def test_demos_that_do_not_say_it_are_refused_in_one_line(went_on, episodes, tmp
     store.append(steps, {name: said[name] for name in ("object_index", "T_world_cam")})
     if went_on:
         store.append(steps, said)
-    with pytest.raises(UserError, match=r"does not say which object .* collect them again") as error:
+    with pytest.raises(UserError, match=r"does not say which object .* collect new ones") as error:
         check_demos(RigSource(CONFIG), store)
     assert "\n" not in str(error.value)

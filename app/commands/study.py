@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from app import extras
 from app.commands.base import FromPreset
 from app.commands.checks import check_config_values, check_devices, check_networks
-from ddgrasp import contract
+from ddgrasp import artifacts, contract
 from ddgrasp.config import Config
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
@@ -78,11 +78,12 @@ class StudyTable2(FromPreset):
             extras.check_fr3("--rig fr3")
         config = rows.shared_config(self.config)
         check_config_values(config)
-        left_out = {} if self.rows else _impossible(config, names)
+        shared = self.out / results.SHARED
+        left_out = {} if self.rows else _impossible(config, names, shared)
         names = tuple(name for name in names if name not in left_out)
         for name in names:
-            _check_row(config, name)
-        check_devices(config, self.out / results.SHARED)
+            _check_row(config, name, shared)
+        check_devices(config, shared)
         return Study(config, self.out, names, series, self.workers, left_out)
 
 
@@ -127,24 +128,29 @@ class StudyCauses:
         print(causes.markdown(made["rows"]))
 
 
-def _check_row(config: Config, name: str) -> None:
+def _check_row(config: Config, name: str, shared: Path) -> None:
+    from demos.stage import STORE
+    from demos.store import EpisodeStore
     from evaluation.table2.rows import ROWS, row_config
     from evaluation.treatments import make_treatment
+    from student_jax.depth_source import check_views
 
     check_config_values(row_config(config, ROWS[name]))
     make_treatment(ROWS[name].depth, config)
+    if ROWS[name].source == "rig" and artifacts.is_finished(shared / "demos"):
+        check_views(EpisodeStore(shared / "demos" / STORE))
 
 
-def _impossible(config: Config, names: tuple[str, ...]) -> dict[str, str]:
-    """Rows whose network has no weights here, or whose camera no colour, and why: a table is made without."""
-    from ddg_jax.sensor import BY_COLOUR
+def _impossible(config: Config, names: tuple[str, ...], shared: Path) -> dict[str, str]:
+    """Rows whose network has no weights or colour here, or whose camera no scenes, and why: a table is made
+    without."""
     from evaluation.table2.rows import ROWS
 
     why = {}
     for name in names:
-        if ROWS[name].source in ("monocular", *BY_COLOUR):
+        if ROWS[name].source in ("monocular", "rig"):
             try:
-                _check_row(config, name)
+                _check_row(config, name, shared)
             except UserError as error:
                 why[name] = str(error)
     return why

@@ -10,6 +10,7 @@ from app.lerobot.episode import Episode, Picture, Source
 from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.layout import ACTION
+from ddgrasp.shipped import holding
 from demos.store import EpisodeStore
 
 STORE, STAGE = "episodes.zarr", "demos"
@@ -70,7 +71,7 @@ def _begun(start: str) -> str:
 
 def _open_noisy(path: Path, folder: Path) -> tuple[EpisodeStore, str]:
     """The generated depth of the demonstrations in `folder`, and what a card says of it."""
-    place = path if artifacts.is_finished(path) else path / NOISY_STAGE
+    place = holding(path, artifacts.MANIFEST, NOISY_STAGE) or path / NOISY_STAGE
     manifest = artifacts.read_manifest(place)
     if manifest.parents.get(STAGE) != artifacts.read_artifact(folder).hash:
         raise UserError(

@@ -248,8 +248,8 @@ class StudentConfig(Section, name="student"):
     """What gives the demos' clean depth a camera's artefacts: learned (the run's generator),
     learned_ungrafted (its own map instead of grafted depth), ideal (nothing), dextrah, kinect, stereo (the
     rig's camera on the clean picture), monocular (depth from colour, by a network with weights) or rig (the
-    rig's camera before the scene, which a robot's camera cannot be asked for: a bound); stereo and monocular
-    need demos.rgb."""
+    development rig's camera before the scene, which a robot's cannot be asked for: a bound); stereo and
+    monocular need demos.rgb."""
 
     def check(self) -> None:
         """See `Section.check`."""

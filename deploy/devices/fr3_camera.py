@@ -100,7 +100,7 @@ class Fr3Camera:
         self._profile, self._T_world_cam = profile, T_world_cam
         self._channel: Channel | None = None
         self._picture: ScenePicture | None = None
-        self._object, self._object_m = "", np.full(3, np.nan)
+        self._object, self._object_pos_m = "", np.full(3, np.nan)
 
     def start(self) -> None:
         """Connect and build the scene. Raises UserError if no rig runs at the host."""
@@ -139,17 +139,17 @@ class Fr3Camera:
         """See Judge; as of the last `read`, one for every control step."""
         return self._held_steps >= contract.HOLD_STEPS
 
-    def object_m(self) -> Float[np.ndarray, "3"]:
+    def object_pos_m(self) -> Float[np.ndarray, "3"]:
         """See RigCamera; as of the last `read`."""
-        return self._object_m
+        return self._object_pos_m
 
     def _colour(self) -> UInt8[np.ndarray, "H W 3"]:
         assert self._picture is not None
         return self._picture.rgb(pinhole(self._profile, self._T_world_cam))
 
-    def _judge(self, object_m: np.ndarray) -> None:
-        self._object_m = object_m
-        held = np.linalg.norm(object_m - contract.LIFT_TARGET_M) < contract.LIFT_TOLERANCE_M
+    def _judge(self, object_pos_m: np.ndarray) -> None:
+        self._object_pos_m = object_pos_m
+        held = np.linalg.norm(object_pos_m - contract.LIFT_TARGET_M) < contract.LIFT_TOLERANCE_M
         self._held_steps = self._held_steps + 1 if held else 0
 
     def picture(self) -> UInt8[np.ndarray, "H W 3"]:

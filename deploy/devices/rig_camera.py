@@ -65,7 +65,7 @@ class StereoCamera:
         self._catch_up()
         return self._world.success()
 
-    def object_m(self) -> Float[np.ndarray, "3"]:
+    def object_pos_m(self) -> Float[np.ndarray, "3"]:
         """See RigCamera."""
         return self._world.data.qpos[QPOS.object_pos].copy()
 

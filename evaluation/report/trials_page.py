@@ -8,7 +8,7 @@ from typing import Any
 from ddgrasp.files import atomic_write_text, read_json
 from deploy.trial_log import read_results
 from deploy.trials import TrialResult
-from evaluation import failure_causes, wilson
+from evaluation import failure_modes, wilson
 from evaluation.paired import mcnemar_exact
 from evaluation.report.html import REPORT_HTML, contents, film, heading, page, table
 from evaluation.rig_trials import TABLE_FILE, TRIALS_FILE
@@ -58,7 +58,7 @@ def write(trials: Trials) -> Path:
         "interval.</p>",
         table(("object", "success"), _rows(trials.table)),
         heading(_SECTIONS[1]),
-        *_causes(trials.table.get("failures", {})),
+        *_modes(trials.results),
         *_films(trials.folder, "failure"),
         heading(_SECTIONS[2]),
         *_films(trials.folder, "success"),
@@ -111,12 +111,10 @@ def _pair(first: Trials, other: Trials) -> str:
     return f"{won} won, {lost} lost of {len(both)}, p {mcnemar_exact(won, lost):.2g}"
 
 
-def _causes(failures: dict[str, dict[str, int]]) -> list[str]:
-    """None for a table of before 2026-11-25, which does not count them."""
-    if not failures:
+def _modes(results: Sequence[TrialResult]) -> list[str]:
+    if not (rows := failure_modes.rows(failure_modes.count(results))):
         return []
-    note = "<p class=note>By where the object was from step to step.</p>"
-    return [note, table(("cause", "trials", "objects"), failure_causes.rows(failures))]
+    return [f"<p class=note>{failure_modes.NOTE}</p>", table(("mode", "trials", "objects"), rows)]
 
 
 def _films(folder: Path, outcome: str) -> list[str]:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from ddgrasp import contract
 from evaluation import wilson
-from evaluation.failure_causes import CAUSES
+from evaluation.failure_modes import MODES, NOTE
 from evaluation.report.figures import to_png
 from evaluation.report.html import image, page, table
 from evaluation.table2.results import describe_set
@@ -60,10 +60,10 @@ def object_rows(study: Mapping[str, Any], set_of_trials: str) -> tuple[list[str]
     ]
 
 
-def cause_rows(study: Mapping[str, Any], set_of_trials: str) -> list[list[str]]:
-    """(title, failed trials of each of `failure_causes.CAUSES`) of every row tried; "" for none."""
+def mode_rows(study: Mapping[str, Any], set_of_trials: str) -> list[list[str]]:
+    """(title, failed trials of each of `failure_modes.MODES`) of every row tried; "" for none."""
     return [
-        [ROWS[row].title, *(str(sum(made["failures"].get(why, {}).values()) or "") for why in CAUSES)]
+        [ROWS[row].title, *(str(sum(made["failures"].get(how, {}).values()) or "") for how in MODES)]
         for row, made in study["sets"][set_of_trials]["rows"].items()
     ]
 
@@ -100,7 +100,8 @@ def render(study: Mapping[str, Any], picture: bytes) -> str:
             body.append(table(_COLUMNS, table_rows(study, name, key)))
         objects, lines = object_rows(study, name)
         body.append("<h3>By object</h3>" + table(["row", *objects], lines))
-        body.append("<h3>Failures by cause</h3>" + table(["row", *CAUSES], cause_rows(study, name)))
+        body.append(f"<h3>Failures by mode</h3><p class=note>{NOTE}</p>")
+        body.append(table(["row", *MODES], mode_rows(study, name)))
     if study["sets"]:
         body.append(image(picture, "success with intervals, and by object"))
     return page(title, body)

@@ -7,6 +7,7 @@ DIR/trials/<set>/<row>/trials.jsonl        outcome of every trial
 DIR/study.{json, html, png}                the tables
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from typing import Any
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.files import read_json
-from deploy.trial_log import read_results
+from deploy.policy import POLICY_FILE
+from deploy.trial_log import read_header, read_results
 from deploy.trials import TrialResult
 from evaluation import paired, rig_trials
 from evaluation.report.summary import with_intervals
@@ -79,7 +81,8 @@ def _describe(row: Row, student: Artifact) -> dict[str, Any]:
 
 
 def _set(folder: Path) -> dict[str, Any]:
-    outcomes = {name: read_results(folder / name / rig_trials.TRIALS_FILE) for name in ROWS}
+    logs = {name: folder / name / rig_trials.TRIALS_FILE for name in ROWS}
+    outcomes = {name: read_results(log) for name, log in logs.items() if not _outdated(folder, name, log)}
     tried = {name: results for name, results in outcomes.items() if results}
     how = [read_json(path)["series"] for path in sorted(folder.glob(f"*/{rig_trials.TABLE_FILE}"))]
     same = ("rig", "split", "number", "shapes", "camera", "seconds", "contact")
@@ -88,6 +91,13 @@ def _set(folder: Path) -> dict[str, Any]:
         "rows": {name: rig_trials.tabulate(results) for name, results in tried.items()},
         "tables": {name: compare(table, tried) for name, table in TABLES.items()},
     }
+
+
+def _outdated(folder: Path, row: str, log: Path) -> bool:
+    """Whether the log's trials were run with another policy than the row's student is now."""
+    policy = folder.parent.parent / STUDENTS / ROWS[row].student / "export" / POLICY_FILE
+    made = read_header(log).get("policy_sha256")
+    return made is not None and policy.is_file() and made != hashlib.sha256(policy.read_bytes()).hexdigest()
 
 
 def compare(table: Table, tried: Mapping[str, Sequence[TrialResult]]) -> list[dict[str, Any]]:

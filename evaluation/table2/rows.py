@@ -63,7 +63,7 @@ ROWS: dict[str, Row] = {
     "monocular": Row("Monocular", "monocular", depth="monocular"),
     "ddg_no_graft": Row("DDG without grafting", "learned_ungrafted"),
     "ddg": Row("DDG", "learned"),
-    "upper_bound": Row("Upper bound: the rig's camera", "rig"),
+    "upper_bound": Row("Upper bound: development rig's camera", "rig"),
     "sim_gt_ripple": Row("Sim GT, ripple", "ideal", ripple=True),
     "rand_noise_ripple": Row("Rand Noise, ripple", "dextrah", ripple=True),
     "ddg_ripple": Row("DDG, ripple", "learned", ripple=True),
@@ -100,7 +100,7 @@ TRAINING = {
     "dextrah": "DextrAH-G's formulas",
     "learned": "generator, grafted",
     "learned_ungrafted": "generator's own map",
-    "rig": "the rig's camera",
+    "rig": "the development rig's camera",
     "monocular": "network on simulated colour",
 }
 DEPLOYED = {"recorded": "as recorded", "inpaint": "inpainted on line", "monocular": "network on colour"}
