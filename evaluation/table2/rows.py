@@ -107,7 +107,8 @@ DEPLOYED = {"recorded": "as recorded", "inpaint": "inpainted on line", "monocula
 
 
 def chosen(rows: Sequence[str], tables: Sequence[str]) -> tuple[str, ...]:
-    """Names of the rows asked for, in the order of `ROWS`: those named, else the tables', each once.
+    """Names of the rows asked for, in the order in which they are to be made: those named, else the tables',
+    each once.
 
     Raises UserError for an unknown row or table.
     """
@@ -117,8 +118,7 @@ def chosen(rows: Sequence[str], tables: Sequence[str]) -> tuple[str, ...]:
     for name in tables:
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)
-    wanted = set(rows) or {row for name in tables for row in TABLES[name].rows}
-    return tuple(name for name in ROWS if name in wanted)
+    return tuple(dict.fromkeys(rows or (row for name in tables for row in TABLES[name].rows)))
 
 
 def shared_config(config: Config) -> Config:
