@@ -32,6 +32,7 @@ from deploy.devices.franka_robot import AT_START_RAD, FrankaRobot
 from deploy.devices.options import SessionOptions
 from deploy.dry_run import DryRun, draw
 from deploy.interfaces import RobotError
+from deploy.kinematics import grip_pose
 from deploy.loop import ControlLoop, LoopReport, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.session import ask_person, deploy
@@ -39,7 +40,7 @@ from deploy.setup import safety_filter, speed_notice
 from deploy_support import HOME_RAD, ScriptedCamera, constant_bias, depth_mm, describe, write_policy
 from rig.fr3.channel import Channel
 from rig.fr3.process import Fr3Rig
-from rig.fr3.scene import primitive
+from rig.fr3.scene import SceneObject, primitive
 
 pytestmark = pytest.mark.flaky(reruns=2, only_rerun=["UDP receive: Timeout"])
 """libfranka gives a server up that a busy machine kept from answering: -ra names what was tried again."""
@@ -167,6 +168,25 @@ def test_gripper_that_closes_on_nothing_is_an_event_with_its_width(tmp_path, rig
     while robot.read_state().width_m < 0.07:
         time.sleep(0.01)
     robot.stop()
+
+
+def test_a_grasp_of_what_fills_the_whole_opening_is_no_fault():
+    """The fingers, pressed apart to the end of their way and a little more, close on it all the same."""
+    pose = grip_pose(np.array(HOME_RAD))
+    box = '<geom type="box" size="0.012 0.0425 0.012" mass="0.02" friction="1.5 0.005 0.0001"/>'
+    wide = SceneObject("wide", box, rest_height_m=float(pose[2, 3]))
+    with Fr3Rig("127.0.0.14", wide, bare=True) as rig:
+        robot, _ = connect(config_for(rig.host))
+        robot.start()
+        yaw_rad = float(np.arctan2(-pose[0, 1], pose[1, 1]))
+        place = {"x_m": float(pose[0, 3]), "y_m": float(pose[1, 3]), "yaw_rad": yaw_rad}
+        rig.channel.ask("place", **place)
+        start_s = rig.channel.ask("state")["time_s"]
+        robot.command(np.array(HOME_RAD), close=True)
+        while rig.channel.ask("state")["time_s"] < start_s + 1.0:
+            width_m = robot.read_state().width_m
+        robot.stop()
+    assert width_m > contract.GRIPPER_MAX_WIDTH_M
 
 
 def test_a_close_can_be_aborted():

@@ -7,8 +7,9 @@ from typing import Any
 from ddgrasp import contract
 
 SPEED_M_S = 0.1
-GRASP_ANY_WIDTH_M = contract.GRIPPER_MAX_WIDTH_M
-"""franky's outer tolerance: a grasp of any width counts, as in simulation."""
+GRASP_ANY_WIDTH_M = 1.5 * contract.GRIPPER_MAX_WIDTH_M
+"""franky's outer tolerance: a grasp of any width counts, as in simulation. More than the whole opening, since
+fingers that something presses apart report a little more than that."""
 WIDTH_PERIOD_S = 0.03
 THREADS = "Franka Hand"
 END_S = 2.0
