@@ -2,7 +2,9 @@
 
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ class TrialLog:
         """
         self._path = path
         self.results: dict[tuple[int, bool], TrialResult] = {}
-        lines = _complete_lines(path)
+        lines = list(_complete_lines(path))
         if lines and lines[0] != header:
             raise UserError(
                 f"{path} holds trials of another policy or configuration: delete {path.parent} to start "
@@ -46,25 +48,25 @@ class TrialLog:
 
 def read_results(path: Path) -> list[TrialResult]:
     """The finished trials in a log, whatever they belong to; none if there is no log."""
-    return [TrialResult(**line) for line in _complete_lines(path)[1:]]
+    return [TrialResult(**line) for line in islice(_complete_lines(path), 1, None)]
 
 
 def read_header(path: Path) -> dict[str, Any]:
     """What the trials in a log belong to; empty if there is no log."""
-    return next(iter(_complete_lines(path)), {})
+    return next(_complete_lines(path), {})
 
 
 def _line(value: dict[str, Any]) -> str:
     return json.dumps(value, allow_nan=False) + "\n"
 
 
-def _complete_lines(path: Path) -> list[dict[str, Any]]:
+def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
+    """Up to the first that is torn."""
     if not path.exists():
-        return []
-    lines = []
-    for text in path.read_text(errors="replace").splitlines():
-        try:
-            lines.append(json.loads(text))
-        except json.JSONDecodeError:
-            break
-    return lines
+        return
+    with open(path, errors="replace") as file:
+        for text in file:
+            try:
+                yield json.loads(text)
+            except json.JSONDecodeError:
+                return

@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +20,7 @@ from ddgrasp.presets import get_preset
 from deploy import session
 from deploy.clock import SimClock
 from deploy.devices import registry
+from deploy.devices.franka_hand import FrankaHand
 from deploy.devices.franka_robot import FrankaRobot
 from deploy.devices.options import Setup
 from deploy.devices.realsense_camera import RealSenseCamera
@@ -144,6 +146,53 @@ def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
     camera._rs = Library
     monkeypatch.setattr("deploy.devices.realsense_camera.time.time", lambda: 1000.0)
     assert camera._exposed_s(DepthFrame()) == pytest.approx(4.96)
+
+
+class SlowGripper:
+    """Answers as a gripper over a slow network: a command that begins before the last `stop` is through is
+    the one that it stops."""
+
+    width = 0.08
+
+    def __init__(self):
+        self.begun, self.done = [], []
+        self._stopped = threading.Event()
+        self.stop_may_go = threading.Event()
+
+    def grasp(self, *_, **__):
+        self._command("grasp", 0.05)
+
+    def open(self, _):
+        self._command("open", 0.05)
+
+    def stop(self):
+        self.stop_may_go.wait(5)
+        self._stopped.set()
+
+    def _command(self, name, seconds):
+        self.begun.append(name)
+        self._stopped.clear()
+        if self._stopped.wait(seconds):
+            raise RuntimeError("Command aborted")
+        self.done.append(name)
+
+
+def test_a_stop_that_comes_late_does_not_meet_the_next_command():
+    gripper = SlowGripper()
+    hand = FrankaHand(gripper, (RuntimeError,), 70.0)
+    hand.set(True)
+    while not gripper.begun:
+        time.sleep(0.001)
+    hand.set(False)  # while it closes, which is over before the stop is through
+    while gripper.done != ["grasp"]:
+        time.sleep(0.001)
+    time.sleep(0.03)
+    gripper.stop_may_go.set()
+    while len(gripper.done) < 2:
+        hand.width_m()  # raises what stopped it
+        time.sleep(0.001)
+    hand.stop()
+    assert gripper.done == ["grasp", "open"]
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,9 @@ class FrankaHand:
         self._width_m = float(gripper.width)
         self._wish: bool | None = None
         self._busy = False
+        self._aborting: threading.Thread | None = None
+        self._lock = threading.Lock()
+        """Held while a command begins or ends, and while one is called off."""
         self._changed, self._stopping = threading.Event(), threading.Event()
         self._error: Exception | None = None
         self._acting = threading.Thread(target=self._guard, args=(self._act,), name=THREADS, daemon=True)
@@ -45,10 +48,11 @@ class FrankaHand:
         """Close or open. A motion that is not wished any more is stopped; the newest wish counts."""
         if close == self._wish:
             return
-        self._wish = close
-        self._changed.set()
-        if self._busy:
-            self._abort()
+        with self._lock:
+            self._wish = close
+            self._changed.set()
+            if self._busy:
+                self._abort()
 
     def stop(self, connected: bool = True) -> None:
         """End both threads, after what they are at; the gripper keeps its grip.
@@ -63,11 +67,13 @@ class FrankaHand:
             return
         self._acting.join(END_S)
         if self._acting.is_alive():
-            self._abort()
+            with self._lock:
+                self._abort()
             self._acting.join(END_S)
 
     def _abort(self) -> None:
-        threading.Thread(target=self._guard_once, args=(self._gripper.stop,), daemon=True).start()
+        self._aborting = threading.Thread(target=self._guard_once, args=(self._gripper.stop,), daemon=True)
+        self._aborting.start()
 
     def _guard(self, work: Callable[[], None]) -> None:
         while not self._stopping.is_set() and self._error is None:
@@ -86,12 +92,15 @@ class FrankaHand:
 
     def _act(self) -> None:
         self._changed.wait()
-        self._changed.clear()
-        if self._stopping.is_set():
-            return
-        self._busy = True
+        if self._aborting is not None:  # its `stop` may come late, and must not meet the next command
+            self._aborting.join()
+        with self._lock:
+            self._changed.clear()
+            if self._stopping.is_set():
+                return
+            self._busy, close = True, self._wish
         try:
-            if self._wish:
+            if close:
                 self._gripper.grasp(0.0, SPEED_M_S, self._force_n, epsilon_outer=GRASP_ANY_WIDTH_M)
             else:
                 self._gripper.open(SPEED_M_S)
@@ -99,4 +108,5 @@ class FrankaHand:
             if not self._changed.is_set():  # not stopped by `set`: the gripper's own trouble
                 raise
         finally:
-            self._busy = False
+            with self._lock:
+                self._busy = False
