@@ -99,8 +99,9 @@ def lasting(config: Config, seconds: float) -> Config:
     return replace(config, world=replace(config.world, episode_steps=steps))
 
 
-ENDS = {"ends": "with success"}
-"""Header of a log of trials: those of before 2026-11-25 were judged when their time was over."""
+ENDS = {"ends": "with success, as judged then"}
+"""Header of a log of trials. Those of before 2026-11-25 were judged when their time was over; until the day
+after, trials that success had ended were judged again on the development rig a control period later."""
 
 
 Watch = Callable[[Step, Filmed], bool | None]
@@ -183,12 +184,15 @@ class Rig:
         loop = ControlLoop(seen, robot, self._policy, safety, clock, settings)
         filming = Filming(camera, config.deploy.film_every, watch)
         # Drawing for people takes the time of a period: not while time is measured.
-        look = filming.look if not trial.realtime else lambda _: camera.success()
+        look = filming.judge if trial.realtime else filming.look
         report = loop.run(config.world.episode_steps, look)
         if report.interrupted:
             raise KeyboardInterrupt
         robot.catch_up()
-        return result(trial, bool(self._world.success()), report, filming.object_pos_m), filming.film()
+        # What ended it with success has one, whatever the last command does; the last period of a trial
+        # whose time is over counts as well.
+        success = filming.succeeded or bool(self._world.success())
+        return result(trial, success, report, filming.object_pos_m), filming.film()
 
     def watch_policy(self, watch: WatchPolicy) -> None:
         """From now on `watch` is told of everything that the policy is given."""
@@ -241,6 +245,8 @@ class Filming:
         self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
         self.object_pos_m: list[list[float]] = []
         """As each step's frame has it, see `TrialResult`."""
+        self.succeeded = False
+        """Whether success ended the trial."""
 
     def look(self, step: Step) -> bool | None:
         """Takes the picture if it is due; what the loop's `on_step` is called with. True ends the trial, as
@@ -249,7 +255,13 @@ class Filming:
             self._columns.append((step.index, self._camera.picture(), step.frame.depth))
         self.object_pos_m.append([round(float(x), 4) for x in self._camera.object_pos_m()])
         told = self._watch is not None and self._watch(step, self._camera)
-        return told or self._camera.success()
+        return told or self.judge(step)
+
+    def judge(self, step: Step) -> bool:
+        """Ends the trial if it has succeeded, without a picture."""
+        del step
+        self.succeeded = self._camera.success()
+        return self.succeeded
 
     def film(self) -> Film:
         """The pictures so far."""

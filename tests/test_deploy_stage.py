@@ -20,6 +20,7 @@ from ddgrasp.config import (
     WorldConfig,
 )
 from ddgrasp.errors import UserError
+from ddgrasp.layout import QPOS
 from ddgrasp.progress import Progress
 from ddgrasp.shipped import PRETRAINED
 from deploy import stage
@@ -209,6 +210,23 @@ def test_a_trial_ends_with_success():
     height_m = np.array(ended.object_pos_m)[:, 2]
     assert len(height_m) == ended.steps and height_m[0] < 0.05
     assert height_m[-1] == pytest.approx(contract.LIFT_TARGET_M[2], abs=contract.LIFT_TOLERANCE_M)
+
+
+def test_what_ends_a_trial_with_success_has_one_whatever_the_last_command_does(policy):
+    config = dataclasses.replace(CONFIG, world=dataclasses.replace(CONFIG.world, episode_steps=20))
+
+    def lifted(step, camera) -> None:
+        """The object is near where it is to be lifted to as long as it takes, then gone."""
+        _, data = camera.scene()
+        off_m = (0.0, 0.0, 0.03) if step.index < contract.HOLD_STEPS else (0.0, 0.3, 0.0)
+        data.qpos[QPOS.object_pos] = np.array(contract.LIFT_TARGET_M) + off_m
+        data.qvel[:] = 0.0
+
+    bench = rig_eval.Rig(config, policy)
+    made, _ = bench.run(Trial(0, "cube"), lifted)
+    assert made.success and made.steps == contract.HOLD_STEPS + 1
+    bench.run(Trial(0, "cube"), lambda step, camera: lifted(step, camera) or step.index == 3)
+    assert not bench.run(Trial(0, "cube"))[0].success  # the one before says nothing about this one
 
 
 def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):
