@@ -108,9 +108,9 @@ class Fr3Runner:
         report = loop.run(config.world.episode_steps, filming.look)
         if report.interrupted:
             raise KeyboardInterrupt
-        if report.fault.startswith(LOST):
+        if report.fault.startswith(LOST) and not filming.succeeded:
             raise RobotError(report.fault)
-        return report, camera.success() and not report.fault, filming
+        return report, filming.succeeded, filming
 
     def draw(self, trial: Trial) -> PlacedDraw:
         """What chance decides about `trial`."""

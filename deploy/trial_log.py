@@ -17,7 +17,7 @@ class TrialLog:
     """Finished trials on disk, one JSON line each behind a header; a torn last line is dropped."""
 
     def __init__(self, path: Path, header: dict[str, Any]):
-        """Read what is there. Raises UserError if it belongs to another policy or configuration.
+        """Read what is there. Raises UserError if it belongs to another policy, configuration or rule.
 
         Args:
             header: what the trials belong to: the policy and the configuration.
@@ -27,8 +27,8 @@ class TrialLog:
         lines = list(_complete_lines(path))
         if lines and lines[0] != header:
             raise UserError(
-                f"{path} holds trials of another policy or configuration: delete {path.parent} to start "
-                "them anew, or choose another --out."
+                f"{path} holds trials of another policy, configuration or rule: delete {path.parent} to "
+                "start them anew, or choose another --out."
             )
         for line in lines[1:]:
             result = TrialResult(**line)

@@ -254,8 +254,9 @@ class Filming:
         if step.index % self._every == 0 and step.frame is not None:
             self._columns.append((step.index, self._camera.picture(), step.frame.depth))
         self.object_pos_m.append([round(float(x), 4) for x in self._camera.object_pos_m()])
+        succeeded = self.judge(step)
         told = self._watch is not None and self._watch(step, self._camera)
-        return told or self.judge(step)
+        return succeeded or told
 
     def judge(self, step: Step) -> bool:
         """Ends the trial if it has succeeded, without a picture."""

@@ -19,7 +19,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy import session
 from deploy.clock import SimClock
-from deploy.devices import registry
+from deploy.devices import franka_hand, registry
 from deploy.devices.franka_hand import FrankaHand
 from deploy.devices.franka_robot import FrankaRobot
 from deploy.devices.options import Setup
@@ -155,7 +155,7 @@ class SlowGripper:
     width = 0.08
 
     def __init__(self):
-        self.begun, self.done = [], []
+        self.begun, self.done, self.stops = [], [], 0
         self._stopped = threading.Event()
         self.stop_may_go = threading.Event()
 
@@ -166,6 +166,7 @@ class SlowGripper:
         self._command("open", 0.05)
 
     def stop(self):
+        self.stops += 1
         self.stop_may_go.wait(5)
         self._stopped.set()
 
@@ -184,6 +185,8 @@ def test_a_stop_that_comes_late_does_not_meet_the_next_command():
     while not gripper.begun:
         time.sleep(0.001)
     hand.set(False)  # while it closes, which is over before the stop is through
+    hand.set(True)
+    hand.set(False)
     while gripper.done != ["grasp"]:
         time.sleep(0.001)
     time.sleep(0.03)
@@ -192,7 +195,24 @@ def test_a_stop_that_comes_late_does_not_meet_the_next_command():
         hand.width_m()  # raises what stopped it
         time.sleep(0.001)
     hand.stop()
-    assert gripper.done == ["grasp", "open"]
+    assert gripper.done == ["grasp", "open"] and gripper.stops == 1
+
+
+def test_a_stop_that_never_ends_is_the_hand_s_error(monkeypatch):
+    monkeypatch.setattr(franka_hand, "END_S", 0.1)
+    gripper = SlowGripper()
+    hand = FrankaHand(gripper, (ConnectionError,), 70.0)
+    hand.set(True)
+    while not gripper.begun:
+        time.sleep(0.001)
+    hand.set(False)
+    with pytest.raises(RuntimeError, match=r"did not answer a stop within 0\.1 s"):
+        for _ in range(1000):
+            hand.width_m()
+            time.sleep(0.01)
+    assert gripper.begun == ["grasp"]
+    hand.stop()
+    gripper.stop_may_go.set()
 
 
 @pytest.mark.parametrize(

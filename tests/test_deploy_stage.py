@@ -113,7 +113,7 @@ def test_trials_of_another_policy_are_refused_and_kept(tmp_path):
     path = tmp_path / "trials.jsonl"
     TrialLog(path, {"policy_sha256": "a"}).append(result(0))
     before = path.read_bytes()
-    with pytest.raises(UserError, match="another policy or configuration"):
+    with pytest.raises(UserError, match="another policy, configuration or rule"):
         TrialLog(path, {"policy_sha256": "b"})
     assert path.read_bytes() == before
 

@@ -72,6 +72,9 @@ class FrankaHand:
             self._acting.join(END_S)
 
     def _abort(self) -> None:
+        """Stops the command that runs; once is enough, since none begins before that is through."""
+        if self._aborting is not None and self._aborting.is_alive():
+            return
         self._aborting = threading.Thread(target=self._guard_once, args=(self._gripper.stop,), daemon=True)
         self._aborting.start()
 
@@ -82,7 +85,7 @@ class FrankaHand:
     def _guard_once(self, work: Callable[[], Any]) -> None:
         try:
             work()
-        except self._errors as error:
+        except (*self._errors, RuntimeError) as error:
             if self._error is None and not self._stopping.is_set():
                 self._error = error
 
@@ -92,8 +95,8 @@ class FrankaHand:
 
     def _act(self) -> None:
         self._changed.wait()
-        if self._aborting is not None:  # its `stop` may come late, and must not meet the next command
-            self._aborting.join()
+        if not self._stopping.is_set():
+            self._await_abort()
         with self._lock:
             self._changed.clear()
             if self._stopping.is_set():
@@ -110,3 +113,10 @@ class FrankaHand:
         finally:
             with self._lock:
                 self._busy = False
+
+    def _await_abort(self) -> None:
+        """A late `stop` must not meet the next command. Raises RuntimeError if it never ends."""
+        if self._aborting is not None:
+            self._aborting.join(END_S)
+            if self._aborting.is_alive():
+                raise RuntimeError(f"the gripper did not answer a stop within {END_S:g} s")
