@@ -313,6 +313,7 @@ def test_limits_are_the_fr3_s_and_the_filter_keeps_them_before_the_arm_would(tmp
         robot.stop()
 
 
+@pytest.mark.flaky(reruns=2)  # a busy machine may take 5 of the 100 ms to hand the command over
 def test_an_arm_that_gets_no_further_command_brakes_by_itself(rig):
     config = config_for(HOST)  # other tests left the arm elsewhere: half a minute away at a start's pace
     quick = replace(config, franka=replace(config.franka, start_dynamics=0.3))
