@@ -157,59 +157,61 @@ class SlowGripper:
     def __init__(self):
         self.begun, self.done, self.stops = [], [], 0
         self._stopped = threading.Event()
-        self.stop_may_go = threading.Event()
+        self.grasp_may_end, self.stop_may_go = threading.Event(), threading.Event()
 
     def grasp(self, *_, **__):
-        self._command("grasp", 0.05)
+        self.begun.append("grasp")
+        self.grasp_may_end.wait(20)
+        self.done.append("grasp")
 
     def open(self, _):
-        self._command("open", 0.05)
+        self.begun.append("open")
+        self._stopped.clear()
+        if self._stopped.wait(0.1):
+            raise RuntimeError("Command aborted")
+        self.done.append("open")
 
     def stop(self):
         self.stops += 1
-        self.stop_may_go.wait(5)
+        self.stop_may_go.wait(20)
         self._stopped.set()
 
-    def _command(self, name, seconds):
-        self.begun.append(name)
-        self._stopped.clear()
-        if self._stopped.wait(seconds):
-            raise RuntimeError("Command aborted")
-        self.done.append(name)
+
+def until(condition) -> None:
+    """Waits for it, at most 20 s."""
+    end_s = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.001)
+
+
+def called_off(errors) -> tuple[FrankaHand, SlowGripper]:
+    """A hand that is to open while it closes, which ends by itself before the stop is through."""
+    gripper = SlowGripper()
+    hand = FrankaHand(gripper, errors, 70.0)
+    hand.set(True)
+    until(lambda: gripper.begun)
+    for close in (False, True, False):
+        hand.set(close)
+    gripper.grasp_may_end.set()
+    until(lambda: gripper.done == ["grasp"])
+    return hand, gripper
 
 
 def test_a_stop_that_comes_late_does_not_meet_the_next_command():
-    gripper = SlowGripper()
-    hand = FrankaHand(gripper, (RuntimeError,), 70.0)
-    hand.set(True)
-    while not gripper.begun:
-        time.sleep(0.001)
-    hand.set(False)  # while it closes, which is over before the stop is through
-    hand.set(True)
-    hand.set(False)
-    while gripper.done != ["grasp"]:
-        time.sleep(0.001)
+    hand, gripper = called_off((RuntimeError,))
     time.sleep(0.03)
     gripper.stop_may_go.set()
-    while len(gripper.done) < 2:
-        hand.width_m()  # raises what stopped it
-        time.sleep(0.001)
+    until(lambda: hand.width_m() and len(gripper.done) == 2)  # the width raises what stopped the hand
     hand.stop()
     assert gripper.done == ["grasp", "open"] and gripper.stops == 1
 
 
 def test_a_stop_that_never_ends_is_the_hand_s_error(monkeypatch):
     monkeypatch.setattr(franka_hand, "END_S", 0.1)
-    gripper = SlowGripper()
-    hand = FrankaHand(gripper, (ConnectionError,), 70.0)
-    hand.set(True)
-    while not gripper.begun:
-        time.sleep(0.001)
-    hand.set(False)
+    hand, gripper = called_off((ConnectionError,))
     with pytest.raises(RuntimeError, match=r"did not answer a stop within 0\.1 s"):
-        for _ in range(1000):
-            hand.width_m()
-            time.sleep(0.01)
+        until(lambda: not hand.width_m())
     assert gripper.begun == ["grasp"]
     hand.stop()
     gripper.stop_may_go.set()
