@@ -4,7 +4,6 @@ import json
 import os
 from collections.abc import Iterator
 from dataclasses import asdict
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -46,14 +45,10 @@ class TrialLog:
             os.fsync(file.fileno())
 
 
-def read_results(path: Path) -> list[TrialResult]:
-    """The finished trials in a log, whatever they belong to; none if there is no log."""
-    return [TrialResult(**line) for line in islice(_complete_lines(path), 1, None)]
-
-
-def read_header(path: Path) -> dict[str, Any]:
-    """What the trials in a log belong to; empty if there is no log."""
-    return next(_complete_lines(path), {})
+def read_log(path: Path) -> tuple[dict[str, Any], list[TrialResult]]:
+    """(what the trials in a log belong to, the finished ones); empty both if there is no log."""
+    lines = _complete_lines(path)
+    return next(lines, {}), [TrialResult(**line) for line in lines]
 
 
 def _line(value: dict[str, Any]) -> str:

@@ -20,7 +20,7 @@ from ddgrasp.install import pip_install
 from ddgrasp.progress import Progress
 from deploy.changes import Change
 from deploy.fr3_trials import Fr3Bench
-from deploy.trial_log import read_results
+from deploy.trial_log import read_log
 from deploy.trials import Bench, Rig, TrialResult
 from evaluation import paired, rig_trials, wilson
 from evaluation.rig_trials import Series
@@ -191,4 +191,4 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _known(folder: Path) -> list[TrialResult]:
-    return read_results(folder / rig_trials.TRIALS_FILE)
+    return read_log(folder / rig_trials.TRIALS_FILE)[1]

@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from deploy.trial_log import read_results
+from deploy.trial_log import read_log
 from deploy.trials import TrialResult
 from evaluation import failure_modes, rig_trials
 
@@ -73,5 +73,5 @@ def test_a_log_of_before_is_read_and_its_failures_are_not_recorded(tmp_path):
     old = asdict(trial([STILL, PUSHED]))
     del old["object_pos_m"]
     (tmp_path / "trials.jsonl").write_text(f"{{}}\n{json.dumps(old)}\n")
-    table = rig_trials.tabulate(read_results(tmp_path / "trials.jsonl"))
+    table = rig_trials.tabulate(read_log(tmp_path / "trials.jsonl")[1])
     assert table["failures"] == {"not recorded": {"can": 1}}

@@ -12,7 +12,6 @@ from app.commands import parse
 from app.commands.study import StudyTable2
 from ddgrasp import artifacts
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_json
 from ddgrasp.presets import get_preset
 from demos.stage import STORE
 from demos.store import EpisodeStore
@@ -166,14 +165,11 @@ def write_row(out: Path, series: Series, row: str, wins: dict[str, list[bool]]) 
     """The trials of a row as `rig_trials.run` leaves them."""
     folder = results.row_folder(out, results.set_name(series), row)
     folder.mkdir(parents=True)
-    log = TrialLog(
-        folder / rig_trials.TRIALS_FILE, {"policy_sha256": hashlib.sha256(row.encode()).hexdigest()}
-    )
+    header = {"policy_sha256": hashlib.sha256(row.encode()).hexdigest(), "rig": series.rig, "seconds": 6.0}
+    log = TrialLog(folder / rig_trials.TRIALS_FILE, header)
     for place, (name, successes) in enumerate(wins.items()):
         for i, success in enumerate(successes):
             log.append(outcome(1000 * place + i, name, success))
-    how = {"rig": series.rig, "split": series.split, "number": 0, "shapes": "mesh", "camera": "stereo"}
-    atomic_write_json(folder / rig_trials.TABLE_FILE, {"series": how | {"seconds": 6.0, "contact": 100.0}})
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from deploy.trials import TrialResult
 from evaluation.report import html, trials_page
-from evaluation.rig_trials import TABLE_FILE, TRIALS_FILE, Series, tabulate
+from evaluation.rig_trials import TRIALS_FILE
 
 CONFIG = Config(preset="debug")
 
@@ -34,10 +34,8 @@ def _trials(folder, outcomes, missed=0, number=0):
     """A folder as `ddgrasp deploy trials` leaves it, with a film of a success and of a failure."""
     folder.mkdir()
     results = [_result(i, name, success, missed) for i, (name, success) in enumerate(outcomes)]
-    lines = [{"policy_sha256": ""}, *map(asdict, results)]
+    lines = [{"policy_sha256": "", "number": number}, *map(asdict, results)]
     (folder / TRIALS_FILE).write_text("".join(json.dumps(line) + "\n" for line in lines))
-    series = asdict(Series("development", number=number))
-    (folder / TABLE_FILE).write_text(json.dumps({"series": series, **tabulate(results)}))
     for outcome in {result.success for result in results}:
         strip = np.random.default_rng(0).integers(0, 255, (200, 3200, 3), np.uint8)
         cv2.imwrite(str(folder / f"cube-0-{'success' if outcome else 'failure'}.png"), strip)
@@ -124,6 +122,9 @@ def test_the_same_trials_are_compared_in_pairs(trials, tmp_path, capsys):
     assert trials_page.compare([trials_page.find(trials), trials_page.find(other)])[1][-1][-1] == (
         "3 won, 1 lost of 4, p 0.62"
     )
+    third = _trials(tmp_path / "third", [("cube", False), ("cube", False), ("can", False), ("can", True)])
+    (*_, last) = trials_page.compare([trials_page.find(folder) for folder in (trials, other, third)])[1]
+    assert last[-2:] == ("3 won, 1 lost of 4, p 0.62 (Holm 1)", "1 won, 1 lost of 4, p 1 (Holm 1)")
     elsewhere = _trials(tmp_path / "elsewhere", [("cube", False)], number=1)
     pair = trials_page.compare([trials_page.find(trials), trials_page.find(elsewhere)])
     assert pair[1][-1][-1] == "other trials"

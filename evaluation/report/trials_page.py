@@ -1,17 +1,16 @@
 """Trials on a rig (`ddgrasp deploy trials`) as one page: verdict, success by object, films of both kinds."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ddgrasp.files import atomic_write_text, read_json
-from deploy.trial_log import read_results
+from ddgrasp.files import atomic_write_text
+from deploy.trial_log import read_log
 from deploy.trials import TrialResult
-from evaluation import failure_modes, wilson
-from evaluation.paired import mcnemar_exact
+from evaluation import failure_modes, paired, wilson
 from evaluation.report.html import REPORT_HTML, contents, film, heading, page, table
-from evaluation.rig_trials import TABLE_FILE, TRIALS_FILE
+from evaluation.rig_trials import TRIALS_FILE, tabulate
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
 _SAME = ("rig", "shapes", "split", "number", "seconds")
@@ -25,24 +24,29 @@ class Trials:
     """What one folder holds."""
 
     folder: Path
-    table: dict[str, Any]
-    """See `evaluation.rig_trials.tabulate`; `series` says which trials they are."""
+    belong_to: dict[str, Any]
+    """Header of the log: which policy, configuration, rule and series."""
     results: Sequence[TrialResult]
+    """In the order of their numbers, not in that in which they ended."""
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """See `evaluation.rig_trials.tabulate`."""
+        return tabulate(self.results)
 
 
 def find(folder: Path) -> Trials | None:
-    """The finished series in `folder`, if there is one."""
-    if not ((folder / TABLE_FILE).exists() and (folder / TRIALS_FILE).exists()):
-        return None
-    return Trials(folder, read_json(folder / TABLE_FILE), read_results(folder / TRIALS_FILE))
+    """The finished trials in `folder`'s log, of a series that is under way as well; None without any."""
+    belong_to, results = read_log(folder / TRIALS_FILE)
+    return Trials(folder, belong_to, sorted(results, key=lambda r: r.index)) if results else None
 
 
 def verdict(trials: Trials) -> str:
     """Success of all, what ended by a fault, deadlines missed."""
     missed = sum(result.missed_deadlines for result in trials.results)
     steps = sum(result.steps for result in trials.results)
-    rate = wilson.describe(trials.table["all"])
-    faults = trials.table["faults"]
+    made = trials.table
+    rate, faults = wilson.describe(made["all"]), made["faults"]
     return f"Success {rate}. Ended by a fault: {faults}. Missed deadlines: {missed} in {steps:,} steps."
 
 
@@ -63,7 +67,7 @@ def write(trials: Trials) -> Path:
         heading(_SECTIONS[2]),
         *_films(trials.folder, "success"),
         heading(_SECTIONS[3]),
-        table(("setting", "value"), [(k, str(v)) for k, v in trials.table["series"].items()]),
+        table(("setting", "value"), [(k, str(v)) for k, v in trials.belong_to.items()]),
     ]
     path = trials.folder / REPORT_HTML
     atomic_write_text(path, page(f"Trials {trials.folder.name}: DiffuDepGrasp-JAX", body))
@@ -72,20 +76,24 @@ def write(trials: Trials) -> Path:
 
 def compare(all_trials: Sequence[Trials]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """(header, rows) of several series side by side: success by object, then trials that the first lost and
-    another won, and the other way round, among those that both ran, with McNemar's exact p."""
+    another won, and the other way round, among those that both ran, with McNemar's exact p, and that after
+    Holm's correction where several are set beside the first."""
     header = ("", *(str(trials.folder) for trials in all_trials))
     rates = [dict(_rows(trials.table)) for trials in all_trials]
     names = dict.fromkeys(name for column in rates for name in column)
-    pairs = ["", *(_pair(all_trials[0], trials) for trials in all_trials[1:])]
     rows = [(name, *(column.get(name, "") for column in rates)) for name in names]
-    return header, [*rows, (f"against {all_trials[0].folder.name}, same trials", *pairs)]
+    pairs = _pairs(all_trials[0], all_trials[1:])
+    return header, [*rows, (f"against {all_trials[0].folder.name}, same trials", "", *pairs)]
 
 
 def write_comparison(all_trials: Sequence[Trials], file: str) -> Path:
     """Writes `compare` as a page into the first folder; returns its path."""
     header, rows = compare(all_trials)
     verdicts = (f"<p class=verdict>{trials.folder}: {verdict(trials)}</p>" for trials in all_trials)
-    note = "<p class=note>Success: rate of n trials, Wilson 95 % interval. p: McNemar's test, exact.</p>"
+    note = (
+        "<p class=note>Success: rate of n trials, Wilson 95 % interval. p: McNemar's test, exact; Holm: "
+        "corrected for all that are set beside the first.</p>"
+    )
     body = ["<h1>Trials side by side</h1>", *verdicts, note, table(header, rows, last_bold=True)]
     path = all_trials[0].folder / file
     atomic_write_text(path, page("Trials side by side: DiffuDepGrasp-JAX", body))
@@ -101,14 +109,25 @@ def _outcomes(trials: Trials) -> dict[tuple[int, str], bool]:
     return {(r.index, r.object_name): r.success for r in trials.results if not r.realtime}
 
 
-def _pair(first: Trials, other: Trials) -> str:
-    if any(first.table["series"][name] != other.table["series"][name] for name in _SAME):
-        return "other trials"
-    before, after = _outcomes(first), _outcomes(other)
-    both = before.keys() & after.keys()
-    won = sum(after[key] and not before[key] for key in both)
-    lost = sum(before[key] and not after[key] for key in both)
-    return f"{won} won, {lost} lost of {len(both)}, p {mcnemar_exact(won, lost):.2g}"
+def _pairs(first: Trials, others: Sequence[Trials]) -> list[str]:
+    """A cell for each of `others`."""
+    made = [_compared(first, other) for other in others]
+    adjusted = iter(paired.holm([pair["p"] for pair in made if pair]))
+    several = len(made) > 1
+    return [_pair(pair, next(adjusted) if several else None) if pair else "other trials" for pair in made]
+
+
+def _compared(first: Trials, other: Trials) -> dict[str, Any] | None:
+    """None for trials of two kinds."""
+    if any(first.belong_to.get(key) != other.belong_to.get(key) for key in _SAME):
+        return None
+    return paired.compared(_outcomes(first), _outcomes(other))
+
+
+def _pair(made: Mapping[str, Any], p_holm: float | None) -> str:
+    corrected = "" if p_holm is None else f" (Holm {p_holm:.2g})"
+    won, lost = made["only_row"], made["only_reference"]
+    return f"{won} won, {lost} lost of {made['n']}, p {made['p']:.2g}{corrected}"
 
 
 def _modes(results: Sequence[TrialResult]) -> list[str]:

@@ -14,9 +14,8 @@ from typing import Any
 
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
-from ddgrasp.files import read_json
 from deploy.policy import POLICY_FILE
-from deploy.trial_log import read_header, read_results
+from deploy.trial_log import read_log
 from deploy.trials import TrialResult
 from evaluation import paired, rig_trials
 from evaluation.report.summary import with_intervals
@@ -81,23 +80,26 @@ def _describe(row: Row, student: Artifact) -> dict[str, Any]:
 
 
 def _set(folder: Path) -> dict[str, Any]:
-    logs = {name: folder / name / rig_trials.TRIALS_FILE for name in ROWS}
-    outcomes = {name: read_results(log) for name, log in logs.items() if not _outdated(folder, name, log)}
-    tried = {name: results for name, results in outcomes.items() if results}
-    how = [read_json(path)["series"] for path in sorted(folder.glob(f"*/{rig_trials.TABLE_FILE}"))]
+    logs = {name: read_log(folder / name / rig_trials.TRIALS_FILE) for name in ROWS}
+    tried = {
+        name: results
+        for name, (belong_to, results) in logs.items()
+        if results and not _outdated(folder, name, belong_to)
+    }
+    belong_to = next((logs[name][0] for name in tried), {})
     same = ("rig", "split", "number", "shapes", "camera", "seconds", "contact")
     return {
-        "trials": {key: how[0][key] for key in same} if how else {},
+        "trials": {key: belong_to[key] for key in same if key in belong_to},
         "rows": {name: rig_trials.tabulate(results) for name, results in tried.items()},
         "tables": {name: compare(table, tried) for name, table in TABLES.items()},
     }
 
 
-def _outdated(folder: Path, row: str, log: Path) -> bool:
-    """Whether the log's trials were run with another policy than the row's student is now."""
+def _outdated(folder: Path, row: str, belong_to: Mapping[str, Any]) -> bool:
+    """Whether a log's trials were run with another policy than the row's student is now."""
     policy = folder.parent.parent / STUDENTS / ROWS[row].student / "export" / POLICY_FILE
-    made = read_header(log).get("policy_sha256")
-    return made is not None and policy.is_file() and made != hashlib.sha256(policy.read_bytes()).hexdigest()
+    made = belong_to["policy_sha256"]
+    return policy.is_file() and made != hashlib.sha256(policy.read_bytes()).hexdigest()
 
 
 def compare(table: Table, tried: Mapping[str, Sequence[TrialResult]]) -> list[dict[str, Any]]:
