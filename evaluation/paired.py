@@ -1,8 +1,10 @@
 """Whether two policies tried on the very same trials differ, and what many such questions cost."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any, TypeVar
+
+Key = TypeVar("Key", bound=Hashable)
 
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
@@ -40,8 +42,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted
 
 
-def compared(reference: Mapping[int, bool], row: Mapping[int, bool]) -> dict[str, Any]:
-    """Success of two series by number of the trial, on the trials that both have.
+def compared(reference: Mapping[Key, bool], row: Mapping[Key, bool]) -> dict[str, Any]:
+    """Success of two series by what names a trial, on the trials that both have.
 
     Keys: n, pairs of trials; only_reference, only_row, pairs in which one alone succeeded; p, McNemar's exact
     two-sided one; difference, the reference's success less the row's.
