@@ -45,7 +45,7 @@ _RIG_DDG = DDGConfig(
     training=DDGTrainingConfig(steps=1000),
     sampling=_BUMPS,
 )
-"""Bumps and places of the rig's camera are learnt, chosen by a student's success (docs/student.md)."""
+"""Bumps and places of the rig's camera are learnt, chosen by a student's success (docs/table2.md)."""
 _PAPER_DDG = DDGConfig(
     depth=_RIG_DDG.depth,
     unet=UNetConfig(
@@ -245,7 +245,7 @@ prior: inverse depth, holes filled, where the paper has Video Depth Anything: it
     repository (--ddg.prior.source video_depth_anything, once they are converted).
 sampler: DDIM with 10 evaluations, where the paper goes through all K steps: 100 times the time.
 bumps: deviations are counted from planes, and the network knows where in the picture it is: what a student's
-    success was chosen by (docs/student.md); the paper says nothing of either.
+    success was chosen by (docs/table2.md); the paper says nothing of either.
 encoder: ResNet-18 from random numbers, where the paper's starts from ImageNet's weights, for the same reason
     (--student.encoder.weights weights/resnet18); its last stage keeps stride 16, and keypoints pool it.
 student: sees relief over the table instead of depth, its holes filled from around them, and has a hand view,
