@@ -1,7 +1,7 @@
 """Which seeds are for developing on the rigs and which are for testing: no number is both.
 
 What was chosen, tuned or debugged by looking at trials is a development figure. Test seeds are looked at once
-for each row of a table, and docs/hardware.md counts the looks.
+for each row of a table, and docs/test_rig.md counts the looks.
 """
 
 from typing import Literal
