@@ -75,9 +75,10 @@ def _run(
     kept = DeploymentRecord(camera, profile, f"{options.camera}, D455 profile", config.deploy.film_every)
     with kept.into(folder):
         report = loop.run(steps, kept.look)
-    unattended = options.yes or report.interrupted or bool(report.fault)
-    finished = not (options.dry_run or report.interrupted)
-    success = verdict(camera, _unasked if unattended else ask_success) if finished else None
+        # Before the last frames are on the disk: the simulated arm's world goes on meanwhile.
+        unattended = options.yes or report.interrupted or bool(report.fault)
+        finished = not (options.dry_run or report.interrupted)
+        success = verdict(camera, _unasked if unattended else ask_success) if finished else None
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
     if name := options.object_name or (config.world.objects[0] if options.robot == "sim" else ""):
         about["object"] = name

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int, Key, UInt8, UInt16
 
-from ddg_jax.generate import Clip, made_mm, noisy_episodes
+from ddg_jax.generate import Clip, by_frames, made_mm, noisy_episodes
 from ddg_jax.monocular import MonocularDepth
 from ddg_jax.prior import Prior
 from ddg_jax.sample import Generator, generate
@@ -132,10 +132,7 @@ class MonocularSource:
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
     ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
         """See `DepthSource`."""
-        for i in range(first, len(lengths)):
-            clip = read(i)
-            assert clip.rgb is not None  # `check_demos` sees to it
-            yield self.network(clip.depth_mm, clip.rgb)
+        return by_frames(self.frames, lengths, read, first)
 
     def frames(
         self,
@@ -146,7 +143,7 @@ class MonocularSource:
         views: Views | None = None,
     ) -> UInt16[np.ndarray, "B H W"]:
         """See `DepthSource`."""
-        assert rgb is not None
+        assert rgb is not None  # `check_demos` sees to it
         return self.network(depth_mm, rgb)
 
 
@@ -163,10 +160,7 @@ class SenseSource:
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
     ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
         """See `DepthSource`."""
-        for i in range(first, len(lengths)):
-            clip = read(i)
-            number = np.full(len(clip.depth_mm), clip.number)
-            yield self.frames(clip.depth_mm, clip.rgb, number, np.arange(len(number)))
+        return by_frames(self.frames, lengths, read, first)
 
     def frames(
         self,

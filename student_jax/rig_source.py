@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Int, UInt8, UInt16
 
-from ddg_jax.generate import Clip
+from ddg_jax.generate import Clip, by_frames
 from ddgrasp import cores
 from ddgrasp.config import Config
 from mjx_envs import scene
@@ -42,10 +42,7 @@ class RigSource:
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
     ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
         """See `DepthSource`."""
-        for i in range(first, len(lengths)):
-            clip = read(i)
-            number = np.full(len(clip.depth_mm), clip.number)
-            yield self.frames(clip.depth_mm, clip.rgb, number, np.arange(len(number)), clip.views)
+        return by_frames(self.frames, lengths, read, first)
 
     def frames(
         self,

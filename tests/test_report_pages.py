@@ -118,6 +118,8 @@ def test_a_missed_deadline_is_red(tmp_path):
 def test_the_same_trials_are_compared_in_pairs(trials, tmp_path, capsys):
     other = _trials(tmp_path / "other", [("cube", False), ("cube", True), ("can", True), ("can", True)])
     parse("report", [str(trials), str(other)]).run()
+    assert (trials / "comparison.png").read_bytes()[:4] == b"\x89PNG"
+    assert "data:image/png;base64," in (trials / "comparison.html").read_text()
     # three won and one lost: p = 2 (1 + 4) / 2^4
     assert trials_page.compare([trials_page.find(trials), trials_page.find(other)])[1][-1][-1] == (
         "3 won, 1 lost of 4, p 0.62"

@@ -109,12 +109,12 @@ def _compare(runs: Sequence[Path]) -> None:
 
 
 def _compare_trials(runs: Sequence[Path], tried: Sequence["Trials"]) -> None:
-    from evaluation.report import comparison, trials_page
+    from evaluation.report import trials_page
 
     if len(tried) < len(runs):
         others = [str(run) for run in runs if trials_page.find(run) is None]
         raise UserError(f"{', '.join(others)}: no finished trials to set beside {tried[0].folder}.")
-    print(f"{trials_page.write_comparison(tried, comparison.COMPARISON_HTML)}\n")
+    print(f"{trials_page.write_comparison(tried)}\n")
     _print_table(*trials_page.compare(tried))
 
 

@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ddgrasp.files import atomic_write_text
+from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from deploy.trial_log import read_log
 from deploy.trials import TrialResult
 from evaluation import failure_modes, paired, wilson
-from evaluation.report.html import REPORT_HTML, contents, film, heading, page, table
+from evaluation.report import success_chart
+from evaluation.report.comparison import COMPARISON_HTML, COMPARISON_PNG
+from evaluation.report.html import REPORT_HTML, contents, film, heading, image, page, table
 from evaluation.rig_trials import TRIALS_FILE, tabulate
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
@@ -86,16 +88,20 @@ def compare(all_trials: Sequence[Trials]) -> tuple[tuple[str, ...], list[tuple[s
     return header, [*rows, (f"against {all_trials[0].folder.name}, same trials", "", *pairs)]
 
 
-def write_comparison(all_trials: Sequence[Trials], file: str) -> Path:
-    """Writes `compare` as a page into the first folder; returns its path."""
+def write_comparison(all_trials: Sequence[Trials]) -> Path:
+    """Writes `compare` as a page, and its picture, into the first folder; returns the page's path."""
     header, rows = compare(all_trials)
     verdicts = (f"<p class=verdict>{trials.folder}: {verdict(trials)}</p>" for trials in all_trials)
     note = (
         "<p class=note>Success: rate of n trials, Wilson 95 % interval. p: McNemar's test, exact; Holm: "
         "corrected for all that are set beside the first.</p>"
     )
-    body = ["<h1>Trials side by side</h1>", *verdicts, note, table(header, rows, last_bold=True)]
-    path = all_trials[0].folder / file
+    tables = {f"{i}. {trials.folder.name}": trials.table for i, trials in enumerate(all_trials, 1)}
+    picture = success_chart.draw({"": tables})
+    shown = image(picture, "success with intervals, and by object")
+    body = ["<h1>Trials side by side</h1>", *verdicts, note, table(header, rows, last_bold=True), shown]
+    path = all_trials[0].folder / COMPARISON_HTML
+    atomic_write_bytes(path.with_name(COMPARISON_PNG), picture)
     atomic_write_text(path, page("Trials side by side: DiffuDepGrasp-JAX", body))
     return path
 

@@ -4,14 +4,9 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-
-from ddgrasp import contract
 from evaluation import wilson
 from evaluation.failure_modes import MODES, NOTE
-from evaluation.report.figures import to_png
+from evaluation.report import success_chart
 from evaluation.report.html import image, page, table
 from evaluation.table2.results import describe_set
 from evaluation.table2.rows import DEPLOYED, ROWS, TABLES, TRAINING
@@ -53,7 +48,7 @@ def _p(value: float) -> str:
 def object_rows(study: Mapping[str, Any], set_of_trials: str) -> tuple[list[str], list[list[str]]]:
     """(objects, lines) of successes by object: title, then "k of n" per object."""
     tried = study["sets"][set_of_trials]["rows"]
-    names = _objects(tried)
+    names = success_chart.objects(tried)
     return names, [
         [ROWS[row].title, *(_count(made["objects"].get(name)) for name in names)]
         for row, made in tried.items()
@@ -66,12 +61,6 @@ def mode_rows(study: Mapping[str, Any], set_of_trials: str) -> list[list[str]]:
         [ROWS[row].title, *(str(sum(made["failures"].get(how, {}).values()) or "") for how in MODES)]
         for row, made in study["sets"][set_of_trials]["rows"].items()
     ]
-
-
-def _objects(tried: Mapping[str, Any]) -> list[str]:
-    order = (*contract.SEEN_OBJECTS, *contract.UNSEEN_OBJECTS)
-    found = dict.fromkeys(name for made in tried.values() for name in made["objects"])
-    return sorted(found, key=lambda name: order.index(name) if name in order else len(order))
 
 
 def _count(success: Mapping[str, Any] | None) -> str:
@@ -130,43 +119,9 @@ def _begun(tried: Mapping[str, Any]) -> list[str]:
     return names
 
 
-# --- picture -------------------------------------------------------------------------------------
-
-
 def draw(study: Mapping[str, Any]) -> bytes:
     """PNG: per set of trials, success of every row tried with its interval, and by object."""
-    sets = {name: of["rows"] for name, of in study["sets"].items() if of["rows"]}
-    tallest = max((len(rows) for rows in sets.values()), default=1)
-    figure = Figure(figsize=(14, max(1, len(sets)) * (1.6 + 0.36 * tallest)), layout="constrained")
-    for index, (name, rows) in enumerate(sets.items()):
-        bars = figure.add_subplot(len(sets), 2, 2 * index + 1)
-        _draw_bars(bars, rows)
-        bars.set_title(f"{name}: success, Wilson 95 %", fontsize=9)
-        _draw_objects(figure.add_subplot(len(sets), 2, 2 * index + 2), rows)
-    return to_png(figure)
-
-
-def _draw_bars(axes: Axes, rows: Mapping[str, Any]) -> None:
-    total = [made["all"] for made in rows.values()]
-    rates = np.array([success["rate"] for success in total])
-    whiskers = np.abs(np.array([[s["low"], s["high"]] for s in total]).T - rates)
-    places = np.arange(len(rows))
-    axes.barh(places, 100 * rates, xerr=100 * whiskers, height=0.6, color="#7a9cc6", capsize=3)
-    axes.set_yticks(places, [ROWS[name].title for name in rows], fontsize=8)
-    axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.set_xlim(0, 100)
-    axes.set_xlabel("%", fontsize=8)
-    axes.tick_params(axis="x", labelsize=8)
-
-
-def _draw_objects(axes: Axes, rows: Mapping[str, Any]) -> None:
-    names = _objects(rows)
-    rates = [[made["objects"].get(name, {}).get("rate") for name in names] for made in rows.values()]
-    values = 100 * np.array([[np.nan if rate is None else rate for rate in line] for line in rates], float)
-    axes.imshow(values, vmin=0, vmax=100, cmap="RdYlGn", aspect="auto")
-    for (i, j), value in np.ndenumerate(values):
-        if np.isfinite(value):
-            axes.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=7)
-    axes.set_xticks(np.arange(len(names)), names, rotation=60, ha="right", fontsize=8)
-    axes.set_yticks([])
-    axes.set_title("by object, %", fontsize=9)
+    tried = {name: of["rows"] for name, of in study["sets"].items()}
+    return success_chart.draw(
+        {name: {ROWS[row].title: made for row, made in rows.items()} for name, rows in tried.items()}
+    )
