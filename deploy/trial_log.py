@@ -46,9 +46,10 @@ class TrialLog:
 
 
 def read_log(path: Path) -> tuple[dict[str, Any], list[TrialResult]]:
-    """(what the trials in a log belong to, the finished ones); empty both if there is no log."""
+    """(what the trials in a log belong to, the finished ones, each once); empty both if there is no log."""
     lines = _complete_lines(path)
-    return next(lines, {}), [TrialResult(**line) for line in lines]
+    header, results = next(lines, {}), (TrialResult(**line) for line in lines)
+    return header, list({result.key: result for result in results}.values())
 
 
 def _line(value: dict[str, Any]) -> str:

@@ -34,7 +34,7 @@ def _trials(folder, outcomes, missed=0, number=0):
     """A folder as `ddgrasp deploy trials` leaves it, with a film of a success and of a failure."""
     folder.mkdir()
     results = [_result(i, name, success, missed) for i, (name, success) in enumerate(outcomes)]
-    lines = [{"policy_sha256": "", "number": number}, *map(asdict, results)]
+    lines = [{"policy_sha256": "", "rig": "development", "number": number}, *map(asdict, results)]
     (folder / TRIALS_FILE).write_text("".join(json.dumps(line) + "\n" for line in lines))
     for outcome in {result.success for result in results}:
         strip = np.random.default_rng(0).integers(0, 255, (200, 3200, 3), np.uint8)
@@ -103,6 +103,20 @@ def test_trials_open_with_success_and_show_both_kinds_of_film(trials, capsys):
     assert page.count("data:image/webp") == 2
     assert "<td>can</td><td>0.0 % of 2" in page
     assert "<td>not lifted</td><td>3</td><td>cube 1, can 2</td>" in page
+    assert "<td>trials</td><td>4, 2 of each object</td>" in page and "<td>depth</td><td>recorded</td>" in page
+
+
+def test_a_log_says_of_which_trials_it_is_and_counts_each_once(trials):
+    log = trials / TRIALS_FILE
+    header, *lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join([header, *lines, lines[1], lines[2][:20]]))  # written twice; torn
+    assert trials_page.find(trials).table["all"]["n"] == 4
+    log.write_text(
+        "".join([json.dumps({"policy_sha256": ""}) + "\n", *lines])
+    )  # a run.s last stage
+    assert trials_page.find(trials) is None
+    log.write_text(header)
+    assert trials_page.find(trials) is None
 
 
 def test_a_film_cut_short_is_named(trials):
@@ -130,5 +144,8 @@ def test_the_same_trials_are_compared_in_pairs(trials, tmp_path, capsys):
     elsewhere = _trials(tmp_path / "elsewhere", [("cube", False)], number=1)
     pair = trials_page.compare([trials_page.find(trials), trials_page.find(elsewhere)])
     assert pair[1][-1][-1] == "other trials"
+    more = _trials(tmp_path / "more", [("pear", True)] * 5)  # numbers 0 to 4 of another object
+    (*_, last) = trials_page.compare([trials_page.find(folder) for folder in (trials, other, more)])[1]
+    assert last[-2:] == ("3 won, 1 lost of 4, p 0.62", "other trials")
     with pytest.raises(UserError, match="no finished trials to set beside"):
         parse("report", [str(trials), str(tmp_path)]).run()

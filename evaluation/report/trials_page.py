@@ -15,7 +15,9 @@ from evaluation.report.html import REPORT_HTML, contents, film, heading, image, 
 from evaluation.rig_trials import TRIALS_FILE, tabulate
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
-_SAME = ("rig", "shapes", "split", "number", "seconds")
+_KINDS = ("rig", "row")
+"""The header of a log has one of them: of `deploy trials`, or of `study causes`."""
+_SAME = ("rig", "shapes", "split", "number", "seconds", "ends")
 """What two series agree on where trial i of an object is the same trial."""
 _QUALITY = 75
 """The films' WebP takes a sixth of the PNG files that they are made from."""
@@ -32,6 +34,11 @@ class Trials:
     """In the order of their numbers, not in that in which they ended."""
 
     @property
+    def name(self) -> str:
+        """The folder's."""
+        return self.folder.resolve().name
+
+    @property
     def table(self) -> dict[str, Any]:
         """See `evaluation.rig_trials.tabulate`."""
         return tabulate(self.results)
@@ -40,7 +47,9 @@ class Trials:
 def find(folder: Path) -> Trials | None:
     """The finished trials in `folder`'s log, of a series that is under way as well; None without any."""
     belong_to, results = read_log(folder / TRIALS_FILE)
-    return Trials(folder, belong_to, sorted(results, key=lambda r: r.index)) if results else None
+    if not results or not any(kind in belong_to for kind in _KINDS):
+        return None
+    return Trials(folder, belong_to, sorted(results, key=lambda r: r.index))
 
 
 def verdict(trials: Trials) -> str:
@@ -56,7 +65,7 @@ def write(trials: Trials) -> Path:
     """Writes the page into the trials' folder; returns its path."""
     bad = trials.table["faults"] or any(result.missed_deadlines for result in trials.results)
     body = [
-        f"<h1>Trials <code>{trials.folder.name}</code></h1>",
+        f"<h1>Trials <code>{trials.name}</code></h1>",
         f"<p class={'missed' if bad else 'verdict'}>{verdict(trials)}</p>",
         contents(_SECTIONS),
         heading(_SECTIONS[0]),
@@ -69,10 +78,10 @@ def write(trials: Trials) -> Path:
         heading(_SECTIONS[2]),
         *_films(trials.folder, "success"),
         heading(_SECTIONS[3]),
-        table(("setting", "value"), [(k, str(v)) for k, v in trials.belong_to.items()]),
+        table(("setting", "value"), _settings(trials)),
     ]
     path = trials.folder / REPORT_HTML
-    atomic_write_text(path, page(f"Trials {trials.folder.name}: DiffuDepGrasp-JAX", body))
+    atomic_write_text(path, page(f"Trials {trials.name}: DiffuDepGrasp-JAX", body))
     return path
 
 
@@ -85,7 +94,7 @@ def compare(all_trials: Sequence[Trials]) -> tuple[tuple[str, ...], list[tuple[s
     names = dict.fromkeys(name for column in rates for name in column)
     rows = [(name, *(column.get(name, "") for column in rates)) for name in names]
     pairs = _pairs(all_trials[0], all_trials[1:])
-    return header, [*rows, (f"against {all_trials[0].folder.name}, same trials", "", *pairs)]
+    return header, [*rows, (f"against {all_trials[0].folder}, same trials", "", *pairs)]
 
 
 def write_comparison(all_trials: Sequence[Trials]) -> Path:
@@ -96,7 +105,7 @@ def write_comparison(all_trials: Sequence[Trials]) -> Path:
         "<p class=note>Success: rate of n trials, Wilson 95 % interval. p: McNemar's test, exact; Holm: "
         "corrected for all that are set beside the first.</p>"
     )
-    tables = {f"{i}. {trials.folder.name}": trials.table for i, trials in enumerate(all_trials, 1)}
+    tables = {f"{i}. {trials.name}": trials.table for i, trials in enumerate(all_trials, 1)}
     picture = success_chart.draw({"": tables})
     shown = image(picture, "success with intervals, and by object")
     body = ["<h1>Trials side by side</h1>", *verdicts, note, table(header, rows, last_bold=True), shown]
@@ -111,6 +120,14 @@ def _rows(made: dict[str, Any]) -> list[tuple[str, str]]:
     return [(name, wilson.describe(row)) for name, row in {**made["objects"], **groups}.items()]
 
 
+def _settings(trials: Trials) -> list[tuple[str, str]]:
+    counts = sorted(success["n"] for success in trials.table["objects"].values())
+    fewest, most = counts[0], counts[-1]
+    each = f"{most} of each object" if fewest == most else f"{fewest} to {most} of an object"
+    said = {"trials": f"{sum(counts)}, {each}", "depth": "recorded"} | trials.belong_to
+    return [(name, str(value)) for name, value in said.items()]
+
+
 def _outcomes(trials: Trials) -> dict[tuple[int, str], bool]:
     return {(r.index, r.object_name): r.success for r in trials.results if not r.realtime}
 
@@ -118,16 +135,17 @@ def _outcomes(trials: Trials) -> dict[tuple[int, str], bool]:
 def _pairs(first: Trials, others: Sequence[Trials]) -> list[str]:
     """A cell for each of `others`."""
     made = [_compared(first, other) for other in others]
-    adjusted = iter(paired.holm([pair["p"] for pair in made if pair]))
-    several = len(made) > 1
-    return [_pair(pair, next(adjusted) if several else None) if pair else "other trials" for pair in made]
+    adjusted = paired.holm([pair["p"] for pair in made if pair])
+    holm = iter(adjusted if len(adjusted) > 1 else [None] * len(adjusted))
+    return [_pair(pair, next(holm)) if pair else "other trials" for pair in made]
 
 
 def _compared(first: Trials, other: Trials) -> dict[str, Any] | None:
-    """None for trials of two kinds."""
+    """None for trials of two kinds, or without one in common."""
     if any(first.belong_to.get(key) != other.belong_to.get(key) for key in _SAME):
         return None
-    return paired.compared(_outcomes(first), _outcomes(other))
+    pair = paired.compared(_outcomes(first), _outcomes(other))
+    return pair if pair["n"] else None
 
 
 def _pair(made: Mapping[str, Any], p_holm: float | None) -> str:

@@ -98,8 +98,8 @@ def _set(folder: Path) -> dict[str, Any]:
 def _outdated(folder: Path, row: str, belong_to: Mapping[str, Any]) -> bool:
     """Whether a log's trials were run with another policy than the row's student is now."""
     policy = folder.parent.parent / STUDENTS / ROWS[row].student / "export" / POLICY_FILE
-    made = belong_to["policy_sha256"]
-    return policy.is_file() and made != hashlib.sha256(policy.read_bytes()).hexdigest()
+    made = belong_to.get("policy_sha256")
+    return made is not None and policy.is_file() and made != hashlib.sha256(policy.read_bytes()).hexdigest()
 
 
 def compare(table: Table, tried: Mapping[str, Sequence[TrialResult]]) -> list[dict[str, Any]]:
