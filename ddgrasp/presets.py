@@ -250,7 +250,7 @@ encoder: ResNet-18 from random numbers, where the paper's starts from ImageNet's
     (--student.encoder.weights weights/resnet18); its last stage keeps stride 16, and keypoints pool it.
 student: sees relief over the table instead of depth, its holes filled from around them, and has a hand view,
     privileged losses and DAgger, which the paper has not: perception to 5 mm is what decides whether it
-    grasps (docs/student.md).
+    grasps (docs/student_log.md).
 crops: shifted by up to 12 pixels around the window's place, since the camera's place is known here.
 teacher: networks, number of environments and steps are not in the paper; ours for its 95 %. Half of the
     episodes begin above the object and a fifth with it in the hand, and the reward is ours; the paper's own
