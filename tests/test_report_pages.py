@@ -111,7 +111,7 @@ def test_a_log_says_of_which_trials_it_is_and_counts_each_once(trials):
     header, *lines = log.read_text().splitlines(keepends=True)
     log.write_text("".join([header, *lines, lines[1], lines[2][:20]]))  # written twice; torn
     assert trials_page.find(trials).table["all"]["n"] == 4
-    log.write_text("".join([json.dumps({"policy_sha256": ""}) + "\n", *lines]))  # a run.s last stage
+    log.write_text("".join([json.dumps({"policy_sha256": ""}) + "\n", *lines]))  # a run's last stage
     assert trials_page.find(trials) is None
     log.write_text(header)
     assert trials_page.find(trials) is None

@@ -22,7 +22,7 @@ def draw(sets: Mapping[str, Rows]) -> bytes:
     for index, (name, rows) in enumerate(sets.items()):
         bars = figure.add_subplot(len(sets), 2, 2 * index + 1)
         _draw_bars(bars, rows)
-        bars.set_title(f"{name}: success, Wilson 95 %".removeprefix(": "), fontsize=9)
+        bars.set_title(f"{name}: success, Wilson 95 %", fontsize=9)
         _draw_objects(figure.add_subplot(len(sets), 2, 2 * index + 2), rows)
     return to_png(figure)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from evaluation.report import success_chart
 from evaluation.report.comparison import COMPARISON_HTML, COMPARISON_PNG
 from evaluation.report.html import REPORT_HTML, contents, film, heading, image, page, table
 from evaluation.rig_trials import TRIALS_FILE, tabulate
+from evaluation.treatments import RECORDED
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
 _KINDS = ("rig", "row")
@@ -38,7 +40,7 @@ class Trials:
         """The folder's."""
         return self.folder.resolve().name
 
-    @property
+    @cached_property
     def table(self) -> dict[str, Any]:
         """See `evaluation.rig_trials.tabulate`."""
         return tabulate(self.results)
@@ -106,7 +108,7 @@ def write_comparison(all_trials: Sequence[Trials]) -> Path:
         "corrected for all that are set beside the first.</p>"
     )
     tables = {f"{i}. {trials.name}": trials.table for i, trials in enumerate(all_trials, 1)}
-    picture = success_chart.draw({"": tables})
+    picture = success_chart.draw({"trials": tables})
     shown = image(picture, "success with intervals, and by object")
     body = ["<h1>Trials side by side</h1>", *verdicts, note, table(header, rows, last_bold=True), shown]
     path = all_trials[0].folder / COMPARISON_HTML
@@ -124,8 +126,10 @@ def _settings(trials: Trials) -> list[tuple[str, str]]:
     counts = sorted(success["n"] for success in trials.table["objects"].values())
     fewest, most = counts[0], counts[-1]
     each = f"{most} of each object" if fewest == most else f"{fewest} to {most} of an object"
-    said = {"trials": f"{sum(counts)}, {each}", "depth": "recorded"} | trials.belong_to
-    return [(name, str(value)) for name, value in said.items()]
+    said = {"trials": f"{sum(counts)}, {each}"}
+    if "rig" in trials.belong_to:
+        said["depth"] = RECORDED  # what the header leaves out
+    return [(name, str(value)) for name, value in (said | trials.belong_to).items()]
 
 
 def _outcomes(trials: Trials) -> dict[tuple[int, str], bool]:
