@@ -11,6 +11,7 @@ It works in `job.directory` and ends with `job.finish`. Modules are imported whe
 import errno
 import gc
 import importlib
+import os
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -50,10 +51,12 @@ def run(
 
 
 def check_place(run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES) -> None:
-    """UserError if `run_dir` cannot hold a run, or holds one and `resume` is off."""
+    """UserError if `run_dir` is or lies below a file, or holds a run and `resume` is off. Writes nothing."""
     if not resume:
         _refuse_occupied(run_dir, [stage.name for stage in stages])
-    _create(run_dir / stages[0].name)
+    place = run_dir.absolute()
+    if not next(path for path in (place, *place.parents) if path.exists()).is_dir():
+        raise _no_place(run_dir / stages[0].name, errno.ENOTDIR)
 
 
 def make(
@@ -117,7 +120,11 @@ def _create(directory: Path) -> None:
     except OSError as error:
         if error.errno not in _NO_SUCH_PLACE:
             raise
-        raise UserError(f"{directory} cannot be created ({error.strerror}): choose another --out.") from None
+        raise _no_place(directory, error.errno) from None
+
+
+def _no_place(directory: Path, number: int) -> UserError:
+    return UserError(f"{directory} cannot be created ({os.strerror(number)}): choose another --out.")
 
 
 def _refuse_occupied(run_dir: Path, names: Sequence[str]) -> None:

@@ -26,8 +26,6 @@ SENSORS: dict[Sensor, Callable[[SensorConfig, CameraProfile], Sense]] = {
     "learned": lambda config, profile: learned(_fitted(config.learned_from)),
 }
 """Every camera model that a configuration can name."""
-BY_COLOUR = ("stereo",)
-"""Those that tell materials by colour."""
 
 
 def make_sensor(config: SensorConfig, profile: CameraProfile) -> Sense:

@@ -18,19 +18,17 @@ from jaxtyping import Int, Key, UInt8, UInt16
 
 from ddg_jax.generate import Clip, by_frames, made_mm, noisy_episodes
 from ddg_jax.monocular import MonocularDepth
-from ddg_jax.prior import Prior
 from ddg_jax.sample import Generator, generate
-from ddg_jax.sensor import BY_COLOUR, make_sensor
-from ddgrasp.config import Config, SensorConfig
+from ddg_jax.sensor import make_sensor
+from ddgrasp.config import BY_COLOUR, Config, SensorConfig
 from ddgrasp.depth import to_metres, to_millimetres
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
 from mjx_envs.views import Views
 from sensors.models.sense import Sense
 from student_jax.rig_source import RigSource
+from student_jax.source_check import LEARNED
 
-LEARNED = ("learned", "learned_ungrafted")
-"""Sources that are the run's generator."""
 VIEWED = ("variant", "size", "T_world_cam")
 """What demos say of each episode that its pictures are of (`mjx_envs.views.Views`)."""
 _BATCH = 16
@@ -201,22 +199,6 @@ def make_source(config: Config, ddg: Path) -> DepthSource:
         return RigSource(config)
     sensor = SensorConfig(name=name, stereo=config.record.stereo)
     return SenseSource(make_sensor(sensor, config.world.profile), key, name in BY_COLOUR)
-
-
-def check_source(config: Config, prior: Prior) -> None:
-    """UserError if the source's weights are missing, or the demos will lack the colour that it needs.
-
-    `prior` is the generator's.
-    """
-    name = config.student.depth_source
-    if name == "monocular":
-        MonocularDepth(config.ddg)
-    needs_rgb = prior.needs_sim_rgb if name in LEARNED else name in (*BY_COLOUR, "monocular")
-    if needs_rgb and not config.demos.rgb:
-        raise UserError(
-            f"student.depth_source {name!r} needs colour in the demos, and demos.rgb is false: add "
-            "--demos.rgb, or take another source."
-        )
 
 
 def check_demos(source: DepthSource, demos: EpisodeStore) -> None:

@@ -18,7 +18,8 @@ from demos.rollout import Scene
 from evaluation.treatments import Monocular, make_treatment
 from foundation import convert, store
 from student_jax.act import SourceCamera
-from student_jax.depth_source import GeneratorSource, MonocularSource, check_source
+from student_jax.depth_source import GeneratorSource, MonocularSource
+from student_jax.source_check import check_source
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +167,7 @@ def test_monocular_depth_without_weights_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "WEIGHTS_DIR", tmp_path)
     settings = Config(preset="test", student=StudentConfig(depth_source="monocular"))
     for ask in (
-        lambda: check_source(settings, InverseDepthPrior(settings.ddg)),
+        lambda: check_source(settings),
         lambda: make_treatment("monocular", settings),
     ):
         with pytest.raises(UserError, match="depth_anything_v2_small holds no converted weights: get a file"):

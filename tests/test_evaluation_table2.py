@@ -306,7 +306,8 @@ def test_a_study_is_continued_only_with_its_own_configuration(tmp_path):
 
     first = command("--out", str(tmp_path), "--rows", "ddg").planned()
     table2.check_place(first, resume=False)
-    (tmp_path / "shared" / "teacher" / "params").write_text("begun")
+    (begun := tmp_path / "shared" / "teacher").mkdir(parents=True)
+    (begun / "params").write_text("begun")
     with pytest.raises(UserError, match="holds an unfinished stage: continue with --resume"):
         table2.check_place(first, resume=False)
     more = command("--out", str(tmp_path), "--rows", "sim_gt", "--trials", "99", "--workers", "1").planned()

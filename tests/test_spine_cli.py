@@ -84,39 +84,59 @@ def test_version_names_the_libraries():
     assert "mujoco 3.17." in ddgrasp("--version").stdout
 
 
-@pytest.mark.parametrize(
-    ("args", "expected"),
-    [
-        (("run", "--preset", "dmo"), "Unknown preset 'dmo'. Did you mean 'demo'?"),
-        (("tacher", "train"), "Unknown command 'tacher'. Did you mean 'teacher'?"),
-        (("teacher", "trian"), "Unknown command 'teacher trian'. Did you mean 'teacher train'?"),
-        (("run", "--world.objects", "cube", "aple"), "Unknown object 'aple'. Did you mean 'apple'?"),
-        (("report", "nowhere"), "nowhere holds no finished stage"),
-        (
-            ("run", "--out", "README.md"),
-            "README.md/teacher cannot be created (Not a directory): choose another",
-        ),
-        (("teacher", "train", "--out", "README.md/a"), "README.md/a/teacher cannot be created (Not a"),
-        (("teacher", "train", "--out", "/proc/a"), "/proc/a/teacher cannot be created (No such file or"),
-        (("run", "--demos.episodes", "0"), "demos.episodes is 0; expected at least 1."),
-        (("teacher", "eval", "nowhere", "--trials", "0"), "--trials is 0; expected at least 1."),
-        (("student", "eval", "nowhere", "--trials", "-1"), "--trials is -1; expected at least 1."),
-        (
-            ("ddg", "sample", "--model", "x", "--data", "x", "--count", "0"),
-            "--count is 0; expected at least 1.",
-        ),
-        (
-            ("export", "--export.depth-dtype", "uint8"),
-            "Unknown export.depth_dtype 'uint8'. Known: float32_m",
-        ),
-        (("demos", "collect", "--out", "nowhere"), "nowhere has no finished stage 'teacher': run it first"),
-    ],
-)
+WRONG = [
+    (("run", "--preset", "dmo"), "Unknown preset 'dmo'. Did you mean 'demo'?"),
+    (("tacher", "train"), "Unknown command 'tacher'. Did you mean 'teacher'?"),
+    (("teacher", "trian"), "Unknown command 'teacher trian'. Did you mean 'teacher train'?"),
+    (("run", "--world.objects", "cube", "aple"), "Unknown object 'aple'. Did you mean 'apple'?"),
+    (("report", "nowhere"), "nowhere holds no finished stage"),
+    (
+        ("run", "--out", "README.md"),
+        "README.md/teacher cannot be created (Not a directory): choose another",
+    ),
+    (("teacher", "train", "--out", "README.md/a"), "README.md/a/teacher cannot be created (Not a"),
+    (("teacher", "train", "--out", "/proc/a"), "/proc/a/teacher cannot be created (No such file or"),
+    (("run", "--demos.episodes", "0"), "demos.episodes is 0; expected at least 1."),
+    (("teacher", "eval", "nowhere", "--trials", "0"), "--trials is 0; expected at least 1."),
+    (("student", "eval", "nowhere", "--trials", "-1"), "--trials is -1; expected at least 1."),
+    (
+        ("ddg", "sample", "--model", "x", "--data", "x", "--count", "0"),
+        "--count is 0; expected at least 1.",
+    ),
+    (
+        ("export", "--export.depth-dtype", "uint8"),
+        "Unknown export.depth_dtype 'uint8'. Known: float32_m",
+    ),
+    (("demos", "collect", "--out", "nowhere"), "nowhere has no finished stage 'teacher': run it first"),
+    (("teacher", "eval", "nowhere"), "nowhere/teacher holds no finished artifact"),
+    (("student", "eval", "nowhere"), "nowhere/student holds no finished artifact"),
+    (
+        ("study", "table2", "--out", "README.md"),
+        "README.md/shared/teacher cannot be created (Not a directory)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("args", "expected"), WRONG)
 def test_wrong_input_gets_one_line_and_status_2(args, expected):
     result = ddgrasp(*args)
     assert result.returncode == 2
     assert expected in _one_error_line(result)
     assert not (ROOT / "nowhere").exists()
+
+
+def test_wrong_input_is_told_before_jax_is_imported():
+    """JAX and MJX take as many seconds as a person waits for the line."""
+    of_the_system = ("teacher", "train", "--out", "/proc/a")  # told when the folder is made
+    given = [args for args, _ in WRONG if args != of_the_system]
+    code = f"""
+import sys
+from app.cli import main
+print([main(args) for args in {given}])
+print({{"jax", "mujoco.mjx"}} & set(sys.modules) or "NOTHING HEAVY")
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.stdout.splitlines() == [str([2] * len(given)), "NOTHING HEAVY"], done.stderr
 
 
 def test_an_out_that_is_a_file_gets_one_line_from_other_commands(tmp_path):

@@ -10,9 +10,10 @@ import pytest
 from app.commands.checks import check_config_values
 from ddg_jax import generate, sample, train
 from ddg_jax.prior import make_prior
-from ddg_jax.sensor import BY_COLOUR, SENSORS
+from ddg_jax.sensor import SENSORS
 from ddgrasp import artifacts, config, contract, upgrades
 from ddgrasp.config import (
+    BY_COLOUR,
     Config,
     DDGConfig,
     DDGDepthConfig,

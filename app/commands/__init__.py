@@ -42,13 +42,13 @@ class Run(FromPreset):
 
     def run(self) -> None:
         """Says what memory the stages will take, makes those that are not finished, prints the table."""
-        from evaluation.report.summary import print_summary
-
         check_config_values(self.config)
-        check_devices(self.config, self.out)
         pipeline.check_place(self.out, resume=self.resume)
+        check_devices(self.config, self.out)
         print(*check_networks(self.config, self.out), sep="\n", file=sys.stderr, flush=True)
         report = pipeline.run(self.config, self.out, resume=self.resume)
+        from evaluation.report.summary import print_summary
+
         print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
         print_summary(report)
 

@@ -41,8 +41,7 @@ def _is_stated(kind: Any) -> bool:
 def check_config_values(config: Config) -> Config:
     """`config` if the names and files in it exist; UserError with the remedy otherwise."""
     from ddg_jax import start
-    from ddg_jax.prior import make_prior
-    from student_jax.depth_source import check_source
+    from student_jax.source_check import check_source
 
     check_objects(config.world)
     for stage in ("ddg", "student"):
@@ -51,7 +50,7 @@ def check_config_values(config: Config) -> Config:
         start.check(config.ddg)
     if config.teacher.starts_from_file:
         _check_start("teacher", "teacher.start", config.teacher.start, "nothing, guide, or ")
-    check_source(config, make_prior(config.ddg))
+    check_source(config)
     if config.student.encoder.weights:
         from student_jax import pretrained_encoder
 

@@ -35,6 +35,7 @@ class StudentEval:
 
     def run(self) -> None:
         """Prints success on clean and on generated depth, with Wilson intervals, and perception's error."""
+        config = load_config(self.run_dir, "student")
         from ddgrasp.progress import Progress
         from evaluation import wilson
         from learning.params import load_params
@@ -43,7 +44,6 @@ class StudentEval:
         from student_jax.evaluate import closed_loop
         from student_jax.policy import PARAMS_FILE
 
-        config = load_config(self.run_dir, "student")
         evaluation = replace(config.evaluation, student_trials=self.trials)
         config = replace(config, seed=self.seed, evaluation=evaluation)
         params = load_params(self.run_dir / "student" / PARAMS_FILE)
@@ -73,11 +73,11 @@ class StudentPerception:
 
     def run(self) -> None:
         """Runs the trials and prints a row for each part of them."""
+        config = load_config(self.run_dir, "export")
         from ddgrasp.progress import Progress
         from evaluation import perception, perception_table
         from evaluation.rig_trials import Series
 
-        config = load_config(self.run_dir, "export")
         series = Series("development", self.objects, self.trials, number=self.number, camera=self.camera)
         progress = Progress(name="student perception")
         rows = perception.measure(config, self.run_dir, series, progress)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from app import extras
+from app import extras, pipeline
 from app.commands.base import FromPreset
 from app.commands.checks import check_config_values, check_devices, check_networks
 from ddgrasp import artifacts, contract
@@ -56,6 +56,7 @@ class StudyTable2(FromPreset):
         from app import table2
         from evaluation.table2 import page, results
 
+        pipeline.check_place(self.out / results.SHARED, resume=self.resume)
         study = self.planned()
         table2.check_place(study, self.resume)
         if not results.has_students(self.out, study.rows):
@@ -129,15 +130,16 @@ class StudyCauses:
 
 
 def _check_row(config: Config, name: str, shared: Path) -> None:
-    from demos.stage import STORE
-    from demos.store import EpisodeStore
     from evaluation.table2.rows import ROWS, row_config
     from evaluation.treatments import make_treatment
-    from student_jax.depth_source import check_views
 
     check_config_values(row_config(config, ROWS[name]))
     make_treatment(ROWS[name].depth, config)
     if ROWS[name].source == "rig" and artifacts.is_finished(shared / "demos"):
+        from demos.stage import STORE
+        from demos.store import EpisodeStore
+        from student_jax.depth_source import check_views
+
         check_views(EpisodeStore(shared / "demos" / STORE))
 
 

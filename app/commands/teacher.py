@@ -29,12 +29,13 @@ class TeacherTrain(OneStage):
 
     def run(self) -> None:
         """Trains with every process that --hosts names."""
+        stage = get_stage(self.stage)
+        check_config_values(self.config)
+        pipeline.check_place(self.out, resume=self.resume, stages=[stage])
         from ppo import hosts
 
         hosts.connect(self.hosts)
-        check_config_values(self.config)
         check_devices(self.config, self.out)
-        stage = get_stage(self.stage)
         pipeline.make(stage, self.config, self.out, resume=self.resume, leads=hosts.leads())
 
 
@@ -57,6 +58,9 @@ class TeacherEval:
 
     def run(self) -> None:
         """Runs the trials, prints a row per object, keeps figures and pictures."""
+        check_objects(self.world)
+        directory = self.run_dir / "teacher"
+        teacher = artifacts.read_artifact(directory).hash
         from ddgrasp.progress import Progress
         from evaluation import teacher_trials
         from mjx_envs.grasp_env import GraspEnv
@@ -64,9 +68,6 @@ class TeacherEval:
         from ppo.policy import load_policy
         from ppo.visible import MOMENTS
 
-        check_objects(self.world)
-        directory = self.run_dir / "teacher"
-        teacher = artifacts.read_artifact(directory).hash
         env, policy = GraspEnv(self.world), load_policy(directory)
         progress = Progress(name="teacher eval")
         result, pictures = trials.measure(env, policy, self.trials, self.watched, self.seed, progress)

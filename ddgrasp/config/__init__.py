@@ -60,7 +60,15 @@ from ddgrasp.config.export import DEPTH_DTYPES, DepthDtype, ExportConfig
 from ddgrasp.config.features import DepthFeatureConfig
 from ddgrasp.config.record import RecordConfig
 from ddgrasp.config.score import SCORE_COLUMNS, SCORE_FEATURES, ScoreConfig
-from ddgrasp.config.sensors import SENSORS, DextrahConfig, KinectConfig, Sensor, SensorConfig, StereoConfig
+from ddgrasp.config.sensors import (
+    BY_COLOUR,
+    SENSORS,
+    DextrahConfig,
+    KinectConfig,
+    Sensor,
+    SensorConfig,
+    StereoConfig,
+)
 from ddgrasp.config.student import (
     CHANNELS,
     GROUP_CHANNELS,
@@ -151,6 +159,7 @@ __all__ = [
     "Renderer",
     "Backend",
     "CHANNELS",
+    "BY_COLOUR",
     "CROSS_ENTROPY",
     "CameraScale",
     "Config",

@@ -8,6 +8,8 @@ from ddgrasp.config.checks import Range, Section, Seed, Share, Text
 
 Sensor = Literal["ideal", "dextrah", "kinect", "stereo", "learned"]
 SENSORS: tuple[Sensor, ...] = get_args(Sensor)
+BY_COLOUR: tuple[Sensor, ...] = ("stereo",)
+"""Those that tell materials by colour."""
 _Window = Annotated[int, Range(1, 255)]
 """Side of a window in pixels."""
 
