@@ -11,7 +11,7 @@ callback, MJX-Warp a foreign kernel), the renderer the project's own.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -61,13 +61,20 @@ def _on_jax(config: Config) -> Config:
     return replace(config, world=replace(config.world, backend="jax", renderer="jax"))
 
 
+@cache
 def _training_env(config: Config) -> AutoReset:
     return AutoReset(GraspEnv(train.training_world(_on_jax(config))), devices.make_mesh())
 
 
+@cache
+def _ppo(config: Config) -> dict[str, Program]:
+    """All parts: each is traced for the shapes of the next."""
+    return train.programs(config, _training_env(config))
+
+
 def ppo(piece: str, config: Config) -> Program:
     """A part of an iteration of PPO, by its name in `ppo.train.programs`."""
-    return train.programs(config, _training_env(config))[piece]
+    return _ppo(config)[piece]
 
 
 def control_step(config: Config) -> Program:
