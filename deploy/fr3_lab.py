@@ -97,10 +97,12 @@ class PlacingRobot(FrankaRobot):
 
 
 def lab_config(config: DeployConfig, host: str, contact: float) -> DeployConfig:
-    """`config` for the rig at `host`, which stops itself at `contact` newtons and newton metres."""
+    """`config` for the rig at `host`, which stops itself at `contact` newtons at the hand, and at a torque
+    on a joint that is to it as the configured ones are to each other."""
+    torque_nm = contact * config.franka.contact_torque_nm / config.franka.contact_force_n
     franka = replace(
         config.franka, host=host, model="fr3", kernel="any", dynamics=DYNAMICS,
-        start_dynamics=START_DYNAMICS, contact_force_n=contact, contact_torque_nm=contact,
+        start_dynamics=START_DYNAMICS, contact_force_n=contact, contact_torque_nm=torque_nm,
     )  # fmt: skip
     return replace(config, clock="robot", franka=franka)
 

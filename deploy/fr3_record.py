@@ -6,7 +6,7 @@ else in every trajectory. What is kept is what the development rig's recordings 
 """
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +33,7 @@ from sensors.recordings.recording import Recording, RecordingWriter, is_recordin
 
 SETTINGS_FILE = "record.json"
 CONTACT = 100.0
-"""Newtons and newton metres at which the arm stops itself."""
+"""Newtons at the hand at which the arm stops itself (`lab_config`)."""
 _STREAM = 0x526563
 """Keeps these random numbers apart from every other stage's ("Rec")."""
 
@@ -127,6 +127,7 @@ def _take(config: Config, takes: Takes, lab: Fr3Lab, index: int, path: Path) -> 
     name, profile = names[index % len(names)], config.world.profile
     rig = lab.with_object(name, draw.clutter_seed)
     settings, clock = lab_config(config.deploy, rig.host, CONTACT), RobotClock()
+    settings = replace(settings, franka=replace(settings.franka, approach_below_m=0.0))  # the way is known
     robot = PlacingRobot(settings.franka, clock, rig.channel, draw.place)
     info = policy_metadata.describe(config.student, config.export, profile)
     safety = safety_filter(settings, info, "franka")

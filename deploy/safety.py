@@ -4,6 +4,7 @@ A policy is a learned function; nothing it says is trusted. The filter is pure a
 measured joints, so it holds for any robot driver and in simulation alike.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -40,6 +41,10 @@ class SafetyLimits:
     arm_lower_m: tuple[float, float, float] = (-0.55, -0.80, 0.0)
     arm_upper_m: tuple[float, float, float] = (0.95, 0.80, 1.30)
     """Box that elbow, forearm, wrist and hand stay inside: table and walls."""
+    approach_below_m: float = 0.0
+    """Below this height the grip point comes down slowly: the hand may land on something."""
+    approach_m_s: float = math.inf
+    """How fast it may come down there."""
     period_s: float = contract.CONTROL_DT_S
 
 
@@ -52,7 +57,10 @@ class SafetyCounts:
 
     def as_dict(self) -> dict[str, int]:
         """Commands in all, and how many were changed for which cause."""
-        causes = ("action", "joint_position", "joint_velocity", "joint_acceleration", "workspace", "arm")
+        causes = (
+            "action", "joint_position", "joint_velocity", "joint_acceleration", "approach",
+            "workspace", "arm",
+        )  # fmt: skip
         return {"commands": self.commands} | {cause: self.by_cause[cause] for cause in causes}
 
 
@@ -124,11 +132,20 @@ class SafetyFilter:
         # All joints alike: the hand goes where it was told to, more slowly.
         slower = min(1.0, float((largest / np.maximum(np.abs(step), 1e-9)).min()))
         step = self._noted(step if slower == 1.0 else slower * step, step, "joint_velocity", causes)
+        step = self._noted(self._gently_down(q_rad, step), step, "approach", causes)
         # A joint measured outside its range may only come back, and no faster than the limit above.
         room_down = np.minimum(np.array(limits.lower_rad) - q_rad, largest)
         room_up = np.maximum(np.array(limits.upper_rad) - q_rad, -largest)
         room_down, room_up = -self._braked(-room_down), self._braked(room_up)
         return self._noted(np.clip(step, room_down, room_up), step, "joint_position", causes)
+
+    def _gently_down(self, q_rad: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """(7,) `step`, shortened so that the grip point comes down no faster than it may where it is low."""
+        here_m, there_m = kinematics.grip_position(q_rad)[2], kinematics.grip_position(q_rad + step)[2]
+        way_m = self.limits.approach_m_s * self.limits.period_s
+        if there_m >= self.limits.approach_below_m or here_m - there_m <= way_m:
+            return step
+        return step * way_m / (here_m - there_m)
 
     def _braked(self, room_rad: np.ndarray) -> np.ndarray:
         """(7,) the longest step towards a limit `room_rad` (7,) away after which the joint can still stop.

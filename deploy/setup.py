@@ -36,6 +36,8 @@ def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim"
         workspace_upper_m=config.workspace_upper_m,
         arm_lower_m=config.arm_lower_m,
         arm_upper_m=config.arm_upper_m,
+        approach_below_m=config.franka.approach_below_m if robot == "franka" else 0.0,
+        approach_m_s=config.franka.approach_m_s,
         period_s=1.0 / info.control_hz,
     )
     return SafetyFilter(limits, info.action_scale_rad)

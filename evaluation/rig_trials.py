@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ddgrasp import artifacts, contract
-from ddgrasp.config import Config
+from ddgrasp.config import Config, FrankaConfig
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from ddgrasp.progress import Progress
@@ -53,8 +53,8 @@ class Series:
 
     seconds: float = contract.TRIAL_S
     """A trial ends with success, or after this."""
-    contact: float = 100.0
-    """On rig fr3: newtons at the hand, and newton metres, at which the arm stops itself."""
+    contact: float = FrankaConfig.contact_force_n
+    """On rig fr3: newtons at the hand at which the arm stops itself."""
 
     depth: TreatmentName = RECORDED
     """What the policy sees: depth as recorded, inpaint (holes filled on line), or monocular (a network on

@@ -32,7 +32,7 @@ from deploy.devices.franka_robot import AT_START_RAD, FrankaRobot
 from deploy.devices.options import SessionOptions
 from deploy.dry_run import DryRun, draw
 from deploy.interfaces import RobotError
-from deploy.kinematics import grip_pose
+from deploy.kinematics import grip_pose, grip_position
 from deploy.loop import ControlLoop, LoopReport, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.session import ask_person, deploy
@@ -70,6 +70,11 @@ def rig(rigs, request):
 def config_for(host: str, **changes) -> DeployConfig:
     config = DeployConfig(clock="robot", **changes)
     return replace(config, franka=replace(config.franka, host=host, kernel="any", dynamics=1.0))
+
+
+def at_full_speed(config: DeployConfig) -> DeployConfig:
+    """Wherever the hand is."""
+    return replace(config, franka=replace(config.franka, approach_below_m=0.0))
 
 
 def connect(config: DeployConfig, confirm=None) -> tuple[FrankaRobot, RobotClock]:
@@ -135,7 +140,7 @@ def test_a_trial_moves_the_arm_at_10_hz_of_its_own_time(tmp_path, rig):
 
 def test_reflex_from_hitting_the_table_ends_the_trial_in_one_line(tmp_path, rig):
     said = []
-    wrong_floor = config_for(HOST, workspace_lower_m=BELOW_THE_TABLE)
+    wrong_floor = at_full_speed(config_for(HOST, workspace_lower_m=BELOW_THE_TABLE))
     report = run_trial(tmp_path, wrong_floor, joint_bias(j2=1.0, j4=0.2), steps=40, say=said.append)
     assert "_reflex (it met something" in report.fault and "recovered, the arm stands" in report.fault
     assert report.steps < 40 and [event.kind for event in report.events] == ["fault"]
@@ -144,6 +149,15 @@ def test_reflex_from_hitting_the_table_ends_the_trial_in_one_line(tmp_path, rig)
     assert stands(rig) and rig.channel.ask("state")["error"] is None
     up = run_trial(tmp_path, config_for(HOST), joint_bias(j2=-1.0), steps=6)
     assert up.fault == ""
+
+
+def test_a_hand_that_comes_down_slowly_comes_to_stand_on_the_table(tmp_path, rig):
+    """What ends the trial above, at the speed that an arm has by default."""
+    wrong_floor = config_for(HOST, workspace_lower_m=BELOW_THE_TABLE)
+    report = run_trial(tmp_path, wrong_floor, joint_bias(j2=1.0, j4=0.2), steps=50)
+    assert report.fault == "" and report.steps == 50
+    assert report.safety.by_cause["approach"] > 15
+    assert grip_position(np.array(rig.channel.ask("state")["q_rad"]))[2] < 0.02
 
 
 def test_lost_connection_ends_the_trial_and_the_next_one_runs_when_it_is_back(tmp_path, rig):
@@ -294,7 +308,7 @@ def test_limits_are_the_fr3_s_and_the_filter_keeps_them_before_the_arm_would(tmp
     near = HOME_RAD.copy()
     near[3] = contract.FR3.joint_lower_rad[3] + 0.35
     with Fr3Rig("127.0.0.14", primitive("cube"), q_rad=near) as rig:
-        config = config_for(rig.host)
+        config = at_full_speed(config_for(rig.host))
         report = run_trial(tmp_path, config, joint_bias(j4=-1.0), steps=15)
         assert report.fault == "" and report.safety.by_cause["joint_position"] >= 10
         assert rig.channel.ask("state")["q_rad"][3] < contract.FR3.joint_lower_rad[3] + 0.06

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ddgrasp import contract
+from ddgrasp import contract, policy_metadata
+from ddgrasp.presets import get_preset
 from deploy import kinematics
 from deploy.safety import NonFiniteAction, SafetyFilter, SafetyLimits
+from deploy.setup import safety_filter
 from mjx_envs.scene import HOME_RAD
 
 HOME = np.array(HOME_RAD)
@@ -32,7 +34,7 @@ def test_harmless_action_passes_unchanged():
     assert close and causes == []
     assert filter_.counts.as_dict() == {
         "commands": 1, "action": 0, "joint_position": 0, "joint_velocity": 0, "joint_acceleration": 0,
-        "workspace": 0, "arm": 0,
+        "approach": 0, "workspace": 0, "arm": 0,
     }  # fmt: skip
 
 
@@ -68,6 +70,41 @@ def test_acceleration_limit_from_rest_and_on_reversal():
     filter_.stopped()
     assert filter_.target(HOME, action(-1.0))[0][0] - HOME[0] == pytest.approx(-0.05)
     assert filter_.counts.by_cause["joint_acceleration"] == 4
+
+
+def _moved_m(q_rad: np.ndarray, target_rad: np.ndarray) -> np.ndarray:
+    return kinematics.grip_position(target_rad) - kinematics.grip_position(q_rad)
+
+
+def test_a_low_hand_comes_down_slowly_and_goes_up_as_it_likes():
+    height_m = kinematics.grip_position(HOME)[2]
+    down = action(0.0, 0.8, 0.0, -0.4)
+    low = replace(FREE, approach_m_s=0.06, approach_below_m=height_m + 0.01)
+    filter_ = SafetyFilter(low, 0.1)
+    target, _, causes = filter_.target(HOME, down)
+    assert _moved_m(HOME, target)[2] == pytest.approx(-0.006, rel=0.05)  # 6 cm/s for 0.1 s; the way is bent
+    assert causes == ["approach"] and filter_.counts.as_dict()["approach"] == 1
+    step = target - HOME
+    np.testing.assert_allclose(step / step[1], [0, 1, 0, -0.5, 0, 0, 0], atol=1e-6)  # all joints alike
+    for free, given in ((filter_, -down), (SafetyFilter(FREE, 0.1), down)):
+        target, _, causes = free.target(HOME, given)
+        assert causes == [] and abs(_moved_m(HOME, target)[2]) > 0.03
+
+
+def test_a_hand_that_would_end_low_is_slowed_before_it_is():
+    height_m = kinematics.grip_position(HOME)[2]
+    down = action(0.0, 0.8, 0.0, -0.4)
+    for below_m, expected in ((height_m - 0.02, ["approach"]), (height_m - 0.2, [])):
+        limits = replace(FREE, approach_m_s=0.06, approach_below_m=below_m)
+        assert SafetyFilter(limits, 0.1).target(HOME, down)[2] == expected
+
+
+def test_a_real_arm_comes_down_slowly_and_the_development_rig_s_as_before():
+    config = get_preset("debug")
+    info = policy_metadata.describe(config.student, config.export, config.world.profile)
+    franka, simulated = (safety_filter(config.deploy, info, robot).limits for robot in ("franka", "sim"))
+    assert (franka.approach_m_s, franka.approach_below_m) == (0.06, 0.16)
+    assert simulated.approach_below_m == 0.0
 
 
 def test_position_limit_and_way_back_from_outside():

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from ddgrasp import contract
+from ddgrasp.config import FrankaConfig
 from ddgrasp.config.checks import Count, Range
 
 
@@ -31,8 +32,9 @@ class DeployTrials:
     """stereo (the rig's own), ideal (without errors), coarse (on rig fr3: matched at the policy's size)."""
     seconds: Annotated[float, Range(0.5, 60)] = contract.TRIAL_S
     """A trial ends with success, or after this."""
-    contact: Annotated[float, Range(1, 100)] = 100.0
-    """On rig fr3: newtons at the hand, and newton metres, at which the arm stops itself."""
+    contact: Annotated[float, Range(1, 100)] = FrankaConfig.contact_force_n
+    """On rig fr3: newtons at the hand at which the arm stops itself, as deploy.franka has it; torques in
+    proportion."""
     depth: Literal["recorded", "inpaint", "monocular"] = "recorded"
     """What the policy sees: recorded, inpaint (holes filled on line), or monocular (a network on colour)."""
     retry: bool = True

@@ -38,6 +38,12 @@ class FrankaConfig(Section, name="deploy.franka"):
     """Torque on any joint at which the arm stops itself."""
     contact_force_n: Annotated[float, Range(1, 100)] = 30.0
     """Force at the hand, in newtons, and torque, in newton metres, at which the arm stops itself."""
+    approach_m_s: Annotated[float, Range(0, 2, above=True)] = 0.06
+    """How fast the hand may come down below `approach_below_m`. An arm that is stopped by what it lands on
+    presses on it in proportion to the speed that it was to have."""
+    approach_below_m: Annotated[float, Range(0, 2)] = 0.16
+    """Height of the point between the finger pads; 0 lets the hand come down at any speed. What is taller
+    than 14 cm needs more."""
     stiffness_nm_rad: Annotated[float, Range(50, 3000)] = 400.0
     """Stiffness of joints 1 to 4, 0.4 of it at the wrist: a stiffer arm presses harder on what it touches."""
     load_kg: Annotated[float, Range(0, 3)] = 0.0

@@ -96,6 +96,7 @@ MEANINGS: dict[str, Meaning] = {
     "joint_position": Meaning("beyond a joint's range"),
     "joint_velocity": Meaning("faster than a joint may turn"),
     "joint_acceleration": Meaning("more sudden than a joint may turn"),
+    "approach": Meaning("a hand that came down faster than it may"),
     "workspace": Meaning("grip point out of its box"),
     "arm": Meaning("elbow, wrist or hand out of its box"),
     # curves
