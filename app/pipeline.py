@@ -54,9 +54,13 @@ def check_place(run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES
     """UserError if `run_dir` is or lies below a file, or holds a run and `resume` is off. Writes nothing."""
     if not resume:
         _refuse_occupied(run_dir, [stage.name for stage in stages])
-    place = run_dir.absolute()
-    if not next(path for path in (place, *place.parents) if path.exists()).is_dir():
-        raise _no_place(run_dir / stages[0].name, errno.ENOTDIR)
+    place, first = run_dir.absolute(), run_dir / stages[0].name
+    try:
+        there = next(path for path in (place, *place.parents) if path.exists())
+    except OSError as error:  # a name that is too long
+        raise _no_place(first, error.errno) from None
+    if not there.is_dir():
+        raise _no_place(first, errno.ENOTDIR)
 
 
 def make(
@@ -81,7 +85,7 @@ def make(
     if parents is None:
         parents = {name: artifacts.require(run_dir, name, config) for name in stage.parents}
     directory = run_dir / stage.name
-    _create(directory)
+    create(directory)
     if not resume:
         _refuse_occupied(run_dir, [stage.name])
     progress = Progress(directory if leads else None, stage.name, quiet=quiet or not leads)
@@ -113,7 +117,7 @@ def _origin(artifact: Artifact) -> str:
     return ", loaded" if artifact.manifest.origin == "loaded" else ""
 
 
-def _create(directory: Path) -> None:
+def create(directory: Path) -> None:
     """UserError if `directory` is or lies below a file, or cannot exist."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -123,8 +127,8 @@ def _create(directory: Path) -> None:
         raise _no_place(directory, error.errno) from None
 
 
-def _no_place(directory: Path, number: int) -> UserError:
-    return UserError(f"{directory} cannot be created ({os.strerror(number)}): choose another --out.")
+def _no_place(directory: Path, number: int | None) -> UserError:
+    return UserError(f"{directory} cannot be created ({os.strerror(number or 0)}): choose another --out.")
 
 
 def _refuse_occupied(run_dir: Path, names: Sequence[str]) -> None:

@@ -118,7 +118,7 @@ _ADDED_AFTER: dict[int, dict[str, Any]] = {
     9: {"deploy.retry": False},
     10: {"deploy.franka.approach_m_s": 0.06, "deploy.franka.approach_below_m": 0.16},
 }
-"""Version -> the fields that it lacked and the next one has, with what it did."""
+"""Version -> the fields that it lacked and the next one has, with what it did (10: with what is done now)."""
 
 _CLONE_ROUNDS = 8
 """What stands in a configuration that does not clone: version 2 wrote 0."""

@@ -97,9 +97,10 @@ class PlacingRobot(FrankaRobot):
 
 
 def lab_config(config: DeployConfig, host: str, contact: float) -> DeployConfig:
-    """`config` for the rig at `host`, which stops itself at `contact` newtons at the hand, and at a torque
-    on a joint that is to it as the configured ones are to each other."""
+    """`config` for the rig at `host`, which stops itself at `contact` newtons and newton metres at the hand,
+    and at a torque on a joint that is to it as the configured ones are to each other, 1 to 100 N m."""
     torque_nm = contact * config.franka.contact_torque_nm / config.franka.contact_force_n
+    torque_nm = min(max(torque_nm, 1.0), 100.0)
     franka = replace(
         config.franka, host=host, model="fr3", kernel="any", dynamics=DYNAMICS,
         start_dynamics=START_DYNAMICS, contact_force_n=contact, contact_torque_nm=torque_nm,

@@ -42,7 +42,7 @@ class SafetyLimits:
     arm_upper_m: tuple[float, float, float] = (0.95, 0.80, 1.30)
     """Box that elbow, forearm, wrist and hand stay inside: table and walls."""
     approach_below_m: float = 0.0
-    """Below this height the grip point comes down slowly: the hand may land on something."""
+    """Below this height the grip point comes down slowly: the hand may land on something. 0: nowhere."""
     approach_m_s: float = math.inf
     """How fast it may come down there."""
     period_s: float = contract.CONTROL_DT_S
@@ -140,10 +140,10 @@ class SafetyFilter:
         return self._noted(np.clip(step, room_down, room_up), step, "joint_position", causes)
 
     def _gently_down(self, q_rad: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """(7,) `step`, shortened so that the grip point comes down no faster than it may where it is low."""
+        """(7,) `step`, shortened so that the grip point comes down about as fast as it may where low."""
+        low_m, way_m = self.limits.approach_below_m, self.limits.approach_m_s * self.limits.period_s
         here_m, there_m = kinematics.grip_position(q_rad)[2], kinematics.grip_position(q_rad + step)[2]
-        way_m = self.limits.approach_m_s * self.limits.period_s
-        if there_m >= self.limits.approach_below_m or here_m - there_m <= way_m:
+        if not low_m or there_m >= low_m or here_m - there_m <= way_m:
             return step
         return step * way_m / (here_m - there_m)
 

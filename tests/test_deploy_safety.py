@@ -104,7 +104,13 @@ def test_a_real_arm_comes_down_slowly_and_the_development_rig_s_as_before():
     info = policy_metadata.describe(config.student, config.export, config.world.profile)
     franka, simulated = (safety_filter(config.deploy, info, robot).limits for robot in ("franka", "sim"))
     assert (franka.approach_m_s, franka.approach_below_m) == (0.06, 0.16)
-    assert simulated.approach_below_m == 0.0
+    low, down = HOME.copy(), action(0.0, 1.0)
+    while kinematics.grip_position(low)[2] > 0.018:
+        low[1] += 0.01
+    assert "approach" in SafetyFilter(franka, 0.1).target(low, down)[2]
+    for limits in (simulated, replace(franka, approach_below_m=0.0)):  # below the table the workspace ends
+        causes = SafetyFilter(limits, 0.1).target(low, down)[2]
+        assert "workspace" in causes and "approach" not in causes
 
 
 def test_position_limit_and_way_back_from_outside():

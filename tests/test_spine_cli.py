@@ -96,6 +96,10 @@ WRONG = [
     ),
     (("teacher", "train", "--out", "README.md/a"), "README.md/a/teacher cannot be created (Not a"),
     (("teacher", "train", "--out", "/proc/a"), "/proc/a/teacher cannot be created (No such file or"),
+    (
+        ("run", "--out", "a" * 300, "--resume"),
+        "cannot be created (File name too long): choose another --out.",
+    ),
     (("run", "--demos.episodes", "0"), "demos.episodes is 0; expected at least 1."),
     (("teacher", "eval", "nowhere", "--trials", "0"), "--trials is 0; expected at least 1."),
     (("student", "eval", "nowhere", "--trials", "-1"), "--trials is -1; expected at least 1."),

@@ -33,8 +33,8 @@ class DeployTrials:
     seconds: Annotated[float, Range(0.5, 60)] = contract.TRIAL_S
     """A trial ends with success, or after this."""
     contact: Annotated[float, Range(1, 100)] = FrankaConfig.contact_force_n
-    """On rig fr3: newtons at the hand at which the arm stops itself, as deploy.franka has it; torques in
-    proportion."""
+    """On rig fr3: newtons at the hand, and newton metres there, at which the arm stops itself: 30 as deploy
+    begins. The joints' torque is in proportion."""
     depth: Literal["recorded", "inpaint", "monocular"] = "recorded"
     """What the policy sees: recorded, inpaint (holes filled on line), or monocular (a network on colour)."""
     retry: bool = True
