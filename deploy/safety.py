@@ -141,9 +141,12 @@ class SafetyFilter:
 
     def _gently_down(self, q_rad: np.ndarray, step: np.ndarray) -> np.ndarray:
         """(7,) `step`, shortened so that the grip point comes down about as fast as it may where low."""
-        low_m, way_m = self.limits.approach_below_m, self.limits.approach_m_s * self.limits.period_s
+        limits = self.limits
+        if not limits.approach_below_m:
+            return step
+        way_m = limits.approach_m_s * limits.period_s
         here_m, there_m = kinematics.grip_position(q_rad)[2], kinematics.grip_position(q_rad + step)[2]
-        if not low_m or there_m >= low_m or here_m - there_m <= way_m:
+        if there_m >= limits.approach_below_m or here_m - there_m <= way_m:
             return step
         return step * way_m / (here_m - there_m)
 

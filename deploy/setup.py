@@ -1,7 +1,5 @@
 """From the configuration and the policy's own metadata to the loop's parts."""
 
-import math
-
 from ddgrasp import contract
 from ddgrasp.config import DeployConfig
 from ddgrasp.policy_metadata import PolicyMetadata
@@ -39,7 +37,7 @@ def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim"
         arm_lower_m=config.arm_lower_m,
         arm_upper_m=config.arm_upper_m,
         approach_below_m=config.franka.approach_below_m if robot == "franka" else 0.0,
-        approach_m_s=config.franka.approach_m_s if robot == "franka" else math.inf,
+        approach_m_s=config.franka.approach_m_s,
         period_s=1.0 / info.control_hz,
     )
     return SafetyFilter(limits, info.action_scale_rad)
