@@ -8,13 +8,14 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 11
+VERSION = 12
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
 edges. 6: demos are trained on from their beginning. 7: a student leaves holes as they are. 8: a
 generator does not know where in the picture it is. 9: the policy alone acts in the loop. 10: a Franka's hand
-comes down at any speed; what was made then comes down slowly too, since no run has an arm."""
+comes down at any speed; what was made then comes down slowly too, since no run has an arm. 11: a Franka
+gives way to nothing before it stops itself; the same."""
 
 VERSION_FIELD = "manifest_version"
 
@@ -116,9 +117,10 @@ _ADDED_AFTER: dict[int, dict[str, Any]] = {
     7: {"student.picture.fill_holes": False},
     8: {"ddg.unet.position": False},
     9: {"deploy.retry": False},
-    10: {"deploy.franka.approach_m_s": 0.06, "deploy.franka.approach_below_m": 0.16},
+    10: {"deploy.franka.approach_m_s": 0.08, "deploy.franka.approach_below_m": 0.16},
+    11: {"deploy.franka.give_way": 0.5},
 }
-"""Version -> the fields that it lacked and the next one has, with what it did (10: with what is done now)."""
+"""Version -> the fields that it lacked and the next one has, with what it did (10, 11: what is done now)."""
 
 _CLONE_ROUNDS = 8
 """What stands in a configuration that does not clone: version 2 wrote 0."""

@@ -127,7 +127,8 @@ def _take(config: Config, takes: Takes, lab: Fr3Lab, index: int, path: Path) -> 
     name, profile = names[index % len(names)], config.world.profile
     rig = lab.with_object(name, draw.clutter_seed)
     settings, clock = lab_config(config.deploy, rig.host, CONTACT), RobotClock()
-    settings = replace(settings, franka=replace(settings.franka, approach_below_m=0.0))  # the way is known
+    known_way = replace(settings.franka, approach_below_m=0.0, give_way=1.0)
+    settings = replace(settings, franka=known_way)
     robot = PlacingRobot(settings.franka, clock, rig.channel, draw.place)
     info = policy_metadata.describe(config.student, config.export, profile)
     safety = safety_filter(settings, info, "franka")

@@ -36,6 +36,8 @@ class RobotState:
     width_m: float
     """Opening between the finger pads."""
     timestamp_s: float
+    met: str = ""
+    """What the arm pressed on and gave way to since the state before, in words; empty if nothing."""
 
     def vector(self) -> Float32[np.ndarray, "8"]:
         """(8,) float32, the policy's state input: arm joints (rad), then the gripper's width (m)."""

@@ -119,7 +119,7 @@ class ControlLoop:
         self._report = LoopReport(settings.period_s, safety=safety.counts)
         self._last_frame_s = -math.inf
         self._held_for = ""
-        self._closed = False
+        self._closed = self._touches = False
         self._start_s = self._last_s = 0.0
 
     def run(
@@ -188,6 +188,7 @@ class ControlLoop:
         timings.sense_s.append(time.perf_counter() - started)
         problem = problem or _state_problem(state)
         self._report.width_m = float(state.width_m)
+        self._tell_touch(state.met)
         action, inferring = None, False
         started = time.perf_counter()
         if frame is not None and not problem:
@@ -212,7 +213,7 @@ class ControlLoop:
 
     def _or_retry(self, state: RobotState, action: np.ndarray) -> np.ndarray:
         """(8,) `action`, or what a hand does that tries again, after which the policy begins anew."""
-        instead = None if self._retry is None else self._retry(state.vector())
+        instead = None if self._retry is None else self._retry(state.vector(), bool(state.met))
         if instead is None:
             return action
         assert self._retry is not None
@@ -276,6 +277,12 @@ class ControlLoop:
         if self._held_for:
             self._log("recover", f"after {self._held_for}")
         self._held_for = ""
+
+    def _tell_touch(self, met: str) -> None:
+        """Once for as long as the arm gives way in every step."""
+        if met and not self._touches:
+            self._log("touch", f"the arm met something and gave way ({met})")
+        self._touches = bool(met)
 
     def _look_at_hand(self) -> None:
         """Says so if the hand was told to close and has nothing in it."""

@@ -63,6 +63,8 @@ class DeploymentRecord:
         """What the loop's `on_step` is called with."""
         row = {"step": step.index, "q_rad": step.state.q_rad.tolist(), "width_m": float(step.state.width_m)}
         row |= {"time_s": step.state.timestamp_s, "held": step.action is None}
+        if step.state.met:
+            row["met"] = step.state.met
         row["action"] = None if step.action is None else np.asarray(step.action, float).tolist()
         row["q_target_rad"] = None if step.q_target_rad is None else step.q_target_rad.tolist()
         self._rows.append(row)

@@ -15,20 +15,25 @@ from jaxtyping import Float
 from ddgrasp import contract
 from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION, STATE
-from deploy.kinematics import grip_position
+from deploy.kinematics import grip_jacobian, grip_position
 
 EMPTY_WIDTH_M = 0.006
 """A closed hand narrower than this holds nothing."""
 EMPTY_STEPS = 2
 """Control steps in a row for which it is to be so."""
-STILL_STEPS, STILL_M = 10, 0.010
-"""A hand stands still that has moved by less within so many control steps."""
+STILL_STEPS, STILL_M = 10, 0.030
+"""A hand stands still that has moved by less within so many control steps. One that has a finger on what it
+is to grasp pushes it away by 10 to 25 mm in them; coming down slowly is 55 mm."""
 OPEN_WIDTH_M = 0.07
 """Fingers are open that are farther apart."""
 LOW_M = 0.20
 """Only below this height of the grip does standing still mean that it is at something."""
 CLOSING_STEPS = 10
 """Control steps given to fingers to close: a Franka Hand's from open to shut, and two."""
+CLEAR_M = 0.16
+"""Below this height of the grip a hand goes straight up: sideways it takes with it what it stands at."""
+UP_M = 0.03
+"""By how much in a control step, as a policy lifts."""
 ABOVE_M = 0.22
 """Where a hand that went up is high enough to look again, height of the grip."""
 RETREAT_STEPS = 25
@@ -44,9 +49,9 @@ OPEN = -1.0
 class Retry:
     """Acts instead of the policy for a while; call it with the robot's state in every control step.
 
-    A hand that is empty goes up with open fingers, towards the start pose. One that stands still, low and
-    open, closes once; if it comes to stand still again, it goes up. One that has lifted something stays there
-    for as long as it has it.
+    A hand that is empty goes up with open fingers, then towards the start pose. One that stands still, low
+    and open, closes once; if it comes to stand still again, or has met something, it goes up: then a finger
+    is on what it is to grasp. One that has lifted something stays there for as long as it has it.
     """
 
     def __init__(self) -> None:
@@ -63,12 +68,13 @@ class Retry:
         self._lifted_steps = 0
         self._stay_rad: np.ndarray | None = None
 
-    def __call__(self, state: Float[np.ndarray, "8"]) -> Float[np.ndarray, "8"] | None:
-        """(8,) action for the state (8,), None where the policy is to act."""
+    def __call__(self, state: Float[np.ndarray, "8"], met: bool = False) -> Float[np.ndarray, "8"] | None:
+        """(8,) action for the state (8,), None where the policy is to act; `met`: the arm gave way."""
         self.begun, self.done = "", False
         grip_m = grip_position(state[STATE.arm].astype(np.float64))
         self._places.append(grip_m)
         self._widths.append(float(state[STATE.width][0]))
+        self._met.append(met)
         if (stay := self._stay(state, grip_m)) is not None:
             return stay
         if not (self._closing or self._retreat):
@@ -82,6 +88,8 @@ class Retry:
             self._retreat -= 1
             if not self._retreat or (grip_m[2] > ABOVE_M and self._widths[-1] > OPEN_WIDTH_M):
                 self._forget()
+            if grip_m[2] < CLEAR_M:
+                return _straight_up(state)
             return _towards(np.array(contract.HOME_RAD), state, OPEN)
         return None
 
@@ -105,8 +113,8 @@ class Retry:
             self._go_up(f"the hand closed to {1e3 * widths[-1]:.1f} mm, on nothing")
         elif len(widths) > STILL_STEPS and self._stands(grip_m):
             reason = f"the open hand has stood still for {STILL_STEPS * contract.CONTROL_DT_S:.0f} s"
-            if self._closed_once:
-                self._go_up(f"{reason} again")
+            if self._closed_once or any(self._met):
+                self._go_up(f"{reason} again" if self._closed_once else f"{reason} on something")
             else:
                 self.begun, self._closing, self._closed_once = f"{reason}; closes", CLOSING_STEPS, True
 
@@ -121,12 +129,23 @@ class Retry:
     def _forget(self) -> None:
         self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
         self._widths: deque[float] = deque(maxlen=STILL_STEPS + 1)
+        self._met: deque[bool] = deque(maxlen=STILL_STEPS + 1)
         self._closing = self._retreat = 0
 
 
 def _still(gripper: float) -> Float[np.ndarray, "8"]:
     action = np.zeros(contract.ACTION_SIZE)
     action[ACTION.gripper] = gripper
+    return action
+
+
+def _straight_up(state: Float[np.ndarray, "8"]) -> np.ndarray:
+    """(8,) action of an open hand that rises without turning (pseudo-inverse of the grip's Jacobian)."""
+    action = _still(OPEN)
+    rise = np.array([0.0, 0.0, UP_M, 0.0, 0.0, 0.0])
+    way_rad = np.linalg.pinv(grip_jacobian(state[STATE.arm].astype(np.float64))) @ rise
+    way = way_rad / contract.ACTION_SCALE_RAD
+    action[ACTION.arm] = way / max(1.0, float(np.abs(way).max()))
     return action
 
 

@@ -6,6 +6,7 @@ time, so a busy machine makes these tests slower and nothing else.
 
 import json
 import os
+import re
 import signal
 import socket
 import struct
@@ -73,8 +74,8 @@ def config_for(host: str, **changes) -> DeployConfig:
 
 
 def at_full_speed(config: DeployConfig) -> DeployConfig:
-    """Wherever the hand is."""
-    return replace(config, franka=replace(config.franka, approach_below_m=0.0))
+    """Wherever the hand is, and whatever it meets."""
+    return replace(config, franka=replace(config.franka, approach_below_m=0.0, give_way=1.0))
 
 
 def connect(config: DeployConfig, confirm=None) -> tuple[FrankaRobot, RobotClock]:
@@ -158,6 +159,17 @@ def test_a_hand_that_comes_down_slowly_comes_to_stand_on_the_table(tmp_path, rig
     assert report.fault == "" and report.steps == 50
     assert report.safety.by_cause["approach"] > 15
     assert grip_position(np.array(rig.channel.ask("state")["q_rad"]))[2] < 0.02
+    assert run_trial(tmp_path, config_for(HOST), joint_bias(j2=-1.0), steps=6).fault == ""
+
+
+def test_an_arm_that_presses_on_something_gives_way_and_says_so(tmp_path, rig):
+    config = config_for(HOST, workspace_lower_m=BELOW_THE_TABLE)
+    shy = replace(config, franka=replace(config.franka, give_way=0.2))  # 6 N, 4 N m
+    report = run_trial(tmp_path, shy, joint_bias(j2=1.0, j4=0.2), steps=50)
+    assert report.fault == "" and report.steps == 50
+    assert {event.kind for event in report.events} == {"touch"}
+    assert re.search(r"gave way \(\d+ N at the hand, \d+ N m on joint \d\)", report.events[0].reason)
+    assert run_trial(tmp_path, config_for(HOST), joint_bias(j2=-1.0), steps=6).fault == ""
 
 
 def test_lost_connection_ends_the_trial_and_the_next_one_runs_when_it_is_back(tmp_path, rig):

@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -222,6 +223,16 @@ def test_robot_is_stopped_when_a_device_fails(tmp_path):
     with pytest.raises(OSError, match="joint controller lost"):
         loop.run(max_steps=3)
     assert robot.calls[-1] == "stop" and camera.stopped
+
+
+def test_what_the_arm_gave_way_to_is_an_event_once_for_as_long_as_it_does(tmp_path):
+    loop, robot, _ = make_loop(tmp_path, [depth_mm()], SimClock())
+    read, met = robot.read_state, iter(["", "16 N", "17 N", "", "18 N", ""])
+    robot.read_state = lambda: replace(read(), met=next(met))
+    report = loop.run(max_steps=6)
+    assert [(event.step, event.kind) for event in report.events] == [(1, "touch"), (4, "touch")]
+    assert report.events[0].reason == "the arm met something and gave way (16 N)"
+    assert report.holds == 0 and robot.calls.count("command") == 6
 
 
 def test_on_step_can_end_the_run(tmp_path):

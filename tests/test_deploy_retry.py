@@ -11,6 +11,7 @@ from deploy.loop import ControlLoop, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.retry import (
     ABOVE_M,
+    CLEAR_M,
     CLOSING_STEPS,
     DONE_STEPS,
     EMPTY_STEPS,
@@ -68,7 +69,7 @@ def test_a_hand_that_closed_on_nothing_opens_and_goes_up_for_a_while_at_most():
 
 @pytest.mark.parametrize(
     ("q_rad", "width_m", "drift_rad"),
-    [(LOW, HOLDING, 0.0), (HOME, OPEN, 0.0), (LOW, OPEN, 0.003)],
+    [(LOW, HOLDING, 0.0), (HOME, OPEN, 0.0), (LOW, OPEN, 0.009)],
     ids=["it holds something", "it waits above", "it moves, slowly"],
 )
 def test_it_leaves_alone(q_rad, width_m, drift_rad):
@@ -76,6 +77,37 @@ def test_it_leaves_alone(q_rad, width_m, drift_rad):
     for step in range(4 * STILL_STEPS):
         assert retry(state(q_rad - [drift_rad * step, *[0] * 6], width_m)) is None
     assert STATE.size == 8
+
+
+def test_a_hand_that_pushes_something_away_from_above_stands_still_too():
+    retry, pushed_rad = Retry(), 0.004  # 2 mm in a step at joint 1's radius
+    answers = [retry(state(LOW - [pushed_rad * step, *[0] * 6], OPEN)) for step in range(STILL_STEPS + 1)]
+    assert answers[:-1] == [None] * STILL_STEPS and closes(answers[-1])
+
+
+def test_a_hand_that_met_something_and_stands_on_it_goes_up_at_once():
+    retry = Retry()
+    told(retry, LOW, OPEN, 2)
+    assert retry(state(LOW, OPEN), met=True) is None
+    told(retry, LOW, OPEN, STILL_STEPS - 3)
+    action = retry(state(LOW, OPEN))
+    assert action is not None and not closes(action)
+    assert retry.begun == "the open hand has stood still for 1 s on something; goes up to look again"
+
+
+def test_a_hand_at_an_object_goes_straight_up_before_it_turns_to_the_start_pose():
+    beside = HOME + np.array([0.5, 0.45, 0, 0.2, 0, 0, 0])
+    assert grip_position(beside)[2] < CLEAR_M
+    retry, q_rad, way_m = Retry(), beside, []
+    told(retry, q_rad, SHUT, EMPTY_STEPS - 1)
+    while (action := retry(state(q_rad, SHUT))) is not None and grip_position(q_rad)[2] < CLEAR_M:
+        before_m, q_rad = grip_position(q_rad), q_rad + contract.ACTION_SCALE_RAD * action[ACTION.arm]
+        assert not closes(action) and np.abs(action[ACTION.arm]).max() <= 1.0
+        way_m.append(grip_position(q_rad) - before_m)
+    assert len(way_m) > 1 and np.abs(np.array(way_m)[:, :2]).max() < 0.003
+    assert (np.array(way_m)[:, 2] > 0.02).all()
+    action = retry(state(q_rad, SHUT))
+    assert action is not None and action[ACTION.arm][0] < -0.9, "now towards the start pose, too"
 
 
 def test_a_hand_that_has_lifted_something_stays_there_until_it_has_lost_it():

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from ddgrasp import contract
-from ddgrasp.config import FrankaConfig
 from ddgrasp.config.checks import Count, Range
 
 
@@ -32,9 +31,9 @@ class DeployTrials:
     """stereo (the rig's own), ideal (without errors), coarse (on rig fr3: matched at the policy's size)."""
     seconds: Annotated[float, Range(0.5, 60)] = contract.TRIAL_S
     """A trial ends with success, or after this."""
-    contact: Annotated[float, Range(1, 100)] = FrankaConfig.contact_force_n
-    """On rig fr3: newtons at the hand, and newton metres there, at which the arm stops itself: 30 as deploy
-    begins. The joints' torque is in proportion."""
+    contact: Annotated[float, Range(0, 100)] = 0.0
+    """On rig fr3: newtons at the hand, and newton metres there, at which the arm stops itself; 0 takes what
+    the configuration has, 30 as deploy begins. The joints' torque is in proportion."""
     depth: Literal["recorded", "inpaint", "monocular"] = "recorded"
     """What the policy sees: recorded, inpaint (holes filled on line), or monocular (a network on colour)."""
     retry: bool = True
@@ -54,6 +53,7 @@ class DeployTrials:
         from ddgrasp.progress import Progress
         from evaluation import rig_trials
 
+        config = config_of(self.policy, self.preset)
         series = rig_trials.Series(
             self.rig,
             self.objects,
@@ -63,11 +63,10 @@ class DeployTrials:
             self.shapes,
             self.camera,
             self.seconds,
-            self.contact,
+            self.contact or config.deploy.franka.contact_force_n,
             self.depth,
             self.retry,
         )
-        config = config_of(self.policy, self.preset)
         progress = Progress(name="deploy trials")
         table = rig_trials.run(
             config, self.policy, series, self.out, self.workers, progress, record=self.record

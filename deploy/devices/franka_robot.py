@@ -99,14 +99,16 @@ class FrankaRobot:
         assert self._hand is not None
         with self._reporting():
             self._arm.poll_motion()  # raises what stopped the last motion (a reflex, a limit)
-            return RobotState(np.asarray(self._arm.state.q, float), self._hand.width_m(), self._clock.now())
+            met = "" if self._following is None else self._following.met()
+            q_rad = np.asarray(self._arm.state.q, float)
+            return RobotState(q_rad, self._hand.width_m(), self._clock.now(), met)
 
     def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
         """Set the (7,) joint target, in place of the last, and the gripper. Raises RobotError."""
         assert self._hand is not None
         with self._reporting():
             self._arm.poll_motion()
-            self._spring().follow(q_target_rad)
+            self._spring().follow(q_target_rad, self._may_land(q_target_rad))
             self._hand.set(close)
         self._holding = False
 
@@ -161,7 +163,12 @@ class FrankaRobot:
             )
         if stood:
             self._say(f"recovered from {', '.join(stood)}")
-        arm.set_collision_behavior(config.contact_torque_nm, config.contact_force_n)
+        arm.set_collision_behavior(
+            lower_torque_threshold=config.give_way * config.contact_torque_nm,
+            upper_torque_threshold=config.contact_torque_nm,
+            lower_force_threshold=config.give_way * config.contact_force_n,
+            upper_force_threshold=config.contact_force_n,
+        )
         arm.set_load(config.load_kg, [0.0, 0.0, kinematics.GRIP_D_M], [0.0] * 9)
         for limit, own in (
             (arm.joint_velocity_limit, self._limits.joint_velocity_rad_s),
@@ -202,6 +209,13 @@ class FrankaRobot:
 
     def _to(self, q_target_rad: Float[np.ndarray, "7"], **options: Any) -> Any:
         return self._franky.JointMotion([float(q) for q in q_target_rad], **options)
+
+    def _may_land(self, q_target_rad: Float[np.ndarray, "7"]) -> bool:
+        """Whether the hand comes down where the safety filter has it come down slowly."""
+        here_m, there_m = (
+            kinematics.grip_position(np.asarray(q))[2] for q in (self._arm.state.q, q_target_rad)
+        )
+        return bool(there_m < min(here_m, self._config.approach_below_m))
 
     def _spring(self) -> FrankaSpring:
         if self._following is None:

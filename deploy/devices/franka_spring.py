@@ -20,6 +20,10 @@ WEIGHTS = np.array((1.0, 1.0, 1.0, 1.0, 0.4, 0.4, 0.4))
 """Stiffness of the joints relative to the first: the wrist's carry less."""
 DAMPING_S = 0.15
 """Damping over stiffness. Chosen on the FR3 rig so that a step is made within its period as in training."""
+SOFT = 1.0 / 3.0
+"""Share of stiffness and damping of an arm that comes down where it may land on something. What a hand that
+is stopped presses with is the torque that was to carry it on: damping times speed, and more the nearer it is
+to the base, with the square of the distance."""
 LATE = 1.5
 """Control periods for which a joint keeps its speed if no command follows; then it brakes."""
 _LOOK_S = 0.01
@@ -49,24 +53,27 @@ class FrankaSpring:
         """`arm` is a franky.Robot without a motion."""
         self._franky: Any = franky
         self._arm: Any = arm
-        stiffness = stiffness_nm_rad * WEIGHTS
+        self._stiffness = stiffness_nm_rad * WEIGHTS
         self._motion: Any = franky.JointImpedanceTrackingMotion(
-            stiffness=stiffness, damping=DAMPING_S * stiffness
+            stiffness=self._stiffness, damping=DAMPING_S * self._stiffness
         )
+        self._soft = False
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._due_s: float | None = None
+        self._met = ""
         self.stay()
         arm.move(self._motion, asynchronous=True)
-        self._watch = threading.Thread(target=self._brake_when_late, daemon=True)
+        self._watch = threading.Thread(target=self._brake_in_time, daemon=True)
         self._watch.start()
 
-    def follow(self, q_target_rad: Float[np.ndarray, "7"]) -> None:
-        """Make the step to (7,) `q_target_rad` within a control period.
+    def follow(self, q_target_rad: Float[np.ndarray, "7"], soft: bool = False) -> None:
+        """Make the step to (7,) `q_target_rad` within a control period; `soft`: with `SOFT` of its strength.
 
         At the step's speed, about its middle: over the period the spring's pull is zero on average.
         """
         state = self._arm.state
         step = q_target_rad - np.asarray(state.q)
+        self._be(soft)
         with self._lock:
             self._due_s = state.time.to_sec() + LATE * contract.CONTROL_DT_S
             self._set(np.asarray(state.q) + step / 2, step / contract.CONTROL_DT_S)
@@ -76,6 +83,12 @@ class FrankaSpring:
         with self._lock:
             self._stay()
             self._due_s = None
+
+    def met(self) -> str:
+        """What the arm gave way to since the last call, in words; empty if to nothing."""
+        with self._lock:
+            met, self._met = self._met, ""
+        return met
 
     def stop(self) -> None:
         """Brake, and return when the arm stands; its own control unit holds it then."""
@@ -90,20 +103,44 @@ class FrankaSpring:
         arm, self._arm, self._motion = self._arm, None, None
         return arm
 
+    def _be(self, soft: bool) -> None:
+        """The controller comes to the new gains by itself, with a time constant of 0.1 s."""
+        if soft != self._soft:
+            stiffness = self._stiffness * (SOFT if soft else 1.0)
+            gains = self._franky.JointImpedanceGains(stiffness, DAMPING_S * stiffness)
+            self._motion.set_gains(gains)
+            self._soft = soft
+
     def _stay(self) -> None:
         self._set(np.asarray(self._arm.state.q), np.zeros(len(contract.ARM_JOINTS)))
 
     def _set(self, q_rad: Float[np.ndarray, "7"], speed_rad_s: Float[np.ndarray, "7"]) -> None:
         self._motion.set_reference(self._franky.JointReference(q_rad, speed_rad_s))
 
-    def _brake_when_late(self) -> None:
-        """In a thread of its own, by the arm's clock: whoever sends commands may hang."""
+    def _brake_in_time(self) -> None:
+        """When the next command is late, or the control unit says that the arm presses on something.
+
+        In a thread of its own, by the arm's clock: whoever sends commands may hang, and the next comes only
+        after a period in which the arm presses on.
+        """
         while not self._ended.wait(_LOOK_S):
             try:
-                now_s = self._arm.state.time.to_sec()
+                state = self._arm.state
             except (self._franky.Exception, RuntimeError):
                 return  # the connection has gone, and the arm with it stands
             with self._lock:
-                if self._due_s is not None and now_s > self._due_s:
+                if self._due_s is None:
+                    continue
+                met = _touched(state)
+                if met or state.time.to_sec() > self._due_s:
                     self._stay()
-                    self._due_s = None
+                    self._due_s, self._met = None, met or self._met
+
+
+def _touched(state: Any) -> str:
+    """What the arm feels where its control unit sees a contact (the lower thresholds); empty elsewhere."""
+    if not (np.any(state.joint_contact) or np.any(state.cartesian_contact)):
+        return ""
+    force_n = np.linalg.norm(np.asarray(state.O_F_ext_hat_K)[:3])
+    torque_nm = np.abs(np.asarray(state.tau_ext_hat_filtered))
+    return f"{force_n:.0f} N at the hand, {torque_nm.max():.0f} N m on joint {torque_nm.argmax() + 1}"

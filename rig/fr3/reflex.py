@@ -38,10 +38,15 @@ _CONTACTS = (
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Above these the arm stops; as `setCollisionBehavior` sets them (upper, nominal)."""
+    """Above the upper ones the arm stops, above the lower ones it says that it touches something.
+
+    As `setCollisionBehavior` sets them (nominal).
+    """
 
     torque_nm: tuple[float, ...] = (20.0,) * 7
     force_n: tuple[float, ...] = (30.0,) * 6
+    lower_torque_nm: tuple[float, ...] = (20.0,) * 7
+    lower_force_n: tuple[float, ...] = (30.0,) * 6
 
 
 class ReflexServer(FrankaRobotServer):
@@ -59,7 +64,7 @@ class ReflexServer(FrankaRobotServer):
         self.thresholds = Thresholds()
         self.error: int | None = None
         """The number of the error that stopped the arm, None if it may move."""
-        self._torque_nm = np.zeros(7)
+        self._torque_nm, self._force_n = np.zeros(7), np.zeros(6)
 
     def _bind_children(self, hostname: str) -> None:
         gripper = GripperServer(self._arm, hostname)
@@ -80,17 +85,14 @@ class ReflexServer(FrankaRobotServer):
     def watch(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Once per tick: stops the arm if what it touches or is told goes beyond the limits."""
         self._torque_nm += FILTER_SHARE * (contact_torque(model, data) - self._torque_nm)
-        if (
-            self.error is None
-            and self.current_motion_id
-            and (error := self._exceeded(model, data)) is not None
-        ):
+        self._force_n = hand_force(model, data, self._torque_nm)
+        if self.error is None and self.current_motion_id and (error := self._exceeded()) is not None:
             self._stop(error)
 
     def recover(self) -> None:
         """Automatic error recovery: the arm may be moved again. What presses on still stops it again."""
         self.error = None
-        self._torque_nm[:] = 0.0
+        self._torque_nm[:], self._force_n[:] = 0.0, 0.0
 
     def hold(self) -> None:
         """One tick at the joints where it was last told to stand."""
@@ -103,8 +105,14 @@ class ReflexServer(FrankaRobotServer):
 
     @property
     def robot_state(self) -> FrankaRobotState:
-        """See franky-sim; with the contact torque and the error that stands."""
-        state = super().robot_state.replace(tau_ext_hat_filtered=self.contact_torque_nm)
+        """See franky-sim; with what the arm touches and the error that stands."""
+        thresholds = self.thresholds
+        state = super().robot_state.replace(
+            tau_ext_hat_filtered=self.contact_torque_nm,
+            O_F_ext_hat_K=tuple(self._force_n.tolist()),
+            joint_contact=_above(self._torque_nm, thresholds.lower_torque_nm),
+            cartesian_contact=_above(self._force_n, thresholds.lower_force_n),
+        )
         if self.error is None:
             return state
         flags = tuple(index == self.error for index in range(_ERRORS))
@@ -120,15 +128,14 @@ class ReflexServer(FrankaRobotServer):
         if self.current_motion_id and udp is not None:
             select.select([udp], [], [], seconds)
 
-    def _exceeded(self, model: mujoco.MjModel, data: mujoco.MjData) -> int | None:
+    def _exceeded(self) -> int | None:
         command = self._FrankaRobotServer__current_control_command  # type: ignore[attr-defined]
         target, state = np.array(command.q_c), self._arm.inner_state
         if (target.any() and _beyond(target)) or _beyond(_standstill(state.q, state.dq)):
             return GENERATOR_POSITION_LIMITS
         if np.any(np.abs(self._torque_nm) > self.thresholds.torque_nm):
             return JOINT_REFLEX
-        force = hand_force(model, data, self._torque_nm)
-        return CARTESIAN_REFLEX if np.any(np.abs(force) > self.thresholds.force_n) else None
+        return CARTESIAN_REFLEX if np.any(np.abs(self._force_n) > self.thresholds.force_n) else None
 
     def _stop(self, error: int) -> None:
         """Hold the measured joints and tell the client why its motion ended."""
@@ -164,7 +171,10 @@ class GripperServer(FrankaGripperServer):
 class _SetCollisionBehavior(protocol.SetCollisionBehaviorCommand):
     def handle(self, server: ReflexServer) -> None:
         server.thresholds = Thresholds(
-            tuple(self.upper_torque_thresholds_nominal), tuple(self.upper_force_thresholds_nominal)
+            tuple(self.upper_torque_thresholds_nominal),
+            tuple(self.upper_force_thresholds_nominal),
+            tuple(self.lower_torque_thresholds_nominal),
+            tuple(self.lower_force_thresholds_nominal),
         )
         self.reply(0)
 
@@ -179,6 +189,11 @@ def _standstill(q_rad: Sequence[float], speed_rad_s: Sequence[float]) -> Float[n
     """(7,) where the joints stand after braking as hard as they may: q + v |v| / 2a."""
     speed = np.array(speed_rad_s)
     return np.array(q_rad) + speed * np.abs(speed) / (2.0 * np.array(contract.FR3.joint_acceleration_rad_s2))
+
+
+def _above(values: np.ndarray, thresholds: Sequence[float]) -> tuple[float, ...]:
+    """1 where the magnitude is above its threshold, else 0."""
+    return tuple((np.abs(values) > thresholds).astype(float).tolist())
 
 
 def _beyond(q_rad: Float[np.ndarray, "7"]) -> bool:
