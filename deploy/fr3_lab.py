@@ -96,16 +96,24 @@ class PlacingRobot(FrankaRobot):
         self._ticks.sleep_until(self._ticks.now() + SETTLE_S)
 
 
-def lab_config(config: DeployConfig, host: str, contact: float) -> DeployConfig:
-    """`config` for the rig at `host`, which stops itself at `contact` newtons and newton metres at the hand,
-    and at a torque on a joint that is to it as the configured ones are to each other, 1 to 100 N m."""
+def lab_config(config: DeployConfig, host: str) -> DeployConfig:
+    """`config` for the rig at `host`."""
+    franka = replace(
+        config.franka, host=host, model="fr3", kernel="any", dynamics=DYNAMICS, start_dynamics=START_DYNAMICS
+    )
+    return replace(config, clock="robot", franka=franka)
+
+
+def stopping_at(config: DeployConfig, contact: float) -> DeployConfig:
+    """`config` for an arm that stops itself at `contact` newtons and newton metres at the hand, and at a
+    torque on a joint that is to it as the configured ones are to each other, 1 to 100 N m.
+
+    Raises UserError for a force that no arm takes.
+    """
     torque_nm = contact * config.franka.contact_torque_nm / config.franka.contact_force_n
     torque_nm = min(max(torque_nm, 1.0), 100.0)
-    franka = replace(
-        config.franka, host=host, model="fr3", kernel="any", dynamics=DYNAMICS,
-        start_dynamics=START_DYNAMICS, contact_force_n=contact, contact_torque_nm=torque_nm,
-    )  # fmt: skip
-    return replace(config, clock="robot", franka=franka)
+    franka = replace(config.franka, contact_force_n=contact, contact_torque_nm=torque_nm)
+    return replace(config, franka=franka)
 
 
 def free_host() -> str:

@@ -21,7 +21,7 @@ from ddgrasp.progress import Progress
 from deploy.clock import RobotClock
 from deploy.devices import fr3_camera
 from deploy.devices.franka_robot import LOST
-from deploy.fr3_lab import Fr3Lab, PlacingRobot, Shapes, lab_config
+from deploy.fr3_lab import Fr3Lab, PlacingRobot, Shapes, lab_config, stopping_at
 from deploy.guided_path import GuidedPath, plan
 from deploy.interfaces import Camera, Frame, Robot, RobotError
 from deploy.safety import SafetyFilter
@@ -33,7 +33,7 @@ from sensors.recordings.recording import Recording, RecordingWriter, is_recordin
 
 SETTINGS_FILE = "record.json"
 CONTACT = 100.0
-"""Newtons at the hand at which the arm stops itself (`lab_config`)."""
+"""Newtons at the hand at which the arm stops itself (`stopping_at`)."""
 _STREAM = 0x526563
 """Keeps these random numbers apart from every other stage's ("Rec")."""
 
@@ -126,7 +126,7 @@ def _take(config: Config, takes: Takes, lab: Fr3Lab, index: int, path: Path) -> 
     names, draw = takes.names(), _draw(config, takes, index)
     name, profile = names[index % len(names)], config.world.profile
     rig = lab.with_object(name, draw.clutter_seed)
-    settings, clock = lab_config(config.deploy, rig.host, CONTACT), RobotClock()
+    settings, clock = lab_config(stopping_at(config.deploy, CONTACT), rig.host), RobotClock()
     known_way = replace(settings.franka, approach_below_m=0.0, give_way=1.0)
     settings = replace(settings, franka=known_way)
     robot = PlacingRobot(settings.franka, clock, rig.channel, draw.place)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ddgrasp import contract
-from ddgrasp.config import Config, FrankaConfig
+from ddgrasp.config import Config
 from ddgrasp.layout import QPOS
 from deploy.clock import RobotClock
 from deploy.devices import fr3_camera
@@ -38,8 +38,6 @@ class Fr3Bench:
     """Mesh objects, or the primitives of the development rig."""
     sight: Sight = "stereo"
     """A D455 in the mode that it is run in, the same matching at the policy's size, or no errors at all."""
-    contact: float = FrankaConfig.contact_force_n
-    """Newtons at the hand at which the arm stops itself (`lab_config`)."""
     treatment: Treatment | Replacement | None = None
     """What is done to depth before the policy sees it."""
     bare: bool = False
@@ -94,7 +92,7 @@ class Fr3Runner:
         config, draw = self._config, self.draw(trial)
         rig = self.lab.with_object(trial.object_name, config.seed)
         self._policy.reset(draw.policy_seed)
-        settings = lab_config(config.deploy, rig.host, self._bench.contact)
+        settings = lab_config(config.deploy, rig.host)
         clock = RobotClock()
         robot = PlacingRobot(settings.franka, clock, rig.channel, draw.place)
         info = self._policy.info

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ddgrasp.errors import UserError
 from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotError, RobotState
 from deploy.policy import OnnxPolicy
-from deploy.retry import EMPTY_WIDTH_M, Retry
+from deploy.retry import EMPTY_WIDTH_M, Retry, still_for
 from deploy.safety import NonFiniteAction, SafetyCounts, SafetyFilter
 from deploy.timing import Timings
 
@@ -39,7 +39,7 @@ class Event:
     time_s: float
     """Since the loop's start."""
     kind: str
-    """hold, recover, missed, retry, done, empty, fault, stop."""
+    """hold, recover, missed, touch, retry, done, empty, fault, stop."""
     reason: str
 
     def __str__(self) -> str:
@@ -115,7 +115,7 @@ class ControlLoop:
         """`say` is called with one line per event, as it happens."""
         self._camera, self._robot, self._policy = camera, robot, policy
         self._safety, self._clock, self._settings, self._say = safety, clock, settings, say
-        self._retry = Retry() if settings.retry else None
+        self._retry = Retry(still_for(safety.limits)) if settings.retry else None
         self._report = LoopReport(settings.period_s, safety=safety.counts)
         self._last_frame_s = -math.inf
         self._held_for = ""

@@ -16,6 +16,7 @@ from ddgrasp import contract
 from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION, STATE
 from deploy.kinematics import grip_jacobian, grip_position
+from deploy.safety import SafetyLimits
 
 EMPTY_WIDTH_M = 0.006
 """A closed hand narrower than this holds nothing."""
@@ -24,6 +25,9 @@ EMPTY_STEPS = 2
 STILL_STEPS, STILL_M = 10, 0.030
 """A hand stands still that has moved by less within so many control steps. One that has a finger on what it
 is to grasp pushes it away by 10 to 25 mm in them; coming down slowly is 55 mm."""
+STILL_SHARE, REACH_M = 0.4, 0.4
+"""The same of an arm that may not go faster: share of the way that it may make, and how far a hand is at
+least from the joint that moves it."""
 OPEN_WIDTH_M = 0.07
 """Fingers are open that are farther apart."""
 LOW_M = 0.20
@@ -40,10 +44,22 @@ RETREAT_STEPS = 25
 """Control steps after which it looks again in any case."""
 WIDEST_HELD_M = contract.GRIPPER_MAX_WIDTH_M - 0.002
 """Fingers that are closer than this, and not `EMPTY_WIDTH_M`, hold something."""
+LIFTING_STEPS = 60
+"""Control steps given to a lift: from anywhere to where objects are lifted to takes 25, being there 20."""
+SAME_WIDTH_M = 0.002
+"""Fingers that have moved by less stand on what is between them."""
 DONE_STEPS = 20
 """Control steps in a row that a hand has held something where objects are lifted to: it is done."""
+_SECONDS = STILL_STEPS * contract.CONTROL_DT_S
 OPEN = -1.0
 """The gripper's command while it goes up."""
+
+
+def still_for(limits: SafetyLimits) -> float:
+    """Metres in `STILL_STEPS` by which a hand within `limits` moves unless it stands still."""
+    approach_m_s = limits.approach_m_s if limits.approach_below_m else np.inf
+    fastest_m_s = min(approach_m_s, REACH_M * min(limits.velocity_rad_s))
+    return min(STILL_M, STILL_SHARE * fastest_m_s * STILL_STEPS * limits.period_s)
 
 
 class Retry:
@@ -51,10 +67,13 @@ class Retry:
 
     A hand that is empty goes up with open fingers, then towards the start pose. One that stands still, low
     and open, closes once; if it comes to stand still again, or has met something, it goes up: then a finger
-    is on what it is to grasp. One that has lifted something stays there for as long as it has it.
+    is on what it is to grasp. One that stands still with something in it lifts it, straight up, then to where
+    objects are lifted to. One that has lifted something stays there for as long as it has it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, still_m: float = STILL_M) -> None:
+        """`still_m`: see `still_for`."""
+        self._still_m = still_m
         self.reset()
 
     def reset(self) -> None:
@@ -77,8 +96,13 @@ class Retry:
         self._met.append(met)
         if (stay := self._stay(state, grip_m)) is not None:
             return stay
-        if not (self._closing or self._retreat):
+        if not (self._closing or self._retreat or self._lifting):
             self._look(grip_m)
+        if self._lifting:
+            self._lifting -= 1
+            if not self._lifting or not self._holds():
+                self._forget()
+            return _lift(state, grip_m)
         if self._closing:
             self._closing -= 1
             if not self._closing:
@@ -89,7 +113,7 @@ class Retry:
             if not self._retreat or (grip_m[2] > ABOVE_M and self._widths[-1] > OPEN_WIDTH_M):
                 self._forget()
             if grip_m[2] < CLEAR_M:
-                return _straight_up(state)
+                return _moved(state, np.array((0.0, 0.0, UP_M)), OPEN)
             return _towards(np.array(contract.HOME_RAD), state, OPEN)
         return None
 
@@ -97,7 +121,7 @@ class Retry:
         """(8,) action of a hand that has held something at the lift's place for long enough; else None."""
         away_m = float(np.linalg.norm(grip_m - contract.LIFT_TARGET_M))
         there = self._stay_rad is not None or away_m < contract.LIFT_TOLERANCE_M
-        if not (there and EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M):
+        if not (there and self._holds()):
             self._lifted_steps, self._stay_rad = 0, None
             return None
         self._lifted_steps += 1
@@ -111,16 +135,29 @@ class Retry:
         widths = [*self._widths]
         if len(widths) >= EMPTY_STEPS and max(widths[-EMPTY_STEPS:]) < EMPTY_WIDTH_M:
             self._go_up(f"the hand closed to {1e3 * widths[-1]:.1f} mm, on nothing")
+        elif len(widths) > STILL_STEPS and self._keeps(grip_m):
+            self.begun, self._lifting = f"it has held something for {_SECONDS:.0f} s; lifts it", LIFTING_STEPS
         elif len(widths) > STILL_STEPS and self._stands(grip_m):
-            reason = f"the open hand has stood still for {STILL_STEPS * contract.CONTROL_DT_S:.0f} s"
+            reason = f"the open hand has stood still for {_SECONDS:.0f} s"
             if self._closed_once or any(self._met):
                 self._go_up(f"{reason} again" if self._closed_once else f"{reason} on something")
             else:
                 self.begun, self._closing, self._closed_once = f"{reason}; closes", CLOSING_STEPS, True
 
     def _stands(self, grip_m: Float[np.ndarray, "3"]) -> bool:
+        return self._still(grip_m) and min(self._widths) > OPEN_WIDTH_M
+
+    def _keeps(self, grip_m: Float[np.ndarray, "3"]) -> bool:
+        """Whether the fingers stand on something, and so does the hand."""
+        same = max(self._widths) - min(self._widths) < SAME_WIDTH_M
+        return self._still(grip_m) and same and EMPTY_WIDTH_M < self._widths[-1] < OPEN_WIDTH_M
+
+    def _still(self, grip_m: Float[np.ndarray, "3"]) -> bool:
         moved_m = float(np.linalg.norm(self._places[0] - grip_m))
-        return moved_m < STILL_M and min(self._widths) > OPEN_WIDTH_M and float(grip_m[2]) < LOW_M
+        return moved_m < self._still_m and float(grip_m[2]) < LOW_M
+
+    def _holds(self) -> bool:
+        return EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M
 
     def _go_up(self, reason: str) -> None:
         self.begun = f"{reason}; goes up to look again"
@@ -130,7 +167,7 @@ class Retry:
         self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
         self._widths: deque[float] = deque(maxlen=STILL_STEPS + 1)
         self._met: deque[bool] = deque(maxlen=STILL_STEPS + 1)
-        self._closing = self._retreat = 0
+        self._closing = self._retreat = self._lifting = 0
 
 
 def _still(gripper: float) -> Float[np.ndarray, "8"]:
@@ -139,12 +176,19 @@ def _still(gripper: float) -> Float[np.ndarray, "8"]:
     return action
 
 
-def _straight_up(state: Float[np.ndarray, "8"]) -> np.ndarray:
-    """(8,) action of an open hand that rises without turning (pseudo-inverse of the grip's Jacobian)."""
-    action = _still(OPEN)
-    rise = np.array([0.0, 0.0, UP_M, 0.0, 0.0, 0.0])
-    way_rad = np.linalg.pinv(grip_jacobian(state[STATE.arm].astype(np.float64))) @ rise
-    way = way_rad / contract.ACTION_SCALE_RAD
+def _lift(state: Float[np.ndarray, "8"], grip_m: Float[np.ndarray, "3"]) -> np.ndarray:
+    """(8,) action that brings what is held to where objects are lifted to, straight up first."""
+    way_m = contract.LIFT_TARGET_M - grip_m
+    if grip_m[2] < ABOVE_M:
+        way_m[:2] = 0.0
+    return _moved(state, way_m * min(1.0, UP_M / max(float(np.linalg.norm(way_m)), 1e-9)), CLOSE)
+
+
+def _moved(state: Float[np.ndarray, "8"], way_m: Float[np.ndarray, "3"], gripper: float) -> np.ndarray:
+    """(8,) action that moves the grip by (3,) `way_m` without turning it (pseudo-inverse of its Jacobian)."""
+    action = _still(gripper)
+    jacobian = grip_jacobian(state[STATE.arm].astype(np.float64))
+    way = np.linalg.pinv(jacobian) @ np.append(way_m, np.zeros(3)) / contract.ACTION_SCALE_RAD
     action[ACTION.arm] = way / max(1.0, float(np.abs(way).max()))
     return action
 

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ddgrasp import artifacts, contract
-from ddgrasp.config import Config, FrankaConfig
+from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from ddgrasp.progress import Progress
 from deploy.changes import Change
-from deploy.fr3_lab import Shapes
+from deploy.fr3_lab import Shapes, stopping_at
 from deploy.fr3_trials import Fr3Bench, Sight
 from deploy.recorded import RecordedBench
 from deploy.stage import STAGE
@@ -53,8 +53,8 @@ class Series:
 
     seconds: float = contract.TRIAL_S
     """A trial ends with success, or after this."""
-    contact: float = FrankaConfig.contact_force_n
-    """On rig fr3: newtons at the hand at which the arm stops itself."""
+    contact: float | None = None
+    """On rig fr3: newtons at the hand at which the arm stops itself; None: the configuration's."""
 
     depth: TreatmentName = RECORDED
     """What the policy sees: depth as recorded, inpaint (holes filled on line), or monocular (a network on
@@ -82,11 +82,14 @@ class Series:
         return Trial(self.known().index(name) * len(seeds.SEEDS[self.split]) + i, name)
 
     def configured(self, config: Config, policy: Path) -> Config:
-        """`config` with the trials' length, seed and objects. UserError if `policy` is no file."""
+        """`config` with the trials' length, seed, objects and the arm's limits. UserError if `policy` is no
+        file, or a limit not one that an arm has."""
         if not policy.is_file():
             raise UserError(f"{policy}: no such file; make one with `ddgrasp export`.")
         world = replace(config.world, objects=_trained())
         deploy = replace(config.deploy, retry=self.retry)
+        if self.contact is not None:
+            deploy = stopping_at(deploy, self.contact)
         config = replace(config, seed=seeds.seed(self.split, self.number), world=world, deploy=deploy)
         return lasting(config, self.seconds)
 
@@ -97,7 +100,7 @@ class Series:
         where a network's weights are missing."""
         treatment = treatment or make_treatment(self.depth, config)
         if self.rig == "fr3":
-            return Fr3Bench(self.shapes, self.camera, self.contact, treatment)
+            return Fr3Bench(self.shapes, self.camera, treatment)
         change = Change(sight="ideal" if self.camera == "ideal" else "stereo")
         return partial(Rig, change=change, treatment=treatment)
 
@@ -203,7 +206,7 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     """What the trials belong to; how many of which objects may grow."""
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
-    return made_with(config, policy) | bench
+    return made_with(config, policy) | bench | {"contact": config.deploy.franka.contact_force_n}
 
 
 def made_with(config: Config, policy: Path) -> dict[str, str]:

@@ -128,6 +128,11 @@ def assert_next_trial_runs(tmp_path, rig: Fr3Rig) -> None:
     assert (rig.channel.ask("state")["q_rad"][0] - before) * direction > 0.01
 
 
+def lift_off(tmp_path) -> None:
+    """Leaves an arm to the next test that is clear of the table."""
+    assert run_trial(tmp_path, config_for(HOST), joint_bias(j2=-1.0), steps=6).fault == ""
+
+
 def test_a_trial_moves_the_arm_at_10_hz_of_its_own_time(tmp_path, rig):
     before = rig.channel.ask("state")
     report = run_trial(tmp_path, config_for(HOST), joint_bias(j1=0.3), steps=6)
@@ -148,8 +153,7 @@ def test_reflex_from_hitting_the_table_ends_the_trial_in_one_line(tmp_path, rig)
     assert said[-1].endswith(report.fault) and "\n" not in report.fault
     assert json.loads(json.dumps(report.as_dict()))["fault"] == report.fault
     assert stands(rig) and rig.channel.ask("state")["error"] is None
-    up = run_trial(tmp_path, config_for(HOST), joint_bias(j2=-1.0), steps=6)
-    assert up.fault == ""
+    lift_off(tmp_path)
 
 
 def test_a_hand_that_comes_down_slowly_comes_to_stand_on_the_table(tmp_path, rig):
@@ -159,7 +163,7 @@ def test_a_hand_that_comes_down_slowly_comes_to_stand_on_the_table(tmp_path, rig
     assert report.fault == "" and report.steps == 50
     assert report.safety.by_cause["approach"] > 15
     assert grip_position(np.array(rig.channel.ask("state")["q_rad"]))[2] < 0.02
-    assert run_trial(tmp_path, config_for(HOST), joint_bias(j2=-1.0), steps=6).fault == ""
+    lift_off(tmp_path)
 
 
 def test_an_arm_that_presses_on_something_gives_way_and_says_so(tmp_path, rig):
@@ -168,8 +172,25 @@ def test_an_arm_that_presses_on_something_gives_way_and_says_so(tmp_path, rig):
     report = run_trial(tmp_path, shy, joint_bias(j2=1.0, j4=0.2), steps=50)
     assert report.fault == "" and report.steps == 50
     assert {event.kind for event in report.events} == {"touch"}
-    assert re.search(r"gave way \(\d+ N at the hand, \d+ N m on joint \d\)", report.events[0].reason)
-    assert run_trial(tmp_path, config_for(HOST), joint_bias(j2=-1.0), steps=6).fault == ""
+    said = r"gave way \(\d+ N and \d+ N m at the hand, \d+ N m on joint \d\)"
+    assert re.search(said, report.events[0].reason)
+    lift_off(tmp_path)
+
+
+def test_an_arm_that_gave_way_goes_up_when_it_is_told_to(tmp_path, rig):
+    config = config_for(HOST)
+    robot, clock = connect(replace(config, franka=replace(config.franka, give_way=0.2)))
+    robot.start()
+    down = np.array([0.0, 0.02, 0.0, 0.004, 0.0, 0.0, 0.0])
+    while not (state := robot.read_state()).met:
+        robot.command(state.q_rad + down, close=False)
+        clock.sleep_until(clock.now() + 0.1)
+    low_m = grip_position(state.q_rad)[2]
+    for _ in range(5):
+        robot.command(robot.read_state().q_rad - 3 * down, close=False)
+        clock.sleep_until(clock.now() + 0.1)
+    assert grip_position(robot.read_state().q_rad)[2] > low_m + 0.05
+    robot.stop()
 
 
 def test_lost_connection_ends_the_trial_and_the_next_one_runs_when_it_is_back(tmp_path, rig):

@@ -141,6 +141,21 @@ def test_the_table_counts_groups_and_faults():
     assert "apple        75.0 % of 4" in rig_trials.describe(table)
 
 
+def test_the_arm_s_limits_are_the_configuration_s_or_the_series_in_proportion(tmp_path):
+    policy = write_policy(tmp_path / "policy.onnx", describe(), bias=constant_bias(0.0, -1.0))
+    config = get_preset("debug")
+    franka = replace(config.deploy.franka, contact_force_n=40.0, contact_torque_nm=10.0)
+    own = replace(config, deploy=replace(config.deploy, franka=franka))
+    for contact, expected in ((None, (40.0, 10.0)), (60.0, (60.0, 15.0))):
+        series = Series(contact=contact)
+        made = series.configured(own, policy)
+        at = made.deploy.franka
+        assert (at.contact_force_n, at.contact_torque_nm) == expected
+        assert rig_trials._header(made, policy, series)["contact"] == expected[0]
+    with pytest.raises(UserError, match="contact_force_n is 200.0; expected 1 to 100"):
+        Series(contact=200.0).configured(own, policy)
+
+
 def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):
     policy = write_policy(
         tmp_path / "policy.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.0, -1.0)

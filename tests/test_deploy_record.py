@@ -75,6 +75,13 @@ def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
     assert (folder / "film.png").stat().st_size > 1000
 
 
+def test_a_step_before_which_the_arm_gave_way_says_to_what(run, monkeypatch):
+    read, met = KinematicRobot.read_state, iter(["", "16 N"])
+    monkeypatch.setattr(KinematicRobot, "read_state", lambda self: replace(read(self), met=next(met, "")))
+    rows = [json.loads(line) for line in (run()[1] / "steps.jsonl").read_text().splitlines()]
+    assert [row.get("met") for row in rows] == [None, "16 N", None, None, None]
+
+
 def test_two_in_a_second_are_two_recordings_of_one_folder(run, tmp_path):
     folders = {run()[1] for _ in range(2)}
     assert {recording.path for recording in find_recordings(tmp_path / "kept")} == folders

@@ -1,5 +1,7 @@
 """A hand that stands still or has closed on nothing: what it does instead of the policy, and when not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,10 +17,13 @@ from deploy.retry import (
     CLOSING_STEPS,
     DONE_STEPS,
     EMPTY_STEPS,
+    LIFTING_STEPS,
     LOW_M,
     RETREAT_STEPS,
+    STILL_M,
     STILL_STEPS,
     Retry,
+    still_for,
 )
 from deploy.safety import SafetyFilter, SafetyLimits
 from deploy_support import KinematicRobot, ScriptedCamera, constant_bias, depth_mm, describe, write_policy
@@ -67,10 +72,39 @@ def test_a_hand_that_closed_on_nothing_opens_and_goes_up_for_a_while_at_most():
     assert told(retry, LOW, OPEN, 1) == [None], "an arm that cannot get up does not try for ever"
 
 
+def test_a_hand_that_has_held_something_for_a_while_lifts_it_and_keeps_it():
+    aside = LOW + np.array([0.4, 0.25, 0, 0, 0, 0, 0])
+    retry, q_rad = Retry(), aside.copy()
+    assert told(retry, q_rad, HOLDING, STILL_STEPS) == [None] * STILL_STEPS
+    begun, ways_m = [], [grip_position(q_rad)]
+    while not retry.done and len(begun) < LIFTING_STEPS:
+        action = retry(state(q_rad, HOLDING))
+        assert action is not None and closes(action) and np.abs(action[ACTION.arm]).max() <= 1.0
+        begun.append(retry.begun)
+        q_rad = q_rad + contract.ACTION_SCALE_RAD * action[ACTION.arm]
+        ways_m.append(grip_position(q_rad))
+    assert begun[0] == "it has held something for 1 s; lifts it" and not any(begun[1:-1]) and retry.done
+    low = np.array([way for way in ways_m if way[2] < ABOVE_M])
+    assert len(low) > 2 and np.abs(low[:, :2] - low[0, :2]).max() < 0.01, "straight up first"
+    assert np.linalg.norm(ways_m[-1] - contract.LIFT_TARGET_M) < 0.01
+
+
+def test_fingers_that_close_are_let_close():
+    retry = Retry()
+    for step in range(2 * STILL_STEPS):
+        assert retry(state(LOW, 0.065 - 0.001 * step)) is None
+
+
+def test_a_hand_that_loses_what_it_lifts_is_the_policy_s():
+    retry = Retry()
+    told(retry, LOW, HOLDING, STILL_STEPS + 1)
+    assert retry(state(LOW, SHUT)) is not None and retry(state(LOW, OPEN)) is None
+
+
 @pytest.mark.parametrize(
     ("q_rad", "width_m", "drift_rad"),
-    [(LOW, HOLDING, 0.0), (HOME, OPEN, 0.0), (LOW, OPEN, 0.009)],
-    ids=["it holds something", "it waits above", "it moves, slowly"],
+    [(HOME, OPEN, 0.0), (LOW, OPEN, 0.009)],
+    ids=["it waits above", "it moves, slowly"],
 )
 def test_it_leaves_alone(q_rad, width_m, drift_rad):
     retry = Retry()
@@ -83,6 +117,14 @@ def test_a_hand_that_pushes_something_away_from_above_stands_still_too():
     retry, pushed_rad = Retry(), 0.004  # 2 mm in a step at joint 1's radius
     answers = [retry(state(LOW - [pushed_rad * step, *[0] * 6], OPEN)) for step in range(STILL_STEPS + 1)]
     assert answers[:-1] == [None] * STILL_STEPS and closes(answers[-1])
+
+
+def test_an_arm_that_may_only_creep_does_not_stand_still():
+    slow = replace(SafetyLimits(), approach_m_s=0.03, approach_below_m=0.16)
+    assert still_for(SafetyLimits()) == STILL_M
+    assert still_for(slow) < 0.03 * STILL_STEPS * contract.CONTROL_DT_S / 2
+    crawling = tuple(0.03 * limit for limit in contract.JOINT_VELOCITY_LIMIT_RAD_S)
+    assert still_for(replace(SafetyLimits(), velocity_rad_s=crawling)) < still_for(slow)
 
 
 def test_a_hand_that_met_something_and_stands_on_it_goes_up_at_once():

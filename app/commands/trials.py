@@ -31,9 +31,9 @@ class DeployTrials:
     """stereo (the rig's own), ideal (without errors), coarse (on rig fr3: matched at the policy's size)."""
     seconds: Annotated[float, Range(0.5, 60)] = contract.TRIAL_S
     """A trial ends with success, or after this."""
-    contact: Annotated[float, Range(0, 100)] = 0.0
-    """On rig fr3: newtons at the hand, and newton metres there, at which the arm stops itself; 0 takes what
-    the configuration has, 30 as deploy begins. The joints' torque is in proportion."""
+    contact: Annotated[float, Range(1, 100)] | None = None
+    """On rig fr3: newtons at the hand, and newton metres there, at which the arm stops itself; without it
+    what the configuration has, 30 as deploy begins. The joints' torque is in proportion."""
     depth: Literal["recorded", "inpaint", "monocular"] = "recorded"
     """What the policy sees: recorded, inpaint (holes filled on line), or monocular (a network on colour)."""
     retry: bool = True
@@ -63,7 +63,7 @@ class DeployTrials:
             self.shapes,
             self.camera,
             self.seconds,
-            self.contact or config.deploy.franka.contact_force_n,
+            self.contact,
             self.depth,
             self.retry,
         )

@@ -45,13 +45,13 @@ class FrankaConfig(Section, name="deploy.franka"):
     """How fast the hand may come down below `approach_below_m`. An arm that is stopped by what it lands on
     presses on it in proportion to the speed that it was to have."""
     approach_below_m: Annotated[float, Range(0, 2)] = 0.16
-    """Height of the point between the finger pads; 0 lets the hand come down at any speed. What is taller
-    than 14 cm needs more."""
+    """Height of the point between the finger pads below which that holds, and the arm has a third of its
+    stiffness unless it goes up; 0 is nowhere. What is taller than 14 cm needs more."""
     stiffness_nm_rad: Annotated[float, Range(50, 3000)] = 400.0
     """Stiffness of joints 1 to 4, 0.4 of it at the wrist: a stiffer arm presses harder on what it touches."""
     load_kg: Annotated[float, Range(0, 3)] = 0.0
-    """Mass that the arm carries beside its hand, between the fingers. What is grasped need not be known: it
-    must weigh less than the contact force allows."""
+    """Mass that the arm carries beside its hand, between the fingers. What is grasped need not be known if it
+    weighs less than what the arm gives way to, at the hand and on every joint: about 1 kg."""
     grip_force_n: Annotated[float, Range(0, 140, above=True)] = 20.0
     """Force of the gripper in newtons."""
 
@@ -80,8 +80,9 @@ class DeployConfig(Section, name="deploy"):
     execute_steps: Annotated[int, Range(0, 1000)] = 0
     """Actions played from a chunk before the network runs again; 0 takes the exported file's own."""
     retry: bool = True
-    """A hand that has closed on nothing goes up and looks again; one that stands still, low and open,
-    closes; one that has lifted something stays there (deploy/retry.py). Without it the policy alone acts."""
+    """A hand that has closed on nothing goes up and looks again; one that stands still, low and open, closes,
+    or goes up if it has met something; one that has held something for a second lifts it, and stays there
+    (deploy/retry.py). Without it the policy alone acts."""
     stale_periods: Annotated[float, Range(0, 1000, above=True)] = 2.0
     """A frame older than this many control periods makes the robot hold position."""
     acceleration_scale: Annotated[float, Range(0, 100, above=True)] = 2.0

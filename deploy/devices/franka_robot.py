@@ -23,13 +23,15 @@ from deploy import kinematics
 from deploy.devices import franka_faults
 from deploy.devices.franka_hand import FrankaHand
 from deploy.devices.franka_probe import check_arm
-from deploy.devices.franka_spring import FrankaSpring, priority_kept
+from deploy.devices.franka_spring import FrankaSpring, priority_kept, touched
 from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotError, RobotState
 
 AT_START_RAD = 0.01
 """No joint further than this from the start pose: the arm is there."""
 START_S = 120.0
+RISE_M = 0.002
+"""A hand goes up that is to be higher by more, in a control step: away from what it pressed on."""
 LOST = "the connection to"
 """How a fault begins that is the network's."""
 RECOVERY_S = 0.5
@@ -108,7 +110,8 @@ class FrankaRobot:
         assert self._hand is not None
         with self._reporting():
             self._arm.poll_motion()
-            self._spring().follow(q_target_rad, self._may_land(q_target_rad))
+            rises, lands = self._way(q_target_rad)
+            self._spring().follow(q_target_rad, soft=lands, heeds=not rises)
             self._hand.set(close)
         self._holding = False
 
@@ -170,6 +173,11 @@ class FrankaRobot:
             upper_force_threshold=config.contact_force_n,
         )
         arm.set_load(config.load_kg, [0.0, 0.0, kinematics.GRIP_D_M], [0.0] * 9)
+        if felt := touched(arm.state):
+            self._say(
+                f"the arm feels {felt} before it moves: does it touch something, or carry what it does "
+                "not know of (deploy.franka.load_kg, the hand in Desk)?"
+            )
         for limit, own in (
             (arm.joint_velocity_limit, self._limits.joint_velocity_rad_s),
             (arm.joint_acceleration_limit, self._limits.joint_acceleration_rad_s2),
@@ -210,12 +218,14 @@ class FrankaRobot:
     def _to(self, q_target_rad: Float[np.ndarray, "7"], **options: Any) -> Any:
         return self._franky.JointMotion([float(q) for q in q_target_rad], **options)
 
-    def _may_land(self, q_target_rad: Float[np.ndarray, "7"]) -> bool:
-        """Whether the hand comes down where the safety filter has it come down slowly."""
+    def _way(self, q_target_rad: Float[np.ndarray, "7"]) -> tuple[bool, bool]:
+        """Whether the hand goes up, and whether it may land on something: where the safety filter has it come
+        down slowly, unless it goes up."""
         here_m, there_m = (
-            kinematics.grip_position(np.asarray(q))[2] for q in (self._arm.state.q, q_target_rad)
+            float(kinematics.grip_position(np.asarray(q))[2]) for q in (self._arm.state.q, q_target_rad)
         )
-        return bool(there_m < min(here_m, self._config.approach_below_m))
+        rises = there_m > here_m + RISE_M
+        return rises, not rises and there_m < self._config.approach_below_m
 
     def _spring(self) -> FrankaSpring:
         if self._following is None:

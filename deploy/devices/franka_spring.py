@@ -21,9 +21,9 @@ WEIGHTS = np.array((1.0, 1.0, 1.0, 1.0, 0.4, 0.4, 0.4))
 DAMPING_S = 0.15
 """Damping over stiffness. Chosen on the FR3 rig so that a step is made within its period as in training."""
 SOFT = 1.0 / 3.0
-"""Share of stiffness and damping of an arm that comes down where it may land on something. What a hand that
-is stopped presses with is the torque that was to carry it on: damping times speed, and more the nearer it is
-to the base, with the square of the distance."""
+"""Share of stiffness and damping of an arm that may land on something. What a hand that is stopped presses
+with is what was to carry it on, (DAMPING_S + half a period) * stiffness * speed of every joint: in proportion
+to the stiffness, and at the hand the more the nearer it is to the base, with the square of the distance."""
 LATE = 1.5
 """Control periods for which a joint keeps its speed if no command follows; then it brakes."""
 _LOOK_S = 0.01
@@ -57,7 +57,7 @@ class FrankaSpring:
         self._motion: Any = franky.JointImpedanceTrackingMotion(
             stiffness=self._stiffness, damping=DAMPING_S * self._stiffness
         )
-        self._soft = False
+        self._soft, self._heeds = False, True
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._due_s: float | None = None
         self._met = ""
@@ -66,22 +66,24 @@ class FrankaSpring:
         self._watch = threading.Thread(target=self._brake_in_time, daemon=True)
         self._watch.start()
 
-    def follow(self, q_target_rad: Float[np.ndarray, "7"], soft: bool = False) -> None:
-        """Make the step to (7,) `q_target_rad` within a control period; `soft`: with `SOFT` of its strength.
+    def follow(self, q_target_rad: Float[np.ndarray, "7"], soft: bool = False, heeds: bool = True) -> None:
+        """Make the step to (7,) `q_target_rad` within a control period.
 
+        `soft`: with `SOFT` of the strength; `heeds`: gives way to what it touches, short of stopping itself.
         At the step's speed, about its middle: over the period the spring's pull is zero on average.
         """
         state = self._arm.state
         step = q_target_rad - np.asarray(state.q)
-        self._be(soft)
         with self._lock:
-            self._due_s = state.time.to_sec() + LATE * contract.CONTROL_DT_S
+            self._due_s, self._heeds = state.time.to_sec() + LATE * contract.CONTROL_DT_S, heeds
+            self._be(soft)
             self._set(np.asarray(state.q) + step / 2, step / contract.CONTROL_DT_S)
 
     def stay(self) -> None:
-        """Brake, and hold where the arm is now."""
+        """Brake, and hold where the arm is now, with all of its strength."""
         with self._lock:
-            self._stay()
+            self._be(soft=False)
+            self._stay(self._arm.state)
             self._due_s = None
 
     def met(self) -> str:
@@ -111,8 +113,8 @@ class FrankaSpring:
             self._motion.set_gains(gains)
             self._soft = soft
 
-    def _stay(self) -> None:
-        self._set(np.asarray(self._arm.state.q), np.zeros(len(contract.ARM_JOINTS)))
+    def _stay(self, state: Any) -> None:
+        self._set(np.asarray(state.q), np.zeros(len(contract.ARM_JOINTS)))
 
     def _set(self, q_rad: Float[np.ndarray, "7"], speed_rad_s: Float[np.ndarray, "7"]) -> None:
         self._motion.set_reference(self._franky.JointReference(q_rad, speed_rad_s))
@@ -131,16 +133,19 @@ class FrankaSpring:
             with self._lock:
                 if self._due_s is None:
                     continue
-                met = _touched(state)
+                met = touched(state) if self._heeds else ""
                 if met or state.time.to_sec() > self._due_s:
-                    self._stay()
+                    self._be(soft=self._soft and bool(met))
+                    self._stay(state)
                     self._due_s, self._met = None, met or self._met
 
 
-def _touched(state: Any) -> str:
+def touched(state: Any) -> str:
     """What the arm feels where its control unit sees a contact (the lower thresholds); empty elsewhere."""
     if not (np.any(state.joint_contact) or np.any(state.cartesian_contact)):
         return ""
-    force_n = np.linalg.norm(np.asarray(state.O_F_ext_hat_K)[:3])
+    force_n, turn_nm = map(np.linalg.norm, np.split(np.asarray(state.O_F_ext_hat_K), 2))
     torque_nm = np.abs(np.asarray(state.tau_ext_hat_filtered))
-    return f"{force_n:.0f} N at the hand, {torque_nm.max():.0f} N m on joint {torque_nm.argmax() + 1}"
+    joint = int(torque_nm.argmax())
+    hand = f"{force_n:.0f} N and {turn_nm:.0f} N m at the hand"
+    return f"{hand}, {torque_nm[joint]:.0f} N m on joint {joint + 1}"

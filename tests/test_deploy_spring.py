@@ -1,0 +1,122 @@
+"""The spring that an arm follows by: how strong it is when, and what it gives way to.
+
+Before an arm of plain values, which says what it feels; tests/test_deploy_fr3.py has one that really touches.
+"""
+
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from deploy.devices.franka_spring import DAMPING_S, SOFT, WEIGHTS, FrankaSpring
+
+STIFFNESS = 400.0
+STEP = np.full(7, 0.05)
+
+
+class Motion:
+    """What franky's tracking motion is told."""
+
+    def __init__(self, stiffness, damping):
+        self.gains, self.references = (stiffness, damping), []
+
+    def set_gains(self, gains):
+        self.gains = gains
+
+    def set_reference(self, reference):
+        self.references.append(reference)
+
+
+FRANKY = SimpleNamespace(
+    JointImpedanceTrackingMotion=Motion,
+    JointImpedanceGains=lambda stiffness, damping: (stiffness, damping),
+    JointReference=lambda q_rad, speed_rad_s: (q_rad, speed_rad_s),
+    Exception=type("FrankyException", (Exception,), {}),
+)
+
+
+class Arm:
+    """Stands where it is, feels what it is told to feel, and keeps this machine's time."""
+
+    def __init__(self):
+        self.touches, self.lost, self.moved = False, threading.Event(), None
+
+    @property
+    def state(self):
+        if self.lost.is_set():
+            raise RuntimeError("UDP receive: Timeout")
+        force = np.array([3.0, 0.0, 16.0, 0.0, 1.0, 0.0]) if self.touches else np.zeros(6)
+        return SimpleNamespace(
+            q=np.zeros(7), time=SimpleNamespace(to_sec=time.monotonic), O_F_ext_hat_K=force,
+            joint_contact=np.zeros(7), cartesian_contact=(np.abs(force) > 15.0).astype(float),
+            tau_ext_hat_filtered=np.array([0.0, -6.0, 0, 2.0, 0, 0, 0]) * self.touches,
+        )  # fmt: skip
+
+    def move(self, motion, asynchronous=False):
+        self.moved = motion
+
+
+@pytest.fixture
+def arm():
+    return Arm()
+
+
+@pytest.fixture
+def spring(arm):
+    spring = FrankaSpring(FRANKY, arm, STIFFNESS)
+    yield spring
+    spring.release()
+
+
+def braked(motion) -> bool:
+    return not motion.references[-1][1].any()
+
+
+def strength(motion) -> float:
+    """Share of stiffness and damping that it has."""
+    stiffness, damping = motion.gains
+    np.testing.assert_allclose(damping, DAMPING_S * stiffness)
+    return float((stiffness / (STIFFNESS * WEIGHTS)).mean())
+
+
+def test_it_follows_about_the_middle_of_the_step_at_its_speed(spring, arm):
+    spring.follow(STEP)
+    q_rad, speed_rad_s = arm.moved.references[-1]
+    np.testing.assert_allclose(q_rad, STEP / 2)
+    np.testing.assert_allclose(speed_rad_s, STEP / 0.1)
+    assert strength(arm.moved) == 1.0 and spring.met() == ""
+
+
+def test_it_gives_way_to_a_contact_says_what_and_goes_on_with_the_next_step(spring, arm):
+    arm.touches = True
+    spring.follow(STEP, soft=True)
+    time.sleep(0.05)
+    assert braked(arm.moved) and strength(arm.moved) == pytest.approx(SOFT), "as soft as it came"
+    assert spring.met() == "16 N and 1 N m at the hand, 6 N m on joint 2" and spring.met() == ""
+    arm.touches = False
+    spring.follow(STEP)
+    time.sleep(0.05)
+    assert not braked(arm.moved)
+
+
+def test_a_contact_does_not_keep_a_hand_from_going_up(spring, arm):
+    arm.touches = True
+    spring.follow(STEP, heeds=False)
+    time.sleep(0.05)
+    assert not braked(arm.moved) and spring.met() == ""
+
+
+@pytest.mark.parametrize("stops", [FrankaSpring.stay, lambda spring: time.sleep(0.25)], ids=["hold", "late"])
+def test_it_stands_with_all_of_its_strength(spring, arm, stops):
+    spring.follow(STEP, soft=True)
+    assert strength(arm.moved) == pytest.approx(SOFT)
+    stops(spring)
+    assert braked(arm.moved) and strength(arm.moved) == 1.0 and spring.met() == ""
+
+
+def test_the_watch_ends_with_the_connection(spring, arm):
+    arm.lost.set()
+    spring._watch.join(2.0)
+    assert not spring._watch.is_alive()
