@@ -1,4 +1,4 @@
-"""What a hand that stands still or has closed on nothing does: it closes, or looks again from above.
+"""What a hand that stands still or closed on nothing does: it closes, lifts what it has, or looks again.
 
 A policy sees three frames, 0.3 s. Nothing tells it that it has stood for a second around something taller
 than it believes, waiting to get lower, or that it closes beside the object again and again, where its own
@@ -25,6 +25,7 @@ EMPTY_STEPS = 2
 STILL_STEPS, STILL_M = 10, 0.030
 """A hand stands still that has moved by less within so many control steps. One that has a finger on what it
 is to grasp pushes it away by 10 to 25 mm in them; coming down slowly is 55 mm."""
+_SECONDS = STILL_STEPS * contract.CONTROL_DT_S
 STILL_SHARE, REACH_M = 0.4, 0.4
 """The same of an arm that may not go faster: share of the way that it may make, and how far a hand is at
 least from the joint that moves it."""
@@ -50,7 +51,6 @@ SAME_WIDTH_M = 0.002
 """Fingers that have moved by less stand on what is between them."""
 DONE_STEPS = 20
 """Control steps in a row that a hand has held something where objects are lifted to: it is done."""
-_SECONDS = STILL_STEPS * contract.CONTROL_DT_S
 OPEN = -1.0
 """The gripper's command while it goes up."""
 

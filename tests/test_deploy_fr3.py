@@ -182,9 +182,12 @@ def test_an_arm_that_gave_way_goes_up_when_it_is_told_to(tmp_path, rig):
     robot, clock = connect(replace(config, franka=replace(config.franka, give_way=0.2)))
     robot.start()
     down = np.array([0.0, 0.02, 0.0, 0.004, 0.0, 0.0, 0.0])
-    while not (state := robot.read_state()).met:
+    for _ in range(200):
+        if (state := robot.read_state()).met:
+            break
         robot.command(state.q_rad + down, close=False)
         clock.sleep_until(clock.now() + 0.1)
+    assert state.met, "it came down for 20 s and met nothing"
     low_m = grip_position(state.q_rad)[2]
     for _ in range(5):
         robot.command(robot.read_state().q_rad - 3 * down, close=False)

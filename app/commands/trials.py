@@ -53,7 +53,6 @@ class DeployTrials:
         from ddgrasp.progress import Progress
         from evaluation import rig_trials
 
-        config = config_of(self.policy, self.preset)
         series = rig_trials.Series(
             self.rig,
             self.objects,
@@ -67,6 +66,7 @@ class DeployTrials:
             self.depth,
             self.retry,
         )
+        config = config_of(self.policy, self.preset)
         progress = Progress(name="deploy trials")
         table = rig_trials.run(
             config, self.policy, series, self.out, self.workers, progress, record=self.record
