@@ -117,7 +117,7 @@ _ADDED_AFTER: dict[int, dict[str, Any]] = {
     7: {"student.picture.fill_holes": False},
     8: {"ddg.unet.position": False},
     9: {"deploy.retry": False},
-    10: {"deploy.franka.approach_m_s": 0.08, "deploy.franka.approach_below_m": 0.16},
+    10: {"deploy.franka.approach_m_s": 0.06, "deploy.franka.approach_below_m": 0.16},
     11: {"deploy.franka.give_way": 0.5},
 }
 """Version -> the fields that it lacked and the next one has, with what it did (10, 11: what is done now)."""

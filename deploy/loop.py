@@ -11,9 +11,10 @@ from jaxtyping import Float
 
 from ddgrasp.errors import UserError
 from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotError, RobotState
+from deploy.pace import Pace
 from deploy.policy import OnnxPolicy
 from deploy.retry import EMPTY_WIDTH_M, Retry, still_for
-from deploy.safety import NonFiniteAction, SafetyCounts, SafetyFilter
+from deploy.safety import APPROACH, NonFiniteAction, SafetyCounts, SafetyFilter
 from deploy.timing import Timings
 
 KEPT_EVENTS = 1000
@@ -115,6 +116,7 @@ class ControlLoop:
         """`say` is called with one line per event, as it happens."""
         self._camera, self._robot, self._policy = camera, robot, policy
         self._safety, self._clock, self._settings, self._say = safety, clock, settings, say
+        self._pace = Pace(safety.action_scale_rad)
         self._retry = Retry(still_for(safety.limits)) if settings.retry else None
         self._report = LoopReport(settings.period_s, safety=safety.counts)
         self._last_frame_s = -math.inf
@@ -189,18 +191,17 @@ class ControlLoop:
         problem = problem or _state_problem(state)
         self._report.width_m = float(state.width_m)
         self._tell_touch(state.met)
-        action, inferring = None, False
+        action, own, inferring = None, None, False
         started = time.perf_counter()
         if frame is not None and not problem:
-            inferring = self._policy.will_infer
-            action = self._policy.act(frame.depth, state.vector())
+            own, inferring = self._act(frame, state)
             if inferring:
                 timings.infer_s.append(time.perf_counter() - started)
-            action = self._or_retry(state, action)
+            action = self._or_retry(state, own)
         acting = time.perf_counter()
         target = None
         if action is not None:
-            target, problem = self._command(state, action)
+            target, problem = self._command(state, action, paced=action is own)
         if problem:
             self._hold(problem)
         else:
@@ -211,6 +212,14 @@ class ControlLoop:
             timings.latency_s.append(ended - started)
         return Step(self._report.steps, frame, state, None if problem else action, target)
 
+    def _act(self, frame: Frame, state: RobotState) -> tuple[np.ndarray, bool]:
+        """(8,) the policy's action, or what is left of its last one; whether the network ran for it."""
+        if not state.met and (rest := self._pace.rest(state.q_rad)) is not None:
+            return rest, False
+        self._pace.forget()
+        inferring = self._policy.will_infer
+        return self._policy.act(frame.depth, state.vector()), inferring
+
     def _or_retry(self, state: RobotState, action: np.ndarray) -> np.ndarray:
         """(8,) `action`, or what a hand does that tries again, after which the policy begins anew."""
         instead = None if self._retry is None else self._retry(state.vector(), bool(state.met))
@@ -220,6 +229,7 @@ class ControlLoop:
         if self._retry.begun:
             self._log("done" if self._retry.done else "retry", self._retry.begun)
         self._policy.restart()
+        self._pace.forget()
         return instead
 
     def _sense_camera(self) -> tuple[Frame | None, str]:
@@ -250,12 +260,17 @@ class ControlLoop:
                 "(world.camera_scale, export.depth_dtype)."
             )
 
-    def _command(self, state: RobotState, action: np.ndarray) -> tuple[np.ndarray | None, str]:
-        """(7,) target sent, or why none was."""
+    def _command(self, state: RobotState, action: np.ndarray, paced: bool) -> tuple[np.ndarray | None, str]:
+        """(7,) target sent, or why none was; `paced`: what a slow arm lacks of `action` comes next.
+
+        The fingers move when the hand is where it was to move them.
+        """
         try:
-            target, close, _ = self._safety.target(state.q_rad, action)
+            target, close, causes = self._safety.target(state.q_rad, action)
         except NonFiniteAction as error:
             return None, f"non-finite {error}"
+        if paced and not self._pace.made(state.q_rad, action, APPROACH in causes):
+            close = self._closed
         self._robot.command(target, close)
         self._closed = close
         return target, ""
@@ -265,6 +280,7 @@ class ControlLoop:
         self._safety.stopped()
         # The arm stands still, so after the gap one frame repeated is what three frames would show.
         self._policy.forget()
+        self._pace.forget()
         if self._retry is not None:
             self._retry.reset()
         self._report.holds += 1

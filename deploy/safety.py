@@ -18,6 +18,8 @@ from deploy import kinematics
 
 _BISECTIONS = 12
 """Halvings when a step must end inside the workspace: 1/4096 of the step, below 0.1 mm."""
+APPROACH = "approach"
+"""Cause of a change by which a hand that comes down makes a part of a step, straight on."""
 _NEWTON_STEPS = 3
 _SLIDE_TOLERANCE_M = 1e-4
 
@@ -58,7 +60,7 @@ class SafetyCounts:
     def as_dict(self) -> dict[str, int]:
         """Commands in all, and how many were changed for which cause."""
         causes = (
-            "action", "joint_position", "joint_velocity", "joint_acceleration", "approach",
+            "action", "joint_position", "joint_velocity", "joint_acceleration", APPROACH,
             "workspace", "arm",
         )  # fmt: skip
         return {"commands": self.commands} | {cause: self.by_cause[cause] for cause in causes}
@@ -132,7 +134,7 @@ class SafetyFilter:
         # All joints alike: the hand goes where it was told to, more slowly.
         slower = min(1.0, float((largest / np.maximum(np.abs(step), 1e-9)).min()))
         step = self._noted(step if slower == 1.0 else slower * step, step, "joint_velocity", causes)
-        step = self._noted(self._gently_down(q_rad, step), step, "approach", causes)
+        step = self._noted(self._gently_down(q_rad, step), step, APPROACH, causes)
         # A joint measured outside its range may only come back, and no faster than the limit above.
         room_down = np.minimum(np.array(limits.lower_rad) - q_rad, largest)
         room_up = np.maximum(np.array(limits.upper_rad) - q_rad, -largest)

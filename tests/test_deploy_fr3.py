@@ -177,6 +177,21 @@ def test_an_arm_that_presses_on_something_gives_way_and_says_so(tmp_path, rig):
     lift_off(tmp_path)
 
 
+def test_a_soft_arm_makes_the_small_steps_that_it_is_told_to(rig):
+    """Its joints stick with 1.1 N m: without what the driver adds it made less than half of them."""
+    robot, clock = connect(
+        replace(config_for(HOST), franka=replace(config_for(HOST).franka, approach_below_m=1.0))
+    )
+    robot.start()
+    begun_rad, step = robot.read_state().q_rad, np.array([0.007, 0, 0, 0, 0, 0, 0])
+    for _ in range(10):
+        robot.command(robot.read_state().q_rad + step, close=False)
+        clock.sleep_until(clock.now() + 0.1)
+    made_rad = robot.read_state().q_rad - begun_rad
+    robot.stop()
+    assert 0.8 < made_rad[0] / 0.07 < 1.1
+
+
 def test_an_arm_that_gave_way_goes_up_when_it_is_told_to(tmp_path, rig):
     config = config_for(HOST)
     robot, clock = connect(replace(config, franka=replace(config.franka, give_way=0.2)))

@@ -103,7 +103,7 @@ def test_a_real_arm_comes_down_slowly_and_the_development_rig_s_as_before():
     config = get_preset("debug")
     info = policy_metadata.describe(config.student, config.export, config.world.profile)
     franka, simulated = (safety_filter(config.deploy, info, robot).limits for robot in ("franka", "sim"))
-    assert (franka.approach_m_s, franka.approach_below_m) == (0.08, 0.16)
+    assert (franka.approach_m_s, franka.approach_below_m) == (0.06, 0.16)
     low, down = HOME.copy(), action(0.0, 1.0)
     while kinematics.grip_position(low)[2] > 0.018:
         low[1] += 0.01

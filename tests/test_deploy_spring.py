@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from deploy.devices.franka_spring import DAMPING_S, SOFT, WEIGHTS, FrankaSpring
+from deploy.devices.franka_spring import DAMPING_S, FRICTION_NM, SOFT, WEIGHTS, FrankaSpring
 
 STIFFNESS = 400.0
 STEP = np.full(7, 0.05)
@@ -89,9 +89,37 @@ def test_it_follows_about_the_middle_of_the_step_at_its_speed(spring, arm):
     assert strength(arm.moved) == 1.0 and spring.met() == ""
 
 
-def test_it_gives_way_to_a_contact_says_what_and_goes_on_with_the_next_step(spring, arm):
+@pytest.mark.parametrize("soft", [False, True])
+def test_what_a_joint_lacks_of_its_step_is_asked_for_again_as_far_as_friction_goes(spring, arm, soft):
+    def pull_nm() -> np.ndarray:
+        """Beyond what the step itself asks for."""
+        q_rad, speed_rad_s = arm.moved.references[-1]
+        stiffness, damping = arm.moved.gains
+        return stiffness * (q_rad - STEP / 2) + damping * (speed_rad_s - STEP / 0.1)
+
+    spring.follow(STEP, soft)
+    np.testing.assert_allclose(pull_nm(), 0.0, atol=1e-9)
+    for _ in range(3):
+        spring.follow(STEP, soft)
+        np.testing.assert_allclose(pull_nm(), FRICTION_NM)
+    spring.follow(-STEP, soft)
+    np.testing.assert_allclose(arm.moved.references[-1], [-STEP / 2, -STEP / 0.1], err_msg="against the step")
+    spring.follow(STEP, soft)
+    spring.stay()
+    spring.follow(STEP, soft)
+    np.testing.assert_allclose(pull_nm(), 0.0, atol=1e-9)
+
+
+def test_an_arm_that_touches_something_makes_no_step_that_heeds_it(spring, arm):
     arm.touches = True
     spring.follow(STEP, soft=True)
+    assert braked(arm.moved) and spring.met()
+
+
+def test_it_gives_way_to_a_contact_says_what_and_goes_on_with_the_next_step(spring, arm):
+    spring.follow(STEP, soft=True)
+    assert not braked(arm.moved)
+    arm.touches = True
     time.sleep(0.05)
     assert braked(arm.moved) and strength(arm.moved) == pytest.approx(SOFT), "as soft as it came"
     assert spring.met() == "16 N and 1 N m at the hand, 6 N m on joint 2" and spring.met() == ""

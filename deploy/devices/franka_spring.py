@@ -24,6 +24,9 @@ SOFT = 1.0 / 3.0
 """Share of stiffness and damping of an arm that may land on something. What a hand that is stopped presses
 with is what was to carry it on, (DAMPING_S + half a period) * stiffness * speed of every joint: in proportion
 to the stiffness, and at the hand the more the nearer it is to the base, with the square of the distance."""
+FRICTION_NM = 1.2 * WEIGHTS
+"""At most this is added to a joint that does not make its steps. The first four joints of an FR3 stick with
+1.1 N m (franky-sim's model of it), with which a soft arm makes 0.45 of steps of 0.007 rad."""
 LATE = 1.5
 """Control periods for which a joint keeps its speed if no command follows; then it brakes."""
 _LOOK_S = 0.01
@@ -60,6 +63,8 @@ class FrankaSpring:
         self._soft, self._heeds = False, True
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._due_s: float | None = None
+        self._target_rad: np.ndarray | None = None
+        self._owed_rad = np.zeros(len(contract.ARM_JOINTS))
         self._met = ""
         self.stay()
         arm.move(self._motion, asynchronous=True)
@@ -70,21 +75,27 @@ class FrankaSpring:
         """Make the step to (7,) `q_target_rad` within a control period.
 
         `soft`: with `SOFT` of the strength; `heeds`: gives way to what it touches, short of stopping itself.
-        At the step's speed, about its middle: over the period the spring's pull is zero on average.
+        At the step's speed, about its middle: over the period the spring's pull is zero on average. What
+        joints lacked of the steps before, within `FRICTION_NM`, is added. An arm that touches something
+        already makes no step that heeds it: it would press with the step's pull on top.
         """
         state = self._arm.state
-        step = q_target_rad - np.asarray(state.q)
+        q_rad = np.asarray(state.q)
+        step = q_target_rad - q_rad
         with self._lock:
-            self._due_s, self._heeds = state.time.to_sec() + LATE * contract.CONTROL_DT_S, heeds
             self._be(soft)
-            self._set(np.asarray(state.q) + step / 2, step / contract.CONTROL_DT_S)
+            if heeds and (met := touched(state)):
+                self._give_way(state, met)
+                return
+            self._due_s, self._heeds = state.time.to_sec() + LATE * contract.CONTROL_DT_S, heeds
+            owed = self._owe(q_rad, step)
+            self._set(q_rad + step / 2 + owed, (step + owed) / contract.CONTROL_DT_S)
+            self._target_rad = q_target_rad
 
     def stay(self) -> None:
         """Brake, and hold where the arm is now, with all of its strength."""
         with self._lock:
-            self._be(soft=False)
-            self._stay(self._arm.state)
-            self._due_s = None
+            self._brake(self._arm.state)
 
     def met(self) -> str:
         """What the arm gave way to since the last call, in words; empty if to nothing."""
@@ -108,12 +119,35 @@ class FrankaSpring:
     def _be(self, soft: bool) -> None:
         """The controller comes to the new gains by itself, with a time constant of 0.1 s."""
         if soft != self._soft:
-            stiffness = self._stiffness * (SOFT if soft else 1.0)
-            gains = self._franky.JointImpedanceGains(stiffness, DAMPING_S * stiffness)
-            self._motion.set_gains(gains)
             self._soft = soft
+            gains = self._franky.JointImpedanceGains(self._strength(), DAMPING_S * self._strength())
+            self._motion.set_gains(gains)
+
+    def _give_way(self, state: Any, met: str) -> None:
+        """Stand, as soft as it came."""
+        self._stay(state)
+        self._met = met
+
+    def _brake(self, state: Any) -> None:
+        """Stand with all of its strength."""
+        self._be(soft=False)
+        self._stay(state)
+
+    def _owe(self, q_rad: Float[np.ndarray, "7"], step: Float[np.ndarray, "7"]) -> Float[np.ndarray, "7"]:
+        """(7,) what is left of the steps before the joints at `q_rad`; nothing of it against `step`."""
+        if self._target_rad is not None:
+            pull_nm_rad = self._strength() * (1.0 + DAMPING_S / contract.CONTROL_DT_S)
+            most = FRICTION_NM / pull_nm_rad
+            self._owed_rad = np.clip(self._owed_rad + self._target_rad - q_rad, -most, most)
+        self._owed_rad = np.where(self._owed_rad * step > 0.0, self._owed_rad, 0.0)
+        return self._owed_rad
+
+    def _strength(self) -> Float[np.ndarray, "7"]:
+        return self._stiffness * (SOFT if self._soft else 1.0)
 
     def _stay(self, state: Any) -> None:
+        self._due_s, self._target_rad = None, None
+        self._owed_rad = np.zeros(len(contract.ARM_JOINTS))
         self._set(np.asarray(state.q), np.zeros(len(contract.ARM_JOINTS)))
 
     def _set(self, q_rad: Float[np.ndarray, "7"], speed_rad_s: Float[np.ndarray, "7"]) -> None:
@@ -134,10 +168,10 @@ class FrankaSpring:
                 if self._due_s is None:
                     continue
                 met = touched(state) if self._heeds else ""
-                if met or state.time.to_sec() > self._due_s:
-                    self._be(soft=self._soft and bool(met))
-                    self._stay(state)
-                    self._due_s, self._met = None, met or self._met
+                if met:
+                    self._give_way(state, met)
+                elif state.time.to_sec() > self._due_s:
+                    self._brake(state)
 
 
 def touched(state: Any) -> str:
