@@ -58,6 +58,8 @@ class Step:
     """(8,), None where the loop held position."""
     q_target_rad: Float[np.ndarray, "7"] | None
     """(7,) after the safety filter, None where the loop held position."""
+    close: bool = False
+    """Whether the fingers were told to close, last: they wait for a slow hand."""
 
 
 @dataclass
@@ -201,7 +203,7 @@ class ControlLoop:
         acting = time.perf_counter()
         target = None
         if action is not None:
-            target, problem = self._command(state, action, paced=action is own)
+            target, problem = self._command(state, action, paced=action is own and not state.met)
         if problem:
             self._hold(problem)
         else:
@@ -210,11 +212,12 @@ class ControlLoop:
         timings.act_s.append(ended - acting)
         if action is not None and inferring:
             timings.latency_s.append(ended - started)
-        return Step(self._report.steps, frame, state, None if problem else action, target)
+        return Step(self._report.steps, frame, state, None if problem else action, target, self._closed)
 
     def _act(self, frame: Frame, state: RobotState) -> tuple[np.ndarray, bool]:
         """(8,) the policy's action, or what is left of its last one; whether the network ran for it."""
         if not state.met and (rest := self._pace.rest(state.q_rad)) is not None:
+            self._policy.wait(state.vector())
             return rest, False
         self._pace.forget()
         inferring = self._policy.will_infer
@@ -263,7 +266,7 @@ class ControlLoop:
     def _command(self, state: RobotState, action: np.ndarray, paced: bool) -> tuple[np.ndarray | None, str]:
         """(7,) target sent, or why none was; `paced`: what a slow arm lacks of `action` comes next.
 
-        The fingers move when the hand is where it was to move them.
+        The fingers move when the hand is where it was to move them, or can go no further.
         """
         try:
             target, close, causes = self._safety.target(state.q_rad, action)

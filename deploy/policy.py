@@ -128,7 +128,9 @@ class OnnxPolicy:
         return ""
 
     def act(self, depth: Depth, state: Float[np.ndarray, " _"]) -> Float32[np.ndarray, "8"]:
-        """(8,) action for the newest frame (H, W) and the state (8,). Call once per control period.
+        """(8,) action for the newest frame (H, W) and the state (8,).
+
+        Call this or `wait` in every control step.
 
         UserError for a frame of another size or type, and for a state that is not eight finite numbers; the
         frames of before stay.
@@ -144,6 +146,10 @@ class OnnxPolicy:
         if not self._actions:
             self._actions.extend(self._infer(known)[: self.execute_steps])
         return self._latch(self._actions.popleft())
+
+    def wait(self, state: Float[np.ndarray, " _"]) -> None:
+        """A control step in which the policy is not asked: the fingers move all the same."""
+        self._width_change(state)
 
     def warm_up(self) -> None:
         """Run the network once, so that the first period does not pay for memory."""

@@ -66,6 +66,7 @@ class DeploymentRecord:
         if step.state.met:
             row["met"] = step.state.met
         row["action"] = None if step.action is None else np.asarray(step.action, float).tolist()
+        row["close"] = step.close
         row["q_target_rad"] = None if step.q_target_rad is None else step.q_target_rad.tolist()
         self._rows.append(row)
         if step.frame is None:

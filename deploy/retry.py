@@ -24,9 +24,9 @@ EMPTY_STEPS = 2
 """Control steps in a row for which it is to be so."""
 STILL_STEPS, STILL_M = 10, 0.030
 """A hand stands still that has moved by less within so many control steps. One that has a finger on what it
-is to grasp pushes it away by 10 to 25 mm in them; coming down slowly is 55 mm."""
+is to grasp pushes it away by 10 to 25 mm in them; coming down slowly is 60 mm."""
 _SECONDS = STILL_STEPS * contract.CONTROL_DT_S
-STILL_SHARE, REACH_M = 0.4, 0.4
+STILL_SHARE, REACH_M = 0.5, 0.4
 """The same of an arm that may not go faster: share of the way that it may make, and how far a hand is at
 least from the joint that moves it."""
 OPEN_WIDTH_M = 0.07

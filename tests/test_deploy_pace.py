@@ -62,17 +62,20 @@ def test_a_slow_hand_makes_every_action_whole_and_the_policy_waits_for_it(tmp_pa
     assert slow.closes == [False, False, True, True, True, True], "when the hand is where it was to close"
 
 
-def test_a_hand_that_met_something_asks_the_policy_at_once(tmp_path):
+def test_a_hand_that_met_something_asks_the_policy_at_once_and_closes_when_it_says_so(tmp_path):
     assert run(tmp_path, 6, 0.08)[1] == 2
-    assert run(tmp_path, 6, 0.08, met_at=2)[1] == 3
+    robot, asked = run(tmp_path, 3, 0.08, met_at=1)
+    assert asked == 3 and robot.closes[:2] == [False, True]
 
 
 def test_an_arm_that_comes_no_nearer_has_made_what_it_can():
     pace, q_rad, action = Pace(SCALE_RAD), np.array(HOME_RAD), np.append(np.full(7, 0.5), -1.0)
     assert pace.rest(q_rad) is None and not pace.made(q_rad, action, cut=True)
-    nearer = q_rad + 0.02
-    np.testing.assert_allclose(pace.rest(nearer), np.append(np.full(7, 0.3), -1.0))
-    assert pace.rest(nearer) is None
+    nearer, rest = q_rad + 0.02, np.append(np.full(7, 0.3), -1.0)
+    np.testing.assert_allclose(pace.rest(nearer), rest)
+    assert not pace.made(nearer, rest, cut=True)
+    np.testing.assert_allclose(pace.rest(nearer), rest)
+    assert pace.made(nearer, rest, cut=True) and pace.rest(nearer) is None
 
 
 @pytest.mark.parametrize("beyond", [1.0, 3.0])

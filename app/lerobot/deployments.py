@@ -9,6 +9,7 @@ import numpy as np
 
 from app.lerobot.episode import Episode, Picture, Source
 from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION, STATE
 from deploy.record import STEPS_FILE
 from evaluation.report.deployments import Deployment
@@ -39,7 +40,8 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
         "Robot": f"Franka arm; driver or rig: {_each(usable, 'robot')}.",
         "Camera": f"{_each(usable, 'camera')}, across the table; its depth is raw, with its holes and noise.",
         "How it was made": f"A depth-only policy ({_each(usable, 'policy')}) moved the arm. `action` is what "
-        "it asked for, before the safety filter. Success is what the rig knows or a person answered.",
+        "it asked for, before the safety filter, or what a slow arm lacked of that. Success is what the rig "
+        "knows or a person answered.",
     }
     return Source("deployments", "franka", about, [partial(_read, each) for each in usable], left_out)
 
@@ -92,5 +94,7 @@ def actions(rows: Sequence[Mapping[str, Any]]) -> np.ndarray:
         if row["action"] is not None:
             action[:] = row["action"]
             gripper = action[ACTION.gripper.start]
+        if "close" in row:  # the fingers wait for a slow hand
+            gripper = CLOSE if row["close"] else OPEN
         action[ACTION.gripper] = gripper
     return made

@@ -76,7 +76,7 @@ class FrankaSpring:
 
         `soft`: with `SOFT` of the strength; `heeds`: gives way to what it touches, short of stopping itself.
         At the step's speed, about its middle: over the period the spring's pull is zero on average. What
-        joints lacked of the steps before, within `FRICTION_NM`, is added. An arm that touches something
+        joints lacked of the steps before, within `FRICTION_NM`, is added. A soft arm that touches something
         already makes no step that heeds it: it would press with the step's pull on top.
         """
         state = self._arm.state
@@ -84,7 +84,7 @@ class FrankaSpring:
         step = q_target_rad - q_rad
         with self._lock:
             self._be(soft)
-            if heeds and (met := touched(state)):
+            if soft and heeds and (met := touched(state)):
                 self._give_way(state, met)
                 return
             self._due_s, self._heeds = state.time.to_sec() + LATE * contract.CONTROL_DT_S, heeds
