@@ -19,7 +19,8 @@ class ClosingLatch:
     """Lets a closing last, once begun; call it with every action that is about to be executed.
 
     Args:
-      steps: control steps that a closing lasts at least; 0 lets every action pass as it is.
+      steps: actions that a closing lasts at least, one for a control step unless a slow arm takes several;
+        0 lets every action pass as it is.
     """
 
     def __init__(self, steps: int):
