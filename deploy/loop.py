@@ -59,7 +59,7 @@ class Step:
     q_target_rad: Float[np.ndarray, "7"] | None
     """(7,) after the safety filter, None where the loop held position."""
     close: bool = False
-    """Whether the fingers were told to close, last: they wait for a slow hand."""
+    """Whether the fingers were last told to close; they wait for a slow hand, `action` does not say so."""
 
 
 @dataclass

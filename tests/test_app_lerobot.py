@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from app.commands import parse
-from app.lerobot import card, dataset, steps
+from app.lerobot import card, dataset, deployments, steps
 from app.lerobot.source import limited, open_source
 from ddgrasp import contract
 from ddgrasp.errors import UserError
@@ -272,3 +272,15 @@ def test_a_video_caps_what_is_too_far_and_the_card_says_so(read, tmp_path):
     assert f"{contents.farther} pixels" in (tmp_path / "set" / "README.md").read_text()
     item = LeRobotDataset("set", root=tmp_path / "set")[2]
     np.testing.assert_array_equal(item[steps.DEPTH][0].numpy(), np.minimum(depth_mm[2], 4095))
+
+
+def test_a_gripper_that_waits_for_a_slow_hand_is_told_as_it_was_told():
+    asked = [*[0.1] * 7, 1.0]
+    rows = [
+        {"action": asked, "close": False},
+        {"action": asked, "close": True},
+        {"action": None, "close": True},
+    ]
+    assert deployments.actions(rows)[:, 7].tolist() == [-1.0, 1.0, 1.0]
+    before = [{"action": asked}, {"action": None}]  # rows of before 2026-11-26
+    assert deployments.actions(before)[:, 7].tolist() == [1.0, 1.0]

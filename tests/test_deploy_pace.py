@@ -26,6 +26,9 @@ class Robot(KinematicRobot):
         super().__init__(clock)
         self.heights_m, self.closes = [], []
 
+    def read_state(self):
+        return replace(super().read_state(), width_m=0.08 - 0.01 * len(self.closes))
+
     def command(self, q_target_rad, close):
         super().command(q_target_rad, close)
         self.heights_m.append(kinematics.grip_position(q_target_rad)[2])
@@ -33,7 +36,7 @@ class Robot(KinematicRobot):
 
 
 def run(tmp_path, steps: int, approach_m_s: float, met_at: int | None = None):
-    """(robot, how often the policy was asked) after so many control steps."""
+    """(robot, what the policy was told of its state whenever it was asked) after so many control steps."""
     clock, info = SimClock(), describe()
     robot = Robot(clock)
     policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", info, bias=DOWN))
@@ -48,14 +51,16 @@ def run(tmp_path, steps: int, approach_m_s: float, met_at: int | None = None):
     safety = SafetyFilter(limits, info.action_scale_rad)
     camera = ScriptedCamera(clock, [depth_mm()])
     ControlLoop(camera, robot, policy, safety, clock, LoopSettings(0.1)).run(steps)
-    return robot, len(asked)
+    return robot, np.array(asked)
 
 
 def test_a_slow_hand_makes_every_action_whole_and_the_policy_waits_for_it(tmp_path):
     fast, asked = run(tmp_path, 2, np.inf)
-    assert asked == 2 and fast.closes == [True, True]
+    assert len(asked) == 2 and fast.closes == [True, True]
     slow, asked = run(tmp_path, 6, 0.08)
-    assert asked == 2
+    np.testing.assert_allclose(
+        asked[:, -1], [0.0, -0.01], atol=1e-6, err_msg="the last step's change of width"
+    )
     np.testing.assert_allclose(slow.heights_m[2::3], fast.heights_m, atol=1e-4)
     np.testing.assert_allclose(slow.q_rad, fast.q_rad, atol=1e-6)
     assert np.diff(slow.heights_m).min() > -0.0085
@@ -63,9 +68,9 @@ def test_a_slow_hand_makes_every_action_whole_and_the_policy_waits_for_it(tmp_pa
 
 
 def test_a_hand_that_met_something_asks_the_policy_at_once_and_closes_when_it_says_so(tmp_path):
-    assert run(tmp_path, 6, 0.08)[1] == 2
+    assert len(run(tmp_path, 6, 0.08)[1]) == 2
     robot, asked = run(tmp_path, 3, 0.08, met_at=1)
-    assert asked == 3 and robot.closes[:2] == [False, True]
+    assert len(asked) == 3 and robot.closes[:2] == [False, True]
 
 
 def test_an_arm_that_comes_no_nearer_has_made_what_it_can():

@@ -67,6 +67,7 @@ def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
     assert recording.optics() == pytest.approx((168.6, 0.095), abs=0.1)
     rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
     assert [row["frame"] for row in rows] == list(range(5)) and len(rows[0]["q_rad"]) == 7
+    assert [row["close"] for row in rows] == [False] * 5
     assert rows[1]["action"][0] == pytest.approx(0.2) and rows[1]["q_target_rad"][0] > rows[1]["q_rad"][0]
     kept = json.loads((folder / "report.json").read_text())
     assert kept["calibration"] is None, "the simulated robot has no camera to calibrate"
