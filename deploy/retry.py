@@ -15,6 +15,7 @@ from jaxtyping import Float
 from ddgrasp import contract
 from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION, STATE
+from deploy.aside import FINGER_M, Aside, pressed_at
 from deploy.kinematics import grip_jacobian, grip_position
 from deploy.safety import SafetyLimits
 
@@ -35,6 +36,11 @@ LOW_M = 0.20
 """Only below this height of the grip does standing still mean that it is at something."""
 CLOSING_STEPS = 10
 """Control steps given to fingers to close: a Franka Hand's from open to shut, and two."""
+FELT_STEPS, STOPPED_M = 3, 0.004
+"""Control steps in a row in which the arm feels something on the same finger of an open hand, and by how much
+it comes down in them at most; coming down slowly is 12 mm."""
+BEGUN_STEPS = 3
+"""After so many of them, fingers that do not move have something between them."""
 CLEAR_M = 0.16
 """Below this height of the grip a hand goes straight up: sideways it takes with it what it stands at."""
 UP_M = 0.03
@@ -65,10 +71,11 @@ def still_for(limits: SafetyLimits) -> float:
 class Retry:
     """Acts instead of the policy for a while; call it with the robot's state in every control step.
 
-    A hand that is empty goes up with open fingers, then towards the start pose. One that stands still, low
-    and open, closes once; if it comes to stand still again, or has met something, it goes up: then a finger
-    is on what it is to grasp. One that stands still with something in it lifts it, straight up, then to where
-    objects are lifted to. One that has lifted something stays there for as long as it has it.
+    A hand that is empty goes up with open fingers, then towards the start pose. One that is low and open and
+    stands still closes once; if it comes to stand still again it goes up. One that has a finger on what it is
+    to grasp steps aside (`deploy.aside`), closes, and lifts what it has then. One that stays low with
+    something in it lifts it, straight up, then to where objects are lifted to. One that has lifted something
+    stays there for as long as it has it.
     """
 
     def __init__(self, still_m: float = STILL_M) -> None:
@@ -87,17 +94,27 @@ class Retry:
         self._lifted_steps = 0
         self._stay_rad: np.ndarray | None = None
 
-    def __call__(self, state: Float[np.ndarray, "8"], met: bool = False) -> Float[np.ndarray, "8"] | None:
-        """(8,) action for the state (8,), None where the policy is to act; `met`: the arm gave way."""
+    def __call__(
+        self, state: Float[np.ndarray, "8"], met: bool = False, felt_nm: Float[np.ndarray, "7"] | None = None
+    ) -> Float[np.ndarray, "8"] | None:
+        """(8,) action for the state (8,), None where the policy is to act.
+
+        `met`: the arm gave way; `felt_nm`: (7,) what pressed on it, see `RobotState`.
+        """
         self.begun, self.done = "", False
-        grip_m = grip_position(state[STATE.arm].astype(np.float64))
+        q_rad = state[STATE.arm].astype(np.float64)
+        grip_m = grip_position(q_rad)
         self._places.append(grip_m)
         self._widths.append(float(state[STATE.width][0]))
-        self._met.append(met)
+        self._pressed_m.append(pressed_at(q_rad, felt_nm))
         if (stay := self._stay(state, grip_m)) is not None:
             return stay
-        if not (self._closing or self._retreat or self._lifting):
-            self._look(grip_m)
+        if not (self._closing or self._retreat or self._lifting or self._aside):
+            self._look(q_rad, grip_m)
+        if self._aside is not None:
+            way_m = self._aside(q_rad, met, felt_nm)
+            if not self._ends_aside(self._aside):
+                return _moved(state, way_m, OPEN)
         if self._lifting:
             self._lifting -= 1
             if not self._lifting or not self._holds():
@@ -105,8 +122,10 @@ class Retry:
             return _lift(state, grip_m)
         if self._closing:
             self._closing -= 1
-            if not self._closing:
+            lifts = self._then_lifts and self._grips()
+            if lifts or not self._closing:
                 self._forget()
+                self._lifting = LIFTING_STEPS if lifts else 0
             return _still(CLOSE)
         if self._retreat:
             self._retreat -= 1
@@ -130,27 +149,51 @@ class Retry:
             self.begun, self.done = "what was grasped is lifted; stays there", True
         return None if self._stay_rad is None else _towards(self._stay_rad, state, CLOSE)
 
-    def _look(self, grip_m: Float[np.ndarray, "3"]) -> None:
+    def _ends_aside(self, aside: Aside) -> bool:
+        """Whether the hand does something else from now on."""
+        if aside.failed:
+            self._go_up("a finger is on something wherever the hand comes down")
+        elif aside.ended:
+            self._closing, self._then_lifts = CLOSING_STEPS, True
+        else:
+            return False
+        self._aside = None
+        return True
+
+    def _look(self, q_rad: Float[np.ndarray, "7"], grip_m: Float[np.ndarray, "3"]) -> None:
         """Whether to take over, and how."""
         widths = [*self._widths]
         if len(widths) >= EMPTY_STEPS and max(widths[-EMPTY_STEPS:]) < EMPTY_WIDTH_M:
             self._go_up(f"the hand closed to {1e3 * widths[-1]:.1f} mm, on nothing")
         elif len(widths) > STILL_STEPS and self._keeps(grip_m):
             self.begun, self._lifting = f"it has held something for {_SECONDS:.0f} s; lifts it", LIFTING_STEPS
+        elif self._lands_on_a_finger(grip_m):
+            self._aside = Aside(q_rad, self._pressed_m[-1], self._places[-FELT_STEPS])
+            self.begun = "a finger of the open hand is on something; steps aside"
         elif len(widths) > STILL_STEPS and self._stands(grip_m):
             reason = f"the open hand has stood still for {_SECONDS:.0f} s"
-            if self._closed_once or any(self._met):
-                self._go_up(f"{reason} again" if self._closed_once else f"{reason} on something")
+            if self._closed_once:
+                self._go_up(f"{reason} again")
             else:
                 self.begun, self._closing, self._closed_once = f"{reason}; closes", CLOSING_STEPS, True
+
+    def _lands_on_a_finger(self, grip_m: Float[np.ndarray, "3"]) -> bool:
+        """Whether the same finger of an open hand has been on something that keeps it from coming down."""
+        at_m = [float(pressed_m[1]) for pressed_m in self._pressed_m][-FELT_STEPS:]
+        if len(at_m) < FELT_STEPS or max(min(at_m), -max(at_m)) < FINGER_M:
+            return False
+        stopped = float(self._places[-FELT_STEPS][2] - grip_m[2]) < STOPPED_M
+        return stopped and self._widths[-1] > OPEN_WIDTH_M and float(grip_m[2]) < LOW_M
 
     def _stands(self, grip_m: Float[np.ndarray, "3"]) -> bool:
         return self._still(grip_m) and min(self._widths) > OPEN_WIDTH_M
 
     def _keeps(self, grip_m: Float[np.ndarray, "3"]) -> bool:
-        """Whether the fingers stand on something, and so does the hand."""
+        """Whether the fingers stand on something, and the hand stays low with it."""
         same = max(self._widths) - min(self._widths) < SAME_WIDTH_M
-        return self._still(grip_m) and same and EMPTY_WIDTH_M < self._widths[-1] < OPEN_WIDTH_M
+        raised_m = float(grip_m[2] - self._places[0][2])
+        stays = raised_m < self._still_m and float(grip_m[2]) < LOW_M
+        return stays and same and EMPTY_WIDTH_M < self._widths[-1] < OPEN_WIDTH_M
 
     def _still(self, grip_m: Float[np.ndarray, "3"]) -> bool:
         moved_m = float(np.linalg.norm(self._places[0] - grip_m))
@@ -159,6 +202,12 @@ class Retry:
     def _holds(self) -> bool:
         return EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M
 
+    def _grips(self) -> bool:
+        """Whether fingers that were told to close `BEGUN_STEPS` ago have come to stand on something."""
+        before_m, now_m = [*self._widths][-2:]
+        begun = self._closing <= CLOSING_STEPS - BEGUN_STEPS
+        return begun and self._holds() and before_m - now_m < SAME_WIDTH_M
+
     def _go_up(self, reason: str) -> None:
         self.begun = f"{reason}; goes up to look again"
         self._retreat, self._closed_once = RETREAT_STEPS, False
@@ -166,8 +215,10 @@ class Retry:
     def _forget(self) -> None:
         self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
         self._widths: deque[float] = deque(maxlen=STILL_STEPS + 1)
-        self._met: deque[bool] = deque(maxlen=STILL_STEPS + 1)
+        self._pressed_m: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
         self._closing = self._retreat = self._lifting = 0
+        self._aside: Aside | None = None
+        self._then_lifts = False
 
 
 def _still(gripper: float) -> Float[np.ndarray, "8"]:
@@ -181,12 +232,14 @@ def _lift(state: Float[np.ndarray, "8"], grip_m: Float[np.ndarray, "3"]) -> np.n
     way_m = contract.LIFT_TARGET_M - grip_m
     if grip_m[2] < ABOVE_M:
         way_m[:2] = 0.0
-    return _moved(state, way_m * min(1.0, UP_M / max(float(np.linalg.norm(way_m)), 1e-9)), CLOSE)
+    return _moved(state, way_m, CLOSE)
 
 
 def _moved(state: Float[np.ndarray, "8"], way_m: Float[np.ndarray, "3"], gripper: float) -> np.ndarray:
-    """(8,) action that moves the grip by (3,) `way_m` without turning it (pseudo-inverse of its Jacobian)."""
+    """(8,) action that moves the grip by (3,) `way_m`, `UP_M` at most, without turning it (pseudo-inverse of
+    its Jacobian)."""
     action = _still(gripper)
+    way_m = way_m * min(1.0, UP_M / max(float(np.linalg.norm(way_m)), 1e-9))
     jacobian = grip_jacobian(state[STATE.arm].astype(np.float64))
     way = np.linalg.pinv(jacobian) @ np.append(way_m, np.zeros(3)) / contract.ACTION_SCALE_RAD
     action[ACTION.arm] = way / max(1.0, float(np.abs(way).max()))

@@ -27,6 +27,7 @@ from ddgrasp import contract
 from ddgrasp.config import DeployConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
+from deploy.aside import pressed_at
 from deploy.clock import RobotClock
 from deploy.devices.franka_hand import THREADS, WIDTH_PERIOD_S
 from deploy.devices.franka_robot import AT_START_RAD, FrankaRobot
@@ -203,6 +204,7 @@ def test_an_arm_that_gave_way_goes_up_when_it_is_told_to(tmp_path, rig):
         robot.command(state.q_rad + down, close=False)
         clock.sleep_until(clock.now() + 0.1)
     assert state.met, "it came down for 20 s and met nothing"
+    assert pressed_at(state.q_rad, state.felt_nm).any(), "it feels what it met"
     low_m = grip_position(state.q_rad)[2]
     for _ in range(5):
         robot.command(robot.read_state().q_rad - 3 * down, close=False)

@@ -8,7 +8,8 @@ import pytest
 from ddgrasp import contract
 from ddgrasp.layout import ACTION, STATE, closes
 from deploy.clock import SimClock
-from deploy.kinematics import grip_position
+from deploy.interfaces import RobotState
+from deploy.kinematics import grip_jacobian, grip_pose, grip_position
 from deploy.loop import ControlLoop, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.retry import (
@@ -17,6 +18,7 @@ from deploy.retry import (
     CLOSING_STEPS,
     DONE_STEPS,
     EMPTY_STEPS,
+    FELT_STEPS,
     LIFTING_STEPS,
     LOW_M,
     RETREAT_STEPS,
@@ -89,6 +91,19 @@ def test_a_hand_that_has_held_something_for_a_while_lifts_it_and_keeps_it():
     assert np.linalg.norm(ways_m[-1] - contract.LIFT_TARGET_M) < 0.01
 
 
+def test_a_hand_that_drags_what_it_holds_along_the_table_lifts_it_too():
+    retry, drag_rad = Retry(), np.array([0.04, *[0] * 6])
+    answers = [retry(state(LOW + drag_rad * step, HOLDING)) for step in range(STILL_STEPS + 1)]
+    assert answers[:-1] == [None] * STILL_STEPS and answers[-1] is not None and closes(answers[-1])
+
+
+def test_a_hand_that_is_on_its_way_up_with_something_is_left_alone():
+    retry, up_rad = Retry(), np.array([0, -0.012, *[0] * 5])
+    lowest = LOW - 10 * up_rad
+    assert grip_position(lowest + STILL_STEPS * up_rad)[2] < LOW_M
+    assert all(retry(state(lowest + up_rad * step, HOLDING)) is None for step in range(STILL_STEPS + 1))
+
+
 def test_fingers_that_close_are_let_close():
     retry = Retry()
     for step in range(2 * STILL_STEPS):
@@ -125,16 +140,6 @@ def test_an_arm_that_may_only_creep_does_not_stand_still():
     assert still_for(slow) <= 0.03 * STILL_STEPS * contract.CONTROL_DT_S / 2
     crawling = tuple(0.03 * limit for limit in contract.JOINT_VELOCITY_LIMIT_RAD_S)
     assert still_for(replace(SafetyLimits(), velocity_rad_s=crawling)) < still_for(slow)
-
-
-def test_a_hand_that_met_something_and_stands_on_it_goes_up_at_once():
-    retry = Retry()
-    told(retry, LOW, OPEN, 2)
-    assert retry(state(LOW, OPEN), met=True) is None
-    told(retry, LOW, OPEN, STILL_STEPS - 3)
-    action = retry(state(LOW, OPEN))
-    assert action is not None and not closes(action)
-    assert retry.begun == "the open hand has stood still for 1 s on something; goes up to look again"
 
 
 def test_a_hand_at_an_object_goes_straight_up_before_it_turns_to_the_start_pose():
@@ -195,3 +200,20 @@ def test_the_loop_says_so_and_lets_the_policy_begin_anew(tmp_path):
     assert closed == [True, True, False, False, True, True, False] and events == [(2, "retry"), (6, "retry")]
     assert len(report.timings.infer_s) == 7, "the policy goes on being asked, so that time is measured"
     assert run(retry=False)[:2] == ([True] * 7, [])
+
+
+def test_the_loop_says_what_the_arm_feels(tmp_path):
+    """A finger of a robot that stands low is on something."""
+    force = np.array([0.0, 0.0, 10.0])
+    turn = np.cross(0.05 * grip_pose(LOW)[:3, 1], force)
+    felt_nm = grip_jacobian(LOW).T @ np.concatenate([force, turn])
+    clock = SimClock()
+    robot = KinematicRobot(clock)
+    robot.read_state = lambda: RobotState(LOW, OPEN, clock.now(), felt_nm=felt_nm)
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", describe(), bias=constant_bias(0.0)))
+    camera = ScriptedCamera(clock, [depth_mm()])
+    safety, settings = SafetyFilter(SafetyLimits(), 0.1), LoopSettings(0.1, retry=True)
+    loop = ControlLoop(camera, robot, policy, safety, clock, settings)
+    events = loop.run(4).events
+    assert [(event.step, event.kind) for event in events] == [(FELT_STEPS - 1, "retry")]
+    assert events[0].reason == "a finger of the open hand is on something; steps aside"

@@ -132,6 +132,17 @@ def test_it_gives_way_to_a_contact_says_what_and_goes_on_with_the_next_step(spri
     assert not braked(arm.moved)
 
 
+def test_it_says_what_pressed_on_it_hardest_since_it_was_asked(spring, arm):
+    spring.follow(STEP)
+    assert not spring.felt_nm().any()
+    arm.touches = True
+    time.sleep(0.05)
+    arm.touches = False
+    time.sleep(0.05)
+    np.testing.assert_array_equal(spring.felt_nm(), [0.0, -6.0, 0, 2.0, 0, 0, 0])
+    assert not spring.felt_nm().any()
+
+
 def test_a_contact_does_not_keep_a_hand_from_going_up(spring, arm):
     arm.touches = True
     spring.follow(STEP, heeds=False)

@@ -101,9 +101,10 @@ class FrankaRobot:
         assert self._hand is not None
         with self._reporting():
             self._arm.poll_motion()  # raises what stopped the last motion (a reflex, a limit)
-            met = "" if self._following is None else self._following.met()
+            arm = self._following
+            met, felt_nm = ("", None) if arm is None else (arm.met(), arm.felt_nm())
             q_rad = np.asarray(self._arm.state.q, float)
-            return RobotState(q_rad, self._hand.width_m(), self._clock.now(), met)
+            return RobotState(q_rad, self._hand.width_m(), self._clock.now(), met, felt_nm)
 
     def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
         """Set the (7,) joint target, in place of the last, and the gripper. Raises RobotError."""

@@ -65,7 +65,7 @@ class FrankaSpring:
         self._due_s: float | None = None
         self._target_rad: np.ndarray | None = None
         self._owed_rad = np.zeros(len(contract.ARM_JOINTS))
-        self._met = ""
+        self._met, self._felt_nm = "", np.zeros(len(contract.ARM_JOINTS))
         self.stay()
         arm.move(self._motion, asynchronous=True)
         self._watch = threading.Thread(target=self._brake_in_time, daemon=True)
@@ -84,6 +84,7 @@ class FrankaSpring:
         step = q_target_rad - q_rad
         with self._lock:
             self._be(soft)
+            self._feel(state)
             if soft and heeds and (met := touched(state)):
                 self._give_way(state, met)
                 return
@@ -102,6 +103,12 @@ class FrankaSpring:
         with self._lock:
             met, self._met = self._met, ""
         return met
+
+    def felt_nm(self) -> Float[np.ndarray, "7"]:
+        """(7,) torques on the joints by what pressed on the arm hardest since the last call."""
+        with self._lock:
+            felt_nm, self._felt_nm = self._felt_nm, np.zeros(len(contract.ARM_JOINTS))
+        return felt_nm
 
     def stop(self) -> None:
         """Brake, and return when the arm stands; its own control unit holds it then."""
@@ -122,6 +129,11 @@ class FrankaSpring:
             self._soft = soft
             gains = self._franky.JointImpedanceGains(self._strength(), DAMPING_S * self._strength())
             self._motion.set_gains(gains)
+
+    def _feel(self, state: Any) -> None:
+        torque_nm = np.asarray(state.tau_ext_hat_filtered, float)
+        if np.linalg.norm(torque_nm) > np.linalg.norm(self._felt_nm):
+            self._felt_nm = torque_nm
 
     def _give_way(self, state: Any, met: str) -> None:
         """Stand, as soft as it came."""
@@ -165,6 +177,7 @@ class FrankaSpring:
             except (self._franky.Exception, RuntimeError):
                 return  # the connection has gone, and the arm with it stands
             with self._lock:
+                self._feel(state)
                 if self._due_s is None:
                     continue
                 met = touched(state) if self._heeds else ""
