@@ -4,6 +4,8 @@ A camera that has the object two centimetres from where it is has it there again
 lands where it landed. But the arm has felt which finger it was.
 """
 
+from collections import deque
+
 import numpy as np
 from jaxtyping import Float, Float64
 
@@ -11,25 +13,29 @@ from deploy.kinematics import grip_jacobian, grip_pose, grip_position
 
 PRESS_N = 4.0
 """Less than this along the hand is no contact. A soft arm that a policy has come down presses with 6 N."""
-FINGER_M = 0.025
-"""What presses on the hand farther than this from its axis, along the fingers' opening, presses on a finger:
-open they are 40 to 55 mm from it. Nearer it is the palm's, or both fingers'."""
+FINGER_M, FARTHEST_M = 0.025, 0.08
+"""What presses on the hand between so far and so far from its axis, along the fingers' opening, presses on a
+finger: open they are 40 to 55 mm from it. Nearer it is the palm's, or both fingers'; farther it is not the
+hand that is pressed on."""
+FELT_STEPS = 3
+"""Control steps in a row in which the same finger has been on something: it has landed."""
 HALF_FINGER_M = 0.010
-"""Of its width, across the opening: what presses on a finger there is the near part of what is farther."""
+"""Half of its width, across the opening: what presses on its edge is the near part of what is farther."""
 ASIDE_M = 0.014
 """A step aside: the room that an open hand has around something 66 mm wide, so that none is stepped over."""
 TRIES = 3
 """Steps aside; one that goes back is half as long."""
 RAISED_M = 0.025
 """By how much the hand is raised for it."""
-DEEP_M = 0.040
-"""How far below where the finger met it the hand goes to close."""
+DEEP_M, FLOOR_M = 0.040, 0.020
+"""How far below where the finger met it the hand goes to close, and how low at most, height of the grip."""
+DOWN_M = 0.006
+"""Down in a control step: 6 cm/s, also where the safety filter would let it go faster."""
 NEAR_M = 0.005
 """The hand is where it was to be."""
-_DOWN = 2
-"""After going up and aside."""
-_STEPS = (5, 5, 14)
-"""Control steps given to going up, aside and down. Down are 65 mm, of which 6 cm/s make 11."""
+_UP, _ASIDE, _DOWN = range(3)
+_STEPS = (5, 5, 60)
+"""Control steps given to each. Down are 65 mm: 11 by 6 cm/s, 33 by 2."""
 
 
 def pressed_at(
@@ -51,6 +57,31 @@ def pressed_at(
     return np.array((-turn_nm[1], turn_nm[0])) / force_n
 
 
+def on_a_finger(pressed_m: Float[np.ndarray, "2"]) -> bool:
+    """Whether what presses on the hand at (2,) `pressed_at` presses on a finger."""
+    return FINGER_M < abs(float(pressed_m[1])) < FARTHEST_M
+
+
+class Landing:
+    """Notices that a finger stands on something. Call it in every control step."""
+
+    def __init__(self, stopped_m: float) -> None:
+        """`stopped_m`: a hand that comes down moves by more in `FELT_STEPS`."""
+        self._stopped_m = stopped_m
+        self.forget()
+
+    def forget(self) -> None:
+        """What was felt until now does not count."""
+        self._felt: deque[tuple[float, float]] = deque(maxlen=FELT_STEPS)
+
+    def __call__(self, height_m: float, pressed_m: Float[np.ndarray, "2"]) -> bool:
+        """Whether it does; the grip's height, and (2,) `pressed_at`."""
+        self._felt.append((height_m, float(pressed_m[1]) if on_a_finger(pressed_m) else 0.0))
+        heights_m, at_m = zip(*self._felt, strict=True)
+        stopped = max(heights_m) - min(heights_m) < self._stopped_m
+        return len(at_m) == FELT_STEPS and stopped and (min(at_m) > 0.0 or max(at_m) < 0.0)
+
+
 class Aside:
     """Up, aside and down; again where it comes down on a finger again."""
 
@@ -67,24 +98,42 @@ class Aside:
         self.ended = False
         """Whether the hand is where it is to close."""
         self.failed = False
-        """Whether a finger is on something after the last try as well."""
-        self._tries_left, self._way_m = TRIES, ASIDE_M * float(np.sign(pressed_m[1]))
+        """Whether it cannot get there: a finger is on something after the last try as well."""
+        self.tries = 0
+        self._way_m = ASIDE_M * float(np.sign(pressed_m[1]))
         self._plan(q_rad, pressed_m, came_to_m)
 
     def __call__(
-        self, q_rad: Float[np.ndarray, "7"], met: bool, felt_nm: Float[np.ndarray, "7"] | None
+        self, q_rad: Float[np.ndarray, "7"], met: bool, landed: bool, pressed_m: Float[np.ndarray, "2"]
     ) -> Float64[np.ndarray, "3"]:
-        """(3,) way of the grip from the joints (7,), metres; `met`: the arm gave way to what it felt."""
-        if met and self._phase == _DOWN:
-            self._meet(q_rad, pressed_at(q_rad, felt_nm))
+        """(3,) way of the grip from the joints (7,), metres.
+
+        `met`: the arm gave way to what presses at (2,) `pressed_m`; `landed`: a finger stands on it.
+        """
+        if self._phase == _DOWN and (landed or (met and pressed_m.any())):
+            self._meet(q_rad, pressed_m)
         grip_m = grip_position(q_rad)
+        if not (self.ended or self.failed):
+            self._go_on(grip_m)
+        way_m = self._places_m[self._phase] - grip_m
+        if self._phase == _DOWN:
+            way_m[2] = max(way_m[2], -DOWN_M)
+        return way_m
+
+    def _go_on(self, grip_m: Float[np.ndarray, "3"]) -> None:
+        """To the next place, or the end, if the hand is there or comes no nearer."""
         way_m = self._places_m[self._phase] - grip_m
         left_m = (way_m[2], float(np.linalg.norm(way_m[:2])), -way_m[2])[self._phase]
         self._steps += 1
-        if left_m < NEAR_M or self._steps > _STEPS[self._phase]:
-            self.ended = self.ended or self._phase == _DOWN
-            self._phase, self._steps = min(self._phase + 1, _DOWN), 0
-        return self._places_m[self._phase] - grip_m
+        self._stands = self._stands + 1 if left_m > self._left_m - NEAR_M / FELT_STEPS else 0
+        self._left_m = min(left_m, self._left_m)
+        stuck = self._phase == _DOWN and self._stands > FELT_STEPS
+        if left_m >= NEAR_M and self._steps <= _STEPS[self._phase] and not stuck:
+            return
+        if self._phase == _DOWN:
+            self.ended = float(grip_m[2]) < self._met_m - NEAR_M
+            self.failed = not self.ended
+        self._begin(min(self._phase + 1, _DOWN))
 
     def _plan(
         self,
@@ -95,15 +144,21 @@ class Aside:
         pose = grip_pose(q_rad)
         across_m = float(np.clip(pressed_m[0], -HALF_FINGER_M, HALF_FINGER_M))
         way_m = (across_m * pose[:3, 0] + self._way_m * pose[:3, 1]) * (1.0, 1.0, 0.0)
-        up = np.append(came_to_m[:2], pose[2, 3] + RAISED_M)
-        self._places_m = (up, up + way_m, up + way_m - (0.0, 0.0, RAISED_M + DEEP_M))
-        self._phase, self._steps, self._tries_left = 0, 0, self._tries_left - 1
+        self._met_m = float(pose[2, 3])
+        up = np.append(came_to_m[:2], self._met_m + RAISED_M)
+        deep = np.append((up + way_m)[:2], max(self._met_m - DEEP_M, FLOOR_M))
+        self._places_m = (up, up + way_m, deep)
+        self.tries += 1
+        self._begin(_UP)
+
+    def _begin(self, phase: int) -> None:
+        self._phase, self._steps, self._stands, self._left_m = phase, 0, 0, np.inf
 
     def _meet(self, q_rad: Float[np.ndarray, "7"], pressed_m: Float[np.ndarray, "2"]) -> None:
         """On the way down the arm met something."""
-        if abs(pressed_m[1]) < FINGER_M:
+        if not on_a_finger(pressed_m):
             self.ended = True
-        elif not self._tries_left:
+        elif self.tries == TRIES:
             self.failed = True
         else:
             back = pressed_m[1] * self._way_m < 0.0

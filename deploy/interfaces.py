@@ -39,7 +39,8 @@ class RobotState:
     met: str = ""
     """What the arm pressed on and gave way to since the state before, in words; empty if nothing."""
     felt_nm: Float[np.ndarray, "7"] | None = None
-    """(7,) torques on the joints by what pressed on the arm hardest since then; None if it does not say."""
+    """(7,) torques on the joints by what pressed on the arm hardest since then (what is done to the arm, not
+    what it does); None if it does not say."""
 
     def vector(self) -> Float32[np.ndarray, "8"]:
         """(8,) float32, the policy's state input: arm joints (rad), then the gripper's width (m)."""

@@ -220,6 +220,8 @@ class ControlLoop:
             self._policy.wait(state.vector())
             return rest, False
         self._pace.forget()
+        if state.met:
+            self._policy.replan()
         inferring = self._policy.will_infer
         return self._policy.act(frame.depth, state.vector()), inferring
 
@@ -350,4 +352,6 @@ class ControlLoop:
 def _state_problem(state: RobotState) -> str:
     if state.q_rad.shape != (7,) or not np.isfinite(state.q_rad).all() or not np.isfinite(state.width_m):
         return f"bad joint state: {np.array2string(np.asarray(state.q_rad), precision=3)}"
+    if state.felt_nm is not None and not np.isfinite(state.felt_nm).all():
+        return f"bad external torques: {np.array2string(np.asarray(state.felt_nm), precision=3)}"
     return ""

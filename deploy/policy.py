@@ -92,6 +92,10 @@ class OnnxPolicy:
         self._frames: deque[np.ndarray] = deque(maxlen=contract.DEPTH_FRAMES)
         self._actions: deque[np.ndarray] = deque()
 
+    def replan(self) -> None:
+        """Drop the rest of the chunk: it was for a way that ended."""
+        self._actions.clear()
+
     @property
     def will_infer(self) -> bool:
         """Whether the next `act` runs the network (otherwise it plays the last chunk on)."""

@@ -65,6 +65,8 @@ class DeploymentRecord:
         row |= {"time_s": step.state.timestamp_s, "held": step.action is None}
         if step.state.met:
             row["met"] = step.state.met
+        if step.state.felt_nm is not None:
+            row["felt_nm"] = np.round(step.state.felt_nm, 3).tolist()
         row["action"] = None if step.action is None else np.asarray(step.action, float).tolist()
         row["close"] = step.close
         row["q_target_rad"] = None if step.q_target_rad is None else step.q_target_rad.tolist()

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from ddgrasp import contract
 from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION, STATE
-from deploy.aside import FINGER_M, Aside, pressed_at
+from deploy.aside import FELT_STEPS, Aside, Landing, pressed_at
 from deploy.kinematics import grip_jacobian, grip_position
 from deploy.safety import SafetyLimits
 
@@ -36,11 +36,15 @@ LOW_M = 0.20
 """Only below this height of the grip does standing still mean that it is at something."""
 CLOSING_STEPS = 10
 """Control steps given to fingers to close: a Franka Hand's from open to shut, and two."""
-FELT_STEPS, STOPPED_M = 3, 0.004
-"""Control steps in a row in which the arm feels something on the same finger of an open hand, and by how much
-it comes down in them at most; coming down slowly is 12 mm."""
-BEGUN_STEPS = 3
-"""After so many of them, fingers that do not move have something between them."""
+LOWEST_M = 0.04
+"""Below this height of the grip what a finger stands on may be the table."""
+ASIDES = 3
+"""How often at most a hand steps aside (each time `aside.TRIES` steps) until it has lifted something: what an
+arm feels may be wrong."""
+FREE_STEPS = 10
+"""Control steps above `LOW_M`, the last ones, whose mean is what an arm feels that touches nothing."""
+STAND_STEPS = 3
+"""Fingers that have not moved in them, and did before, have something between them."""
 CLEAR_M = 0.16
 """Below this height of the grip a hand goes straight up: sideways it takes with it what it stands at."""
 UP_M = 0.03
@@ -81,6 +85,7 @@ class Retry:
     def __init__(self, still_m: float = STILL_M) -> None:
         """`still_m`: see `still_for`."""
         self._still_m = still_m
+        self._landing = Landing(still_m * (FELT_STEPS - 1) / STILL_STEPS)
         self.reset()
 
     def reset(self) -> None:
@@ -91,6 +96,8 @@ class Retry:
         """Whether that was because nothing is left to do."""
         self._forget()
         self._closed_once = False
+        self._asides_left = ASIDES
+        self._free_nm: deque[np.ndarray] = deque(maxlen=FREE_STEPS)
         self._lifted_steps = 0
         self._stay_rad: np.ndarray | None = None
 
@@ -106,13 +113,20 @@ class Retry:
         grip_m = grip_position(q_rad)
         self._places.append(grip_m)
         self._widths.append(float(state[STATE.width][0]))
-        self._pressed_m.append(pressed_at(q_rad, felt_nm))
+        pressed_m = pressed_at(q_rad, self._tared(grip_m, felt_nm))
+        landed = self._landing(float(grip_m[2]), pressed_m)
         if (stay := self._stay(state, grip_m)) is not None:
             return stay
         if not (self._closing or self._retreat or self._lifting or self._aside):
-            self._look(q_rad, grip_m)
+            if landed and self._may_step_aside(grip_m):
+                self._begin_aside(q_rad, pressed_m)
+            else:
+                self._look(grip_m)
         if self._aside is not None:
-            way_m = self._aside(q_rad, met, felt_nm)
+            tries = self._aside.tries
+            way_m = self._aside(q_rad, met, landed, pressed_m)
+            if self._aside.tries > tries:
+                self.begun = "a finger is on something again; steps aside"
             if not self._ends_aside(self._aside):
                 return _moved(state, way_m, OPEN)
         if self._lifting:
@@ -122,10 +136,11 @@ class Retry:
             return _lift(state, grip_m)
         if self._closing:
             self._closing -= 1
-            lifts = self._then_lifts and self._grips()
+            lifts = self._then_lifts and (self._grips() if self._closing else self._holds())
             if lifts or not self._closing:
                 self._forget()
-                self._lifting = LIFTING_STEPS if lifts else 0
+                if lifts:
+                    self.begun, self._lifting = "it holds something; lifts it", LIFTING_STEPS
             return _still(CLOSE)
         if self._retreat:
             self._retreat -= 1
@@ -147,12 +162,13 @@ class Retry:
         if self._lifted_steps == DONE_STEPS:
             self._stay_rad = np.array(state[STATE.arm])
             self.begun, self.done = "what was grasped is lifted; stays there", True
+            self._asides_left = ASIDES
         return None if self._stay_rad is None else _towards(self._stay_rad, state, CLOSE)
 
     def _ends_aside(self, aside: Aside) -> bool:
         """Whether the hand does something else from now on."""
         if aside.failed:
-            self._go_up("a finger is on something wherever the hand comes down")
+            self._go_up("the hand comes down on something wherever it does")
         elif aside.ended:
             self._closing, self._then_lifts = CLOSING_STEPS, True
         else:
@@ -160,30 +176,37 @@ class Retry:
         self._aside = None
         return True
 
-    def _look(self, q_rad: Float[np.ndarray, "7"], grip_m: Float[np.ndarray, "3"]) -> None:
+    def _tared(
+        self, grip_m: Float[np.ndarray, "3"], felt_nm: Float[np.ndarray, "7"] | None
+    ) -> Float[np.ndarray, "7"] | None:
+        """(7,) `felt_nm` without what the arm felt where it touches nothing."""
+        if felt_nm is None:
+            return None
+        if grip_m[2] > LOW_M:
+            self._free_nm.append(felt_nm)
+        return felt_nm - np.mean(self._free_nm, axis=0) if self._free_nm else felt_nm
+
+    def _may_step_aside(self, grip_m: Float[np.ndarray, "3"]) -> bool:
+        return bool(self._asides_left and self._widths[-1] > OPEN_WIDTH_M and LOWEST_M < grip_m[2] < LOW_M)
+
+    def _begin_aside(self, q_rad: Float[np.ndarray, "7"], pressed_m: Float[np.ndarray, "2"]) -> None:
+        self._aside = Aside(q_rad, pressed_m, self._places[-FELT_STEPS])
+        self._asides_left -= 1
+        self.begun = "a finger of the open hand is on something; steps aside"
+
+    def _look(self, grip_m: Float[np.ndarray, "3"]) -> None:
         """Whether to take over, and how."""
         widths = [*self._widths]
         if len(widths) >= EMPTY_STEPS and max(widths[-EMPTY_STEPS:]) < EMPTY_WIDTH_M:
             self._go_up(f"the hand closed to {1e3 * widths[-1]:.1f} mm, on nothing")
         elif len(widths) > STILL_STEPS and self._keeps(grip_m):
             self.begun, self._lifting = f"it has held something for {_SECONDS:.0f} s; lifts it", LIFTING_STEPS
-        elif self._lands_on_a_finger(grip_m):
-            self._aside = Aside(q_rad, self._pressed_m[-1], self._places[-FELT_STEPS])
-            self.begun = "a finger of the open hand is on something; steps aside"
         elif len(widths) > STILL_STEPS and self._stands(grip_m):
             reason = f"the open hand has stood still for {_SECONDS:.0f} s"
             if self._closed_once:
                 self._go_up(f"{reason} again")
             else:
                 self.begun, self._closing, self._closed_once = f"{reason}; closes", CLOSING_STEPS, True
-
-    def _lands_on_a_finger(self, grip_m: Float[np.ndarray, "3"]) -> bool:
-        """Whether the same finger of an open hand has been on something that keeps it from coming down."""
-        at_m = [float(pressed_m[1]) for pressed_m in self._pressed_m][-FELT_STEPS:]
-        if len(at_m) < FELT_STEPS or max(min(at_m), -max(at_m)) < FINGER_M:
-            return False
-        stopped = float(self._places[-FELT_STEPS][2] - grip_m[2]) < STOPPED_M
-        return stopped and self._widths[-1] > OPEN_WIDTH_M and float(grip_m[2]) < LOW_M
 
     def _stands(self, grip_m: Float[np.ndarray, "3"]) -> bool:
         return self._still(grip_m) and min(self._widths) > OPEN_WIDTH_M
@@ -203,10 +226,11 @@ class Retry:
         return EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M
 
     def _grips(self) -> bool:
-        """Whether fingers that were told to close `BEGUN_STEPS` ago have come to stand on something."""
-        before_m, now_m = [*self._widths][-2:]
-        begun = self._closing <= CLOSING_STEPS - BEGUN_STEPS
-        return begun and self._holds() and before_m - now_m < SAME_WIDTH_M
+        """Whether fingers that close have come to stand on something."""
+        widths_m = [*self._widths]
+        came = max(widths_m) - widths_m[-1] > SAME_WIDTH_M
+        stand = max(widths_m[-STAND_STEPS:]) - min(widths_m[-STAND_STEPS:]) < SAME_WIDTH_M
+        return came and stand and self._holds()
 
     def _go_up(self, reason: str) -> None:
         self.begun = f"{reason}; goes up to look again"
@@ -215,7 +239,7 @@ class Retry:
     def _forget(self) -> None:
         self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
         self._widths: deque[float] = deque(maxlen=STILL_STEPS + 1)
-        self._pressed_m: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
+        self._landing.forget()
         self._closing = self._retreat = self._lifting = 0
         self._aside: Aside | None = None
         self._then_lifts = False

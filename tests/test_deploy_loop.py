@@ -235,6 +235,21 @@ def test_what_the_arm_gave_way_to_is_an_event_once_for_as_long_as_it_does(tmp_pa
     assert report.holds == 0 and robot.calls.count("command") == 6
 
 
+def test_an_arm_that_does_not_know_what_it_feels_is_held(tmp_path):
+    loop, robot, _ = make_loop(tmp_path, [depth_mm()], SimClock())
+    read, felt = robot.read_state, iter([np.zeros(7), np.full(7, np.nan), None])
+    robot.read_state = lambda: replace(read(), felt_nm=next(felt))
+    report = loop.run(max_steps=3)
+    assert report.holds == 1 and report.events[0].reason.startswith("bad external torques: [nan")
+
+
+def test_after_a_contact_the_rest_of_the_chunk_is_not_played(tmp_path):
+    loop, robot, _ = make_loop(tmp_path, [depth_mm()], SimClock(), info=describe(execute_steps=4))
+    read, met = robot.read_state, iter(["", "", "", "16 N", *[""] * 4])
+    robot.read_state = lambda: replace(read(), met=next(met))
+    assert len(loop.run(max_steps=8).timings.infer_s) == 3, "in steps 0, 3 and 7"
+
+
 def test_on_step_can_end_the_run(tmp_path):
     loop, robot, _ = make_loop(tmp_path, [depth_mm()])
     assert loop.run(on_step=lambda step: step.index == 2).steps == 3

@@ -77,10 +77,16 @@ def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
 
 
 def test_a_step_before_which_the_arm_gave_way_says_to_what(run, monkeypatch):
-    read, met = KinematicRobot.read_state, iter(["", "16 N"])
-    monkeypatch.setattr(KinematicRobot, "read_state", lambda self: replace(read(self), met=next(met, "")))
+    read, felt = KinematicRobot.read_state, iter([("", None), ("16 N", np.full(7, 1.23456))])
+
+    def read_state(self):
+        met, felt_nm = next(felt, ("", None))
+        return replace(read(self), met=met, felt_nm=felt_nm)
+
+    monkeypatch.setattr(KinematicRobot, "read_state", read_state)
     rows = [json.loads(line) for line in (run()[1] / "steps.jsonl").read_text().splitlines()]
     assert [row.get("met") for row in rows] == [None, "16 N", None, None, None]
+    assert [row.get("felt_nm") for row in rows] == [None, [1.235] * 7, None, None, None]
 
 
 def test_two_in_a_second_are_two_recordings_of_one_folder(run, tmp_path):

@@ -41,13 +41,13 @@ class Arm:
     """Stands where it is, feels what it is told to feel, and keeps this machine's time."""
 
     def __init__(self):
-        self.touches, self.lost, self.moved = False, threading.Event(), None
+        self.touches, self.lost, self.moved = 0.0, threading.Event(), None
 
     @property
     def state(self):
         if self.lost.is_set():
             raise RuntimeError("UDP receive: Timeout")
-        force = np.array([3.0, 0.0, 16.0, 0.0, 1.0, 0.0]) if self.touches else np.zeros(6)
+        force = self.touches * np.array([3.0, 0.0, 16.0, 0.0, 1.0, 0.0])
         return SimpleNamespace(
             q=np.zeros(7), time=SimpleNamespace(to_sec=time.monotonic), O_F_ext_hat_K=force,
             joint_contact=np.zeros(7), cartesian_contact=(np.abs(force) > 15.0).astype(float),
@@ -86,7 +86,7 @@ def test_it_follows_about_the_middle_of_the_step_at_its_speed(spring, arm):
     q_rad, speed_rad_s = arm.moved.references[-1]
     np.testing.assert_allclose(q_rad, STEP / 2)
     np.testing.assert_allclose(speed_rad_s, STEP / 0.1)
-    assert strength(arm.moved) == 1.0 and spring.met() == ""
+    assert strength(arm.moved) == 1.0 and spring.felt()[0] == ""
 
 
 @pytest.mark.parametrize("soft", [False, True])
@@ -111,10 +111,10 @@ def test_what_a_joint_lacks_of_its_step_is_asked_for_again_as_far_as_friction_go
 
 
 def test_a_soft_arm_that_touches_something_makes_no_step_that_heeds_it(spring, arm):
-    arm.touches = True
+    arm.touches = 1.0
     told = len(arm.moved.references)
     spring.follow(STEP, soft=True)
-    assert [speed.any() for _, speed in arm.moved.references[told:]] == [False] and spring.met()
+    assert [speed.any() for _, speed in arm.moved.references[told:]] == [False] and spring.felt()[0]
     spring.follow(STEP)
     assert any(speed.any() for _, speed in arm.moved.references[told:]), "one that is not low moves"
 
@@ -122,11 +122,11 @@ def test_a_soft_arm_that_touches_something_makes_no_step_that_heeds_it(spring, a
 def test_it_gives_way_to_a_contact_says_what_and_goes_on_with_the_next_step(spring, arm):
     spring.follow(STEP, soft=True)
     assert not braked(arm.moved)
-    arm.touches = True
+    arm.touches = 1.0
     time.sleep(0.05)
     assert braked(arm.moved) and strength(arm.moved) == pytest.approx(SOFT), "as soft as it came"
-    assert spring.met() == "16 N and 1 N m at the hand, 6 N m on joint 2" and spring.met() == ""
-    arm.touches = False
+    assert spring.felt()[0] == "16 N and 1 N m at the hand, 6 N m on joint 2" and spring.felt()[0] == ""
+    arm.touches = 0.0
     spring.follow(STEP)
     time.sleep(0.05)
     assert not braked(arm.moved)
@@ -134,20 +134,20 @@ def test_it_gives_way_to_a_contact_says_what_and_goes_on_with_the_next_step(spri
 
 def test_it_says_what_pressed_on_it_hardest_since_it_was_asked(spring, arm):
     spring.follow(STEP)
-    assert not spring.felt_nm().any()
-    arm.touches = True
-    time.sleep(0.05)
-    arm.touches = False
-    time.sleep(0.05)
-    np.testing.assert_array_equal(spring.felt_nm(), [0.0, -6.0, 0, 2.0, 0, 0, 0])
-    assert not spring.felt_nm().any()
+    assert not spring.felt()[1].any()
+    for arm.touches in (0.5, 1.0, 0.7, 0.0):
+        time.sleep(0.05)
+    met, felt_nm = spring.felt()
+    assert met
+    np.testing.assert_array_equal(felt_nm, [0.0, 6.0, 0, -2.0, 0, 0, 0], "on the arm: not what it does")
+    assert spring.felt()[0] == "" and not spring.felt()[1].any()
 
 
 def test_a_contact_does_not_keep_a_hand_from_going_up(spring, arm):
-    arm.touches = True
+    arm.touches = 1.0
     spring.follow(STEP, heeds=False)
     time.sleep(0.05)
-    assert not braked(arm.moved) and spring.met() == ""
+    assert not braked(arm.moved) and spring.felt()[0] == ""
 
 
 @pytest.mark.parametrize("stops", [FrankaSpring.stay, lambda spring: time.sleep(0.25)], ids=["hold", "late"])
@@ -155,7 +155,7 @@ def test_it_stands_with_all_of_its_strength(spring, arm, stops):
     spring.follow(STEP, soft=True)
     assert strength(arm.moved) == pytest.approx(SOFT)
     stops(spring)
-    assert braked(arm.moved) and strength(arm.moved) == 1.0 and spring.met() == ""
+    assert braked(arm.moved) and strength(arm.moved) == 1.0 and spring.felt()[0] == ""
 
 
 def test_the_watch_ends_with_the_connection(spring, arm):

@@ -101,8 +101,7 @@ class FrankaRobot:
         assert self._hand is not None
         with self._reporting():
             self._arm.poll_motion()  # raises what stopped the last motion (a reflex, a limit)
-            arm = self._following
-            met, felt_nm = ("", None) if arm is None else (arm.met(), arm.felt_nm())
+            met, felt_nm = ("", None) if self._following is None else self._following.felt()
             q_rad = np.asarray(self._arm.state.q, float)
             return RobotState(q_rad, self._hand.width_m(), self._clock.now(), met, felt_nm)
 

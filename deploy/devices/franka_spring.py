@@ -98,17 +98,13 @@ class FrankaSpring:
         with self._lock:
             self._brake(self._arm.state)
 
-    def met(self) -> str:
-        """What the arm gave way to since the last call, in words; empty if to nothing."""
+    def felt(self) -> tuple[str, Float[np.ndarray, "7"]]:
+        """What the arm gave way to since the last call, in words, empty if to nothing; and the (7,) torques
+        on its joints by what pressed on it hardest."""
         with self._lock:
-            met, self._met = self._met, ""
-        return met
-
-    def felt_nm(self) -> Float[np.ndarray, "7"]:
-        """(7,) torques on the joints by what pressed on the arm hardest since the last call."""
-        with self._lock:
-            felt_nm, self._felt_nm = self._felt_nm, np.zeros(len(contract.ARM_JOINTS))
-        return felt_nm
+            felt = self._met, self._felt_nm
+            self._met, self._felt_nm = "", np.zeros(len(contract.ARM_JOINTS))
+        return felt
 
     def stop(self) -> None:
         """Brake, and return when the arm stands; its own control unit holds it then."""
@@ -131,7 +127,9 @@ class FrankaSpring:
             self._motion.set_gains(gains)
 
     def _feel(self, state: Any) -> None:
-        torque_nm = np.asarray(state.tau_ext_hat_filtered, float)
+        """What it does to others is what libfranka's external torques say (Franka's documentation of
+        `RobotState`), and so with the other sign what is done to it."""
+        torque_nm = -np.asarray(state.tau_ext_hat_filtered, float)
         if np.linalg.norm(torque_nm) > np.linalg.norm(self._felt_nm):
             self._felt_nm = torque_nm
 

@@ -105,11 +105,14 @@ class ReflexServer(FrankaRobotServer):
 
     @property
     def robot_state(self) -> FrankaRobotState:
-        """See franky-sim; with what the arm touches and the error that stands."""
+        """See franky-sim; with what the arm touches and the error that stands.
+
+        External torques and forces with the sign of Franka's `RobotState`: what the arm does to others.
+        """
         thresholds = self.thresholds
         state = super().robot_state.replace(
-            tau_ext_hat_filtered=self.contact_torque_nm,
-            O_F_ext_hat_K=tuple(self._force_n.tolist()),
+            tau_ext_hat_filtered=tuple((-self._torque_nm).tolist()),
+            O_F_ext_hat_K=tuple((-self._force_n).tolist()),
             joint_contact=_above(self._torque_nm, thresholds.lower_torque_nm),
             cartesian_contact=_above(self._force_n, thresholds.lower_force_n),
         )
