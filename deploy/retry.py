@@ -77,8 +77,8 @@ class Retry:
 
     A hand that is empty goes up with open fingers, then towards the start pose. One that is low and open and
     stands still closes once; if it comes to stand still again it goes up. One that has a finger on what it is
-    to grasp steps aside (`deploy.aside`), closes, and lifts what it has then. One that stays low with
-    something in it lifts it, straight up, then to where objects are lifted to. One that has lifted something
+    to grasp steps aside (`deploy.aside`) and closes. One that has closed on something, or stays low with
+    something in it, lifts it, straight up, then to where objects are lifted to. One that has lifted something
     stays there for as long as it has it.
     """
 
@@ -136,7 +136,7 @@ class Retry:
             return _lift(state, grip_m)
         if self._closing:
             self._closing -= 1
-            lifts = self._then_lifts and (self._grips() if self._closing else self._holds())
+            lifts = self._grips() if self._closing else self._holds()
             if lifts or not self._closing:
                 self._forget()
                 if lifts:
@@ -170,7 +170,7 @@ class Retry:
         if aside.failed:
             self._go_up("the hand comes down on something wherever it does")
         elif aside.ended:
-            self._closing, self._then_lifts = CLOSING_STEPS, True
+            self._closing = CLOSING_STEPS
         else:
             return False
         self._aside = None
@@ -242,7 +242,6 @@ class Retry:
         self._landing.forget()
         self._closing = self._retreat = self._lifting = 0
         self._aside: Aside | None = None
-        self._then_lifts = False
 
 
 def _still(gripper: float) -> Float[np.ndarray, "8"]:

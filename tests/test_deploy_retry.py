@@ -54,7 +54,7 @@ def test_a_low_open_hand_that_stands_still_closes_once_then_goes_up_to_the_start
     action = retry(state(LOW, OPEN))
     assert action is not None and closes(action) and not action[ACTION.arm].any()
     assert retry.begun == "the open hand has stood still for 1 s; closes" and not retry.done
-    assert all(closes(a) for a in told(retry, LOW, HOLDING, CLOSING_STEPS - 1))
+    assert all(closes(a) for a in told(retry, LOW, OPEN, CLOSING_STEPS - 1)), "on what is too wide"
     assert not retry.begun, "said once"
     assert told(retry, LOW, OPEN, STILL_STEPS) == [None] * STILL_STEPS, "the policy has it again"
     action = retry(state(LOW, OPEN))
@@ -64,6 +64,20 @@ def test_a_low_open_hand_that_stands_still_closes_once_then_goes_up_to_the_start
     )
     assert retry(state(HOME, OPEN)) is not None
     assert retry(state(HOME, OPEN)) is None, "it is high and open: the policy looks"
+
+
+def test_what_it_closes_on_it_lifts():
+    retry = Retry()
+    told(retry, LOW, OPEN, STILL_STEPS + 1)
+    assert (
+        all(closes(a) for a in told(retry, LOW, HOLDING, 3)) and retry.begun == "it holds something; lifts it"
+    )
+    action = retry(state(LOW, HOLDING))
+    assert (
+        closes(action)
+        and grip_position(LOW + contract.ACTION_SCALE_RAD * action[ACTION.arm])[2]
+        > grip_position(LOW)[2] + 0.02
+    )
 
 
 def test_a_hand_that_closed_on_nothing_opens_and_goes_up_for_a_while_at_most():
