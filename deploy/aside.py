@@ -29,6 +29,8 @@ RAISED_M = 0.025
 """By how much the hand is raised for it."""
 DEEP_M, FLOOR_M = 0.040, 0.020
 """How far below where the finger met it the hand goes to close, and how low at most, height of the grip."""
+LOWEST_M = 0.04
+"""Below this height of the grip what a finger stands on may be the table."""
 DOWN_M = 0.006
 """Down in a control step: 6 cm/s, also where the safety filter would let it go faster."""
 NEAR_M = 0.005
@@ -125,13 +127,15 @@ class Aside:
         way_m = self._places_m[self._phase] - grip_m
         left_m = (way_m[2], float(np.linalg.norm(way_m[:2])), -way_m[2])[self._phase]
         self._steps += 1
-        self._stands = self._stands + 1 if left_m > self._left_m - NEAR_M / FELT_STEPS else 0
-        self._left_m = min(left_m, self._left_m)
+        if left_m > self._left_m - NEAR_M / FELT_STEPS:
+            self._stands += 1
+        else:
+            self._left_m, self._stands = left_m, 0
         stuck = self._phase == _DOWN and self._stands > FELT_STEPS
         if left_m >= NEAR_M and self._steps <= _STEPS[self._phase] and not stuck:
             return
         if self._phase == _DOWN:
-            self.ended = float(grip_m[2]) < self._met_m - NEAR_M
+            self.ended = left_m < NEAR_M or float(grip_m[2]) < self._met_m - NEAR_M
             self.failed = not self.ended
         self._begin(min(self._phase + 1, _DOWN))
 
@@ -156,8 +160,11 @@ class Aside:
 
     def _meet(self, q_rad: Float[np.ndarray, "7"], pressed_m: Float[np.ndarray, "2"]) -> None:
         """On the way down the arm met something."""
-        if not on_a_finger(pressed_m):
+        low = float(grip_position(q_rad)[2]) < LOWEST_M
+        if low or abs(float(pressed_m[1])) <= FINGER_M:
             self.ended = True
+        elif not on_a_finger(pressed_m):
+            return
         elif self.tries == TRIES:
             self.failed = True
         else:

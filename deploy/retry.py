@@ -15,7 +15,7 @@ from jaxtyping import Float
 from ddgrasp import contract
 from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION, STATE
-from deploy.aside import FELT_STEPS, Aside, Landing, pressed_at
+from deploy.aside import FELT_STEPS, LOWEST_M, Aside, Landing, pressed_at
 from deploy.kinematics import grip_jacobian, grip_position
 from deploy.safety import SafetyLimits
 
@@ -36,8 +36,6 @@ LOW_M = 0.20
 """Only below this height of the grip does standing still mean that it is at something."""
 CLOSING_STEPS = 10
 """Control steps given to fingers to close: a Franka Hand's from open to shut, and two."""
-LOWEST_M = 0.04
-"""Below this height of the grip what a finger stands on may be the table."""
 ASIDES = 3
 """How often at most a hand steps aside (each time `aside.TRIES` steps) until it has lifted something: what an
 arm feels may be wrong."""
@@ -86,6 +84,8 @@ class Retry:
         """`still_m`: see `still_for`."""
         self._still_m = still_m
         self._landing = Landing(still_m * (FELT_STEPS - 1) / STILL_STEPS)
+        self._asides_left = ASIDES
+        self._free_nm: deque[np.ndarray] = deque(maxlen=FREE_STEPS)
         self.reset()
 
     def reset(self) -> None:
@@ -96,8 +96,6 @@ class Retry:
         """Whether that was because nothing is left to do."""
         self._forget()
         self._closed_once = False
-        self._asides_left = ASIDES
-        self._free_nm: deque[np.ndarray] = deque(maxlen=FREE_STEPS)
         self._lifted_steps = 0
         self._stay_rad: np.ndarray | None = None
 
@@ -136,11 +134,12 @@ class Retry:
             return _lift(state, grip_m)
         if self._closing:
             self._closing -= 1
-            lifts = self._grips() if self._closing else self._holds()
+            lifts = self._grips()
             if lifts or not self._closing:
                 self._forget()
                 if lifts:
                     self.begun, self._lifting = "it holds something; lifts it", LIFTING_STEPS
+                    self._closed_once = False
             return _still(CLOSE)
         if self._retreat:
             self._retreat -= 1

@@ -14,6 +14,7 @@ from deploy.aside import (
     FINGER_M,
     FLOOR_M,
     HALF_FINGER_M,
+    LOWEST_M,
     NEAR_M,
     PRESS_N,
     TRIES,
@@ -22,7 +23,7 @@ from deploy.aside import (
     pressed_at,
 )
 from deploy.kinematics import grip_jacobian, grip_pose, grip_position
-from deploy.retry import ASIDES, CLOSING_STEPS, FREE_STEPS, LOW_M, LOWEST_M, STILL_STEPS, Retry
+from deploy.retry import ASIDES, CLOSING_STEPS, FREE_STEPS, LOW_M, STILL_STEPS, Retry
 
 LOW = np.array(contract.HOME_RAD) + np.array([0.5, 0.35, 0, 0.1, 0, 0.3, 0.4])
 """At an object, turned in every way that a hand is."""
@@ -206,6 +207,39 @@ def test_a_contact_that_does_not_press_along_the_hand_is_none():
     q_rad = under_way(aside, 0.01)
     way_m = aside(q_rad, True, False, NOWHERE)
     assert not (aside.ended or aside.failed) and way_m[2] < 0.0
+
+
+def test_what_presses_beside_the_hand_on_the_way_down_is_not_what_it_came_for():
+    aside = Aside(LOW, AT_RIM, grip_position(LOW))
+    aside(under_way(aside, 0.01), True, False, np.array((0.0, 1.1 * FARTHEST_M)))
+    assert not (aside.ended or aside.failed) and aside.tries == 1
+
+
+def test_near_the_table_a_finger_on_something_is_closed_with():
+    low_rad = lower(LOW, LOWEST_M + 0.005)
+    aside = Aside(low_rad, AT_RIM, grip_position(low_rad))
+    q_rad = flown(aside, low_rad, lambda grip_m: aside._phase == 2 and grip_m[2] < LOWEST_M)
+    aside(q_rad, False, True, AT_RIM)
+    assert aside.ended and aside.tries == 1
+
+
+def test_a_hand_that_creeps_down_is_not_stuck():
+    aside, q_rad = Aside(LOW, AT_RIM, grip_position(LOW)), LOW
+    for _ in range(80):
+        way_m = aside(q_rad, False, False, NOWHERE)
+        if aside.ended or aside.failed:
+            break
+        way_m[2] = max(way_m[2], -0.0015)
+        q_rad = q_rad + np.linalg.pinv(grip_jacobian(q_rad)) @ np.append(way_m, np.zeros(3))
+    assert aside.ended and grip_position(LOW)[2] - grip_position(q_rad)[2] > DEEP_M - 2 * NEAR_M
+
+
+def test_a_hold_leaves_what_the_arm_feels_in_free_air_and_how_often_it_stepped():
+    retry, wrong_nm = Retry(), pressed(LOW, (0.0, RIM_M, 0.0), 8.0)
+    retry(np.append(HIGH, OPEN), False, wrong_nm)
+    retry.reset()
+    for _ in range(2 * FELT_STEPS):
+        assert retry(np.append(LOW, OPEN), False, wrong_nm) is None
 
 
 @pytest.mark.parametrize(("below_m", "closes_there"), [(0.02, True), (-0.01, False)])

@@ -143,6 +143,14 @@ def test_it_says_what_pressed_on_it_hardest_since_it_was_asked(spring, arm):
     assert spring.felt()[0] == "" and not spring.felt()[1].any()
 
 
+def test_torques_that_are_no_numbers_are_told(spring, arm):
+    arm.touches = np.nan
+    time.sleep(0.05)
+    arm.touches = 1.0
+    time.sleep(0.05)
+    assert np.isnan(spring.felt()[1]).any()
+
+
 def test_a_contact_does_not_keep_a_hand_from_going_up(spring, arm):
     arm.touches = 1.0
     spring.follow(STEP, heeds=False)

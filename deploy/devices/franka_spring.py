@@ -130,7 +130,8 @@ class FrankaSpring:
         """What it does to others is what libfranka's external torques say (Franka's documentation of
         `RobotState`), and so with the other sign what is done to it."""
         torque_nm = -np.asarray(state.tau_ext_hat_filtered, float)
-        if np.linalg.norm(torque_nm) > np.linalg.norm(self._felt_nm):
+        hardest_nm = np.linalg.norm(self._felt_nm)
+        if np.isfinite(hardest_nm) and not np.linalg.norm(torque_nm) <= hardest_nm:  # no number is told, too
             self._felt_nm = torque_nm
 
     def _give_way(self, state: Any, met: str) -> None:
