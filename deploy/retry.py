@@ -3,8 +3,8 @@
 A policy sees three frames, 0.3 s. Nothing tells it that it has stood for a second around something taller
 than it believes, waiting to get lower, or that it closes beside the object again and again, where its own
 hand hides what it looks for. Nor does it know that it has done what it was trained for, in episodes of 6 s:
-it goes on, its elbow drifts, and after a minute it is where no training was. Time and the fingers' opening
-tell all of that without a camera.
+it goes on, its elbow drifts, and after a minute it is where no training was. Time, the fingers' opening
+and what the arm feels tell all of that without a camera.
 """
 
 from collections import deque
@@ -40,7 +40,8 @@ ASIDES = 3
 """How often at most a hand steps aside (each time `aside.TRIES` steps) until it has lifted something: what an
 arm feels may be wrong."""
 FREE_STEPS = 10
-"""Control steps above `LOW_M`, the last ones, whose mean is what an arm feels that touches nothing."""
+"""Control steps of an open hand above `LOW_M`, the last ones: their mean is what an arm feels that touches
+and carries nothing."""
 STAND_STEPS = 3
 """Fingers that have not moved in them, and did before, have something between them."""
 CLEAR_M = 0.16
@@ -181,7 +182,7 @@ class Retry:
         """(7,) `felt_nm` without what the arm felt where it touches nothing."""
         if felt_nm is None:
             return None
-        if grip_m[2] > LOW_M:
+        if grip_m[2] > LOW_M and self._widths[-1] > OPEN_WIDTH_M:
             self._free_nm.append(felt_nm)
         return felt_nm - np.mean(self._free_nm, axis=0) if self._free_nm else felt_nm
 

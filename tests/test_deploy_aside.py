@@ -313,6 +313,18 @@ def test_what_an_arm_feels_that_touches_nothing_does_not_count():
     assert retry.begun == STEPS_ASIDE
 
 
+def test_what_a_hand_carries_is_not_what_an_empty_one_feels():
+    retry = Retry()
+    for _ in range(FREE_STEPS):
+        retry(np.append(HIGH, HOLDING), False, pressed(HIGH, (0.0, 0.0, 0.0), -30.0))
+    for _ in range(2 * FELT_STEPS):
+        retry(np.append(LOW, OPEN), False, pressed(LOW, (0.0, RIM_M, 0.0), 0.9 * PRESS_N))
+    assert retry.begun != STEPS_ASIDE
+    for _ in range(FELT_STEPS):
+        retry(np.append(LOW, OPEN), False, pressed(LOW, (0.0, RIM_M, 0.0)))
+    assert retry.begun == STEPS_ASIDE
+
+
 def test_an_arm_whose_finger_is_always_on_something_steps_aside_so_often_and_no_more():
     retry, begun = Retry(), []
     for _ in range(1000):
