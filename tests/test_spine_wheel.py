@@ -98,7 +98,8 @@ def test_a_wheel_has_every_module_and_file(installed):
     left_out = {
         f"pretrained/{file}" for file in there(ROOT / "pretrained") if file.startswith(kept_in_clones)
     }
-    assert len(left_out) == 22
+    for folder in kept_in_clones:  # else nothing would be compared below
+        assert any(file.startswith(f"pretrained/{folder}") for file in left_out)
     assert there(installed / "ddgrasp") == (expected | there(ROOT / "ddgrasp")) - left_out
 
 
