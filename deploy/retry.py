@@ -8,6 +8,8 @@ and what the arm feels tell all of that without a camera.
 """
 
 from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -71,6 +73,20 @@ def still_for(limits: SafetyLimits) -> float:
     return min(STILL_M, STILL_SHARE * fastest_m_s * STILL_STEPS * limits.period_s)
 
 
+@dataclass(frozen=True)
+class _Now:
+    """What a control step knows of the arm; arguments of `Retry.__call__` where not said otherwise."""
+
+    state: Float[np.ndarray, "8"]
+    q_rad: Float[np.ndarray, "7"]
+    grip_m: Float[np.ndarray, "3"]
+    met: bool
+    pressed_m: Float[np.ndarray, "2"]
+    """`aside.pressed_at`."""
+    landed: bool
+    """A finger stands on something (`aside.Landing`)."""
+
+
 class Retry:
     """Acts instead of the policy for a while; call it with the robot's state in every control step.
 
@@ -79,6 +95,9 @@ class Retry:
     to grasp steps aside (`deploy.aside`) and closes. One that has closed on something, or stays low with
     something in it, lifts it, straight up, then to where objects are lifted to. One that has lifted something
     stays there for as long as it has it.
+
+    Each of these is a generator that yields an action (8,) for every control step, `self._now`; `self._doing`
+    is the one that acts. The one that ends says so before its last action, and what comes next.
     """
 
     def __init__(self, still_m: float = STILL_M) -> None:
@@ -95,7 +114,7 @@ class Retry:
         """Why it took over in the last call, empty if it did not."""
         self.done = False
         """Whether that was because nothing is left to do."""
-        self._forget()
+        self._end()
         self._closed_once = False
         self._lifted_steps = 0
         self._stay_rad: np.ndarray | None = None
@@ -108,73 +127,23 @@ class Retry:
         `met`: the arm gave way; `felt_nm`: (7,) what pressed on it, see `RobotState`.
         """
         self.begun, self.done = "", False
+        self._now = self._observed(state, met, felt_nm)
+        if (stay := self._stay()) is not None:
+            return stay
+        if self._doing is None:
+            self._doing = self._look()
+        return None if self._doing is None else next(self._doing)
+
+    def _observed(
+        self, state: Float[np.ndarray, "8"], met: bool, felt_nm: Float[np.ndarray, "7"] | None
+    ) -> _Now:
         q_rad = state[STATE.arm].astype(np.float64)
         grip_m = grip_position(q_rad)
         self._places.append(grip_m)
         self._widths.append(float(state[STATE.width][0]))
         pressed_m = pressed_at(q_rad, self._tared(grip_m, felt_nm))
         landed = self._landing(float(grip_m[2]), pressed_m)
-        if (stay := self._stay(state, grip_m)) is not None:
-            return stay
-        if not (self._closing or self._retreat or self._lifting or self._aside):
-            if landed and self._may_step_aside(grip_m):
-                self._begin_aside(q_rad, pressed_m)
-            else:
-                self._look(grip_m)
-        if self._aside is not None:
-            tries = self._aside.tries
-            way_m = self._aside(q_rad, met, landed, pressed_m)
-            if self._aside.tries > tries:
-                self.begun = "a finger is on something again; steps aside"
-            if not self._ends_aside(self._aside):
-                return _moved(state, way_m, OPEN)
-        if self._lifting:
-            self._lifting -= 1
-            if not self._lifting or not self._holds():
-                self._forget()
-            return _lift(state, grip_m)
-        if self._closing:
-            self._closing -= 1
-            lifts = self._grips()
-            if lifts or not self._closing:
-                self._forget()
-                if lifts:
-                    self.begun, self._lifting = "it holds something; lifts it", LIFTING_STEPS
-                    self._closed_once = False
-            return _still(CLOSE)
-        if self._retreat:
-            self._retreat -= 1
-            if not self._retreat or (grip_m[2] > ABOVE_M and self._widths[-1] > OPEN_WIDTH_M):
-                self._forget()
-            if grip_m[2] < CLEAR_M:
-                return _moved(state, np.array((0.0, 0.0, UP_M)), OPEN)
-            return _towards(np.array(contract.HOME_RAD), state, OPEN)
-        return None
-
-    def _stay(self, state: Float[np.ndarray, "8"], grip_m: Float[np.ndarray, "3"]) -> np.ndarray | None:
-        """(8,) action of a hand that has held something at the lift's place for long enough; else None."""
-        away_m = float(np.linalg.norm(grip_m - contract.LIFT_TARGET_M))
-        there = self._stay_rad is not None or away_m < contract.LIFT_TOLERANCE_M
-        if not (there and self._holds()):
-            self._lifted_steps, self._stay_rad = 0, None
-            return None
-        self._lifted_steps += 1
-        if self._lifted_steps == DONE_STEPS:
-            self._stay_rad = np.array(state[STATE.arm])
-            self.begun, self.done = "what was grasped is lifted; stays there", True
-            self._asides_left = ASIDES
-        return None if self._stay_rad is None else _towards(self._stay_rad, state, CLOSE)
-
-    def _ends_aside(self, aside: Aside) -> bool:
-        """Whether the hand does something else from now on."""
-        if aside.failed:
-            self._go_up("the hand comes down on something wherever it does")
-        elif aside.ended:
-            self._closing = CLOSING_STEPS
-        else:
-            return False
-        self._aside = None
-        return True
+        return _Now(state, q_rad, grip_m, met, pressed_m, landed)
 
     def _tared(
         self, grip_m: Float[np.ndarray, "3"], felt_nm: Float[np.ndarray, "7"] | None
@@ -186,41 +155,111 @@ class Retry:
             self._free_nm.append(felt_nm)
         return felt_nm - np.mean(self._free_nm, axis=0) if self._free_nm else felt_nm
 
-    def _may_step_aside(self, grip_m: Float[np.ndarray, "3"]) -> bool:
-        return bool(self._asides_left and self._widths[-1] > OPEN_WIDTH_M and LOWEST_M < grip_m[2] < LOW_M)
+    def _stay(self) -> Float[np.ndarray, "8"] | None:
+        """(8,) action of a hand that has held something at the lift's place for long enough; else None."""
+        state = self._now.state
+        away_m = float(np.linalg.norm(self._now.grip_m - contract.LIFT_TARGET_M))
+        there = self._stay_rad is not None or away_m < contract.LIFT_TOLERANCE_M
+        if not (there and self._holds()):
+            self._lifted_steps, self._stay_rad = 0, None
+            return None
+        self._lifted_steps += 1
+        if self._lifted_steps == DONE_STEPS:
+            self._stay_rad = np.array(state[STATE.arm])
+            self.begun, self.done = "what was grasped is lifted; stays there", True
+            self._asides_left = ASIDES
+        return None if self._stay_rad is None else _towards(self._stay_rad, state, CLOSE)
 
-    def _begin_aside(self, q_rad: Float[np.ndarray, "7"], pressed_m: Float[np.ndarray, "2"]) -> None:
-        self._aside = Aside(q_rad, pressed_m, self._places[-FELT_STEPS])
-        self._asides_left -= 1
-        self.begun = "a finger of the open hand is on something; steps aside"
-
-    def _look(self, grip_m: Float[np.ndarray, "3"]) -> None:
-        """Whether to take over, and how."""
+    def _look(self) -> Iterator[np.ndarray] | None:
+        """What to do instead of the policy, None to let it act."""
+        if self._now.landed and self._may_step_aside():
+            return self._step_aside()
         widths = [*self._widths]
         if len(widths) >= EMPTY_STEPS and max(widths[-EMPTY_STEPS:]) < EMPTY_WIDTH_M:
-            self._go_up(f"the hand closed to {1e3 * widths[-1]:.1f} mm, on nothing")
-        elif len(widths) > STILL_STEPS and self._keeps(grip_m):
-            self.begun, self._lifting = f"it has held something for {_SECONDS:.0f} s; lifts it", LIFTING_STEPS
-        elif len(widths) > STILL_STEPS and self._stands(grip_m):
-            reason = f"the open hand has stood still for {_SECONDS:.0f} s"
-            if self._closed_once:
-                self._go_up(f"{reason} again")
+            return self._go_up(f"the hand closed to {1e3 * widths[-1]:.1f} mm, on nothing")
+        if len(widths) <= STILL_STEPS:
+            return None
+        if self._keeps():
+            self.begun = f"it has held something for {_SECONDS:.0f} s; lifts it"
+            return self._lift()
+        if not self._stands():
+            return None
+        reason = f"the open hand has stood still for {_SECONDS:.0f} s"
+        if self._closed_once:
+            return self._go_up(f"{reason} again")
+        self.begun, self._closed_once = f"{reason}; closes", True
+        return self._close()
+
+    def _step_aside(self) -> Iterator[np.ndarray]:
+        now = self._now
+        self.begun = "a finger of the open hand is on something; steps aside"
+        self._asides_left -= 1
+        aside = Aside(now.q_rad, now.pressed_m, self._places[-FELT_STEPS])
+        while True:
+            now, tries = self._now, aside.tries
+            way_m = aside(now.q_rad, now.met, now.landed, now.pressed_m)
+            if aside.failed:
+                yield from self._go_up("the hand comes down on something wherever it does")
+            if aside.ended:
+                yield from self._close()
+            if aside.tries > tries:
+                self.begun = "a finger is on something again; steps aside"
+            yield _moved(now.state, way_m, OPEN)
+
+    def _close(self) -> Iterator[np.ndarray]:
+        for left in reversed(range(CLOSING_STEPS)):
+            if self._grips():
+                self.begun, self._closed_once = "it holds something; lifts it", False
+                self._end(then=self._lift())
+            elif not left:
+                self._end()
+            yield _still(CLOSE)
+
+    def _lift(self) -> Iterator[np.ndarray]:
+        """Straight up, then to where objects are lifted to."""
+        for left in reversed(range(LIFTING_STEPS)):
+            if not (left and self._holds()):
+                self._end()
+            way_m = contract.LIFT_TARGET_M - self._now.grip_m
+            if self._now.grip_m[2] < ABOVE_M:
+                way_m[:2] = 0.0
+            yield _moved(self._now.state, way_m, CLOSE)
+
+    def _go_up(self, reason: str) -> Iterator[np.ndarray]:
+        """Straight up with open fingers, then towards the start pose, until it can look again."""
+        self.begun, self._closed_once = f"{reason}; goes up to look again", False
+        for left in reversed(range(RETREAT_STEPS)):
+            height_m = self._now.grip_m[2]
+            if not left or (height_m > ABOVE_M and self._widths[-1] > OPEN_WIDTH_M):
+                self._end()
+            if height_m < CLEAR_M:
+                yield _moved(self._now.state, np.array((0.0, 0.0, UP_M)), OPEN)
             else:
-                self.begun, self._closing, self._closed_once = f"{reason}; closes", CLOSING_STEPS, True
+                yield _towards(np.array(contract.HOME_RAD), self._now.state, OPEN)
 
-    def _stands(self, grip_m: Float[np.ndarray, "3"]) -> bool:
-        return self._still(grip_m) and min(self._widths) > OPEN_WIDTH_M
+    def _end(self, then: Iterator[np.ndarray] | None = None) -> None:
+        """What was until now does not count; `then` acts from the next control step on."""
+        self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
+        self._widths: deque[float] = deque(maxlen=STILL_STEPS + 1)
+        self._landing.forget()
+        self._doing = then
 
-    def _keeps(self, grip_m: Float[np.ndarray, "3"]) -> bool:
+    def _may_step_aside(self) -> bool:
+        low = LOWEST_M < self._now.grip_m[2] < LOW_M
+        return bool(low and self._asides_left and self._widths[-1] > OPEN_WIDTH_M)
+
+    def _stands(self) -> bool:
+        """Whether the open hand stands still."""
+        moved_m = float(np.linalg.norm(self._places[0] - self._now.grip_m))
+        still = moved_m < self._still_m and self._now.grip_m[2] < LOW_M
+        return bool(still and min(self._widths) > OPEN_WIDTH_M)
+
+    def _keeps(self) -> bool:
         """Whether the fingers stand on something, and the hand stays low with it."""
+        height_m = float(self._now.grip_m[2])
         same = max(self._widths) - min(self._widths) < SAME_WIDTH_M
-        raised_m = float(grip_m[2] - self._places[0][2])
-        stays = raised_m < self._still_m and float(grip_m[2]) < LOW_M
+        stays = height_m - float(self._places[0][2]) < self._still_m and height_m < LOW_M
         return stays and same and EMPTY_WIDTH_M < self._widths[-1] < OPEN_WIDTH_M
-
-    def _still(self, grip_m: Float[np.ndarray, "3"]) -> bool:
-        moved_m = float(np.linalg.norm(self._places[0] - grip_m))
-        return moved_m < self._still_m and float(grip_m[2]) < LOW_M
 
     def _holds(self) -> bool:
         return EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M
@@ -232,30 +271,11 @@ class Retry:
         stand = max(widths_m[-STAND_STEPS:]) - min(widths_m[-STAND_STEPS:]) < SAME_WIDTH_M
         return came and stand and self._holds()
 
-    def _go_up(self, reason: str) -> None:
-        self.begun = f"{reason}; goes up to look again"
-        self._retreat, self._closed_once = RETREAT_STEPS, False
-
-    def _forget(self) -> None:
-        self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
-        self._widths: deque[float] = deque(maxlen=STILL_STEPS + 1)
-        self._landing.forget()
-        self._closing = self._retreat = self._lifting = 0
-        self._aside: Aside | None = None
-
 
 def _still(gripper: float) -> Float[np.ndarray, "8"]:
     action = np.zeros(contract.ACTION_SIZE)
     action[ACTION.gripper] = gripper
     return action
-
-
-def _lift(state: Float[np.ndarray, "8"], grip_m: Float[np.ndarray, "3"]) -> np.ndarray:
-    """(8,) action that brings what is held to where objects are lifted to, straight up first."""
-    way_m = contract.LIFT_TARGET_M - grip_m
-    if grip_m[2] < ABOVE_M:
-        way_m[:2] = 0.0
-    return _moved(state, way_m, CLOSE)
 
 
 def _moved(state: Float[np.ndarray, "8"], way_m: Float[np.ndarray, "3"], gripper: float) -> np.ndarray:
