@@ -93,9 +93,10 @@ def stage_folder(option: str, path: Path, stage: str) -> Path:
 
 def check_devices(config: Config, run_dir: Path) -> None:
     """UserError if pictures cannot be drawn here, or the teacher, unless it is finished, not be trained."""
-    from mjx_envs.render.batch_render import check_renderer
+    if config.world.renderer == "warp":  # any other draws anywhere, and to import MJX takes seconds
+        from mjx_envs.physics.mjx_warp import require_gpu
 
-    check_renderer(config.world.renderer)
+        require_gpu("renderer")
     if not artifacts.is_finished(run_dir / "teacher"):
         from ppo.stage import check
 
@@ -108,21 +109,23 @@ def check_networks(config: Config, run_dir: Path) -> list[str]:
 
     Traces a step of each, which the stages do as well.
     """
+    left = [name for name in ("demos", "ddg", "student") if not artifacts.is_finished(run_dir / name)]
+    if not left:
+        return []
     from ddg_jax import memory as ddg_memory
     from demos import memory as demos_memory
     from learning import memory
     from student_jax import memory as student_memory
     from student_jax import start
 
-    if not artifacts.is_finished(run_dir / "student"):
+    if "student" in left:
         start.check(config)
-    lines = []
-    needs = {"demos": demos_memory.need, "ddg": ddg_memory.need, "student": student_memory.need}
-    for stage, need_of in needs.items():
-        if not artifacts.is_finished(run_dir / stage):
-            memory.check(need := need_of(config), run_dir)
-            lines.append(str(need))
-    return lines
+    need_of = {"demos": demos_memory.need, "ddg": ddg_memory.need, "student": student_memory.need}
+    needs = []
+    for name in left:
+        needs.append(need_of[name](config))
+        memory.check(needs[-1], run_dir)
+    return [str(need) for need in needs]
 
 
 def _check_start(stage: str, option: str, folder: str, others: str = "") -> None:

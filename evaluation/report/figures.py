@@ -2,6 +2,7 @@
 that is not in it."""
 
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import matplotlib
@@ -19,6 +20,12 @@ INVALID_RGB = (1.0, 0.0, 1.0)
 """Magenta: no depth is drawn in it."""
 MAX_FRAMES = 8
 """Most frames in one film strip."""
+TITLE_IN, GAP_IN, SCALE_IN = 0.3, 0.06, 0.85
+"""Inches above pictures for a title, between them, and beside them for the scale of depth."""
+LINE_IN, LETTER_IN = 0.18, 0.08
+"""Inches for a line of a label beside pictures, and for each letter of it."""
+CURVE_BOX = (0.2, 0.2, 0.76, 0.67)
+"""Left, bottom, width and height of a curve's axes, shares of its picture."""
 
 
 def depth_to_metres(depth: Real[np.ndarray, "*any"]) -> Float32[np.ndarray, "*any"]:
@@ -58,9 +65,10 @@ def draw_panels(panels: Mapping[str, Real[np.ndarray, "..."]]) -> bytes:
     strips = {title: _thin(strip) for title, strip in strips.items()}
     longest = max(len(strip) for strip in strips.values())
     if longest == 1:
-        figure = _grid([[strip[0] for strip in strips.values()]], list(strips), [""])
+        figure = _grid([[strip[0] for strip in strips.values()]], list(strips), [""], scale=bool(depths))
     else:
-        figure = _grid([list(strip) for strip in strips.values()], [""] * longest, list(strips))
+        rows = [list(strip) for strip in strips.values()]
+        figure = _grid(rows, [""] * longest, list(strips), scale=bool(depths))
     if depths:
         _depth_legend(figure, near, far)
     return to_png(figure)
@@ -80,8 +88,8 @@ def draw_curve(points: Sequence[tuple[int, float]], title: str, x_label: str, un
       x_label: what a step is.
       unit: of the values; "%" of shares, which are drawn times 100.
     """
-    figure = Figure(figsize=(3.6, 2.4), layout="constrained")
-    axes = figure.add_subplot()
+    figure = Figure(figsize=(3.6, 2.4))
+    axes = figure.add_axes(CURVE_BOX)  # a layout that looks for its margins doubles the time, of 37 in a run
     steps, values = zip(*points, strict=True)
     factor = 100.0 if unit == "%" else 1.0
     axes.plot(steps, [factor * v for v in values], linewidth=1.4, marker="." if len(points) < 3 else "")
@@ -89,6 +97,9 @@ def draw_curve(points: Sequence[tuple[int, float]], title: str, x_label: str, un
     axes.set_xlabel(x_label, fontsize=9)
     axes.set_ylabel(unit or "no unit", fontsize=9)
     axes.tick_params(labelsize=8)
+    axes.locator_params(nbins=5)
+    axes.ticklabel_format(axis="y", scilimits=(-3, 5))  # what is longer has no room beside the axis
+    axes.yaxis.get_offset_text().set_fontsize(8)
     axes.grid(alpha=0.3)
     return to_png(figure)
 
@@ -114,18 +125,38 @@ def _to_rgb(frames: np.ndarray) -> np.ndarray:
     return frames / 255.0 if frames.dtype == np.uint8 else np.clip(frames, 0.0, 1.0)
 
 
-def _grid(rows: list[list[np.ndarray]], titles: list[str], labels: list[str]) -> Figure:
+def _grid(rows: list[list[np.ndarray]], titles: list[str], labels: list[str], scale: bool = False) -> Figure:
+    """Named rows of pictures below their titles; `scale`: with room for `_depth_legend` on the right.
+
+    Margins are fixed: a layout that looks for them takes longer than the drawing.
+    """
     columns = max(len(row) for row in rows)
     height, width = rows[0][0].shape[:2]
     panel_in = max(1.3, min(3.4, 13.0 / columns))
-    figure = Figure(
-        figsize=(panel_in * columns, (panel_in * height / width + 0.25) * len(rows) + 0.5),
-        layout="constrained",
+    high_in = panel_in * height / width
+    labels = [textwrap.fill(label, max(1, int(high_in / LETTER_IN))) for label in labels]
+    lines = max(label.count("\n") + 1 if label else 0 for label in labels)
+    left_in, right_in = GAP_IN + LINE_IN * lines, SCALE_IN if scale else GAP_IN
+    size_in = (
+        left_in + (panel_in + GAP_IN) * columns - GAP_IN + right_in,
+        TITLE_IN + (high_in + GAP_IN) * len(rows),
     )
+    figure = Figure(figsize=size_in)
+    margins = {
+        "left": left_in / size_in[0],
+        "right": 1.0 - right_in / size_in[0],
+        "bottom": GAP_IN / size_in[1],
+        "top": 1.0 - TITLE_IN / size_in[1],
+        "wspace": GAP_IN / panel_in,
+        "hspace": GAP_IN / high_in,
+    }
+    panels = figure.subplots(len(rows), columns, squeeze=False, gridspec_kw=margins)
     for r, row in enumerate(rows):
-        for c, image in enumerate(row):
-            axes = figure.add_subplot(len(rows), columns, r * columns + c + 1)
-            axes.imshow(image, interpolation="nearest")
+        for c, axes in enumerate(panels[r]):
+            if c >= len(row):
+                axes.set_axis_off()
+                continue
+            axes.imshow(row[c], interpolation="nearest", aspect="auto")
             axes.set_xticks([])
             axes.set_yticks([])
             axes.set_title(titles[c] if r == 0 else "", fontsize=9)
@@ -134,12 +165,17 @@ def _grid(rows: list[list[np.ndarray]], titles: list[str], labels: list[str]) ->
 
 
 def _depth_legend(figure: Figure, near_m: float, far_m: float) -> None:
-    scale = ScalarMappable(Normalize(near_m, far_m), DEPTH_COLORS)
-    bar = figure.colorbar(scale, ax=figure.axes, fraction=0.02, pad=0.01)
+    """A scale of depth, and what no depth is drawn in, right of a `_grid` that left room for it."""
+    width_in, height_in = figure.get_size_inches()
+    left, wide = 1.0 - (SCALE_IN - 0.15) / width_in, 0.12 / width_in
+    box = (left, 0.5 / height_in, wide, max(0.1, 1.0 - (0.5 + TITLE_IN) / height_in))
+    bar = figure.colorbar(ScalarMappable(Normalize(near_m, far_m), DEPTH_COLORS), cax=figure.add_axes(box))
     bar.set_label("depth (m)", fontsize=8)
     bar.ax.tick_params(labelsize=7)
-    patch = Patch(color=INVALID_RGB, label="no depth")
-    figure.legend(handles=[patch], loc="outside lower right", fontsize=8, frameon=False)
+    figure.legend(
+        handles=[Patch(color=INVALID_RGB, label="no depth")],
+        loc="lower right", fontsize=8, frameon=False, borderpad=0.0, handlelength=1.0,
+    )  # fmt: skip
 
 
 def to_png(figure: Figure) -> bytes:
