@@ -218,7 +218,7 @@ def test_what_presses_beside_the_hand_on_the_way_down_is_not_what_it_came_for():
 def test_near_the_table_a_finger_on_something_is_closed_with():
     low_rad = lower(LOW, LOWEST_M + 0.005)
     aside = Aside(low_rad, AT_RIM, grip_position(low_rad))
-    q_rad = flown(aside, low_rad, lambda grip_m: aside._phase == 2 and grip_m[2] < LOWEST_M)
+    q_rad = flown(aside, low_rad, lambda grip_m: grip_m[2] < LOWEST_M)  # after it went up
     aside(q_rad, False, True, AT_RIM)
     assert aside.ended and aside.tries == 1
 
