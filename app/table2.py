@@ -43,6 +43,12 @@ class Study:
     workers: int
     left_out: Mapping[str, str]
     """Rows of the tables that cannot be made here, and why."""
+    paper_from: str = ""
+    """Run or folder with the paper's own generator, fitted already."""
+
+    def row_config(self, row: Row) -> Config:
+        """What one row is made with."""
+        return row_config(self.config, row, self.paper_from)
 
 
 def check_place(study: Study, resume: bool) -> None:
@@ -63,7 +69,7 @@ def run(study: Study) -> dict[str, Any]:
         row = ROWS[name]
         note(f"row {place} of {len(study.rows)}, {row.title}: student {row.student!r}")
         exported = _student(study, row, common)
-        _try(study, name, row_config(study.config, row), exported)
+        _try(study, name, study.row_config(row), exported)
         written = write(study)
     return written
 
@@ -74,7 +80,7 @@ def _shared(study: Study, stage: str) -> Artifact:
 
 def _student(study: Study, row: Row, common: Mapping[str, Artifact]) -> Artifact:
     """The row's exported student, made if no other row that trains alike has made it."""
-    config, folder = row_config(study.config, row), study.out / STUDENTS / row.student
+    config, folder = study.row_config(row), study.out / STUDENTS / row.student
     parents = {name: common[name] for name in get_stage("student").parents}
     if row.paper_generator:
         recordings = {"record": common["record"]}

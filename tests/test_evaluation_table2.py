@@ -108,6 +108,9 @@ def test_ripple_and_the_paper_s_generator_are_one_difference_each():
     assert (paper.training.steps, paper.unet, paper.prior) == (
         LAPTOP.ddg.training.steps, LAPTOP.ddg.unet, LAPTOP.ddg.prior,
     )  # fmt: skip
+    assert paper.init_from == ""  # not the shared one's, which draws something else
+    assert rows.row_config(shared, ROWS["paper_ddg"], "made").ddg == replace(paper, init_from="made")
+    assert rows.row_config(shared, ROWS["ddg"], "made").ddg == LAPTOP.ddg
     no_ripple = replace(LAPTOP.student.training, disparity_noise_px=0.0)
     still = replace(shared, student=replace(shared.student, training=no_ripple))
     with pytest.raises(UserError, match=r"disparity_noise_px is 0: row 'DDG, ripple' needs its strength"):
@@ -265,6 +268,15 @@ def command(*args: str) -> StudyTable2:
             "a student that has seen one row's depth is no start",
         ),
         (("--table", "ripple", "--student.training.disparity-noise-px", "0"), "needs its strength"),
+        (("--paper-generator", "pretrained/ddg"), "no row asked for has the paper's own generator"),
+        (
+            ("--table", "grafting", "--paper-generator", "nowhere"),
+            "--paper-generator is 'nowhere', which does",
+        ),
+        (
+            ("--table", "grafting", "--paper-generator", "pretrained/ddg"),
+            "use the same value, or fit a new one",
+        ),
     ],
 )
 def test_wrong_input_is_one_line_before_anything_is_written(args, message, tmp_path, monkeypatch, capsys):

@@ -45,7 +45,8 @@ class Run(FromPreset):
         check_config_values(self.config)
         pipeline.check_place(self.out, resume=self.resume)
         check_devices(self.config, self.out)
-        print(*check_networks(self.config, self.out), sep="\n", file=sys.stderr, flush=True)
+        for need in check_networks(self.config, self.out):
+            print(need, file=sys.stderr, flush=True)
         report = pipeline.run(self.config, self.out, resume=self.resume)
         from evaluation.report.summary import print_summary
 

@@ -45,11 +45,11 @@ def check_config_values(config: Config) -> Config:
 
     check_objects(config.world)
     for stage in ("ddg", "student"):
-        _check_start(stage, f"{stage}.init_from", getattr(config, stage).init_from)
+        check_start(stage, f"{stage}.init_from", getattr(config, stage).init_from)
     if config.ddg.init_from:
         start.check(config.ddg)
     if config.teacher.starts_from_file:
-        _check_start("teacher", "teacher.start", config.teacher.start, "nothing, guide, or ")
+        check_start("teacher", "teacher.start", config.teacher.start, "nothing, guide, or ")
     check_source(config)
     if config.student.encoder.weights:
         from student_jax import pretrained_encoder
@@ -128,7 +128,7 @@ def check_networks(config: Config, run_dir: Path) -> list[str]:
     return [str(need) for need in needs]
 
 
-def _check_start(stage: str, option: str, folder: str, others: str = "") -> None:
+def check_start(stage: str, option: str, folder: str, others: str = "") -> None:
     """UserError unless `folder` is empty or holds the stage's checkpoint; `others` might be given instead."""
     file = CHECKPOINTS[stage]
     if not folder or holding(folder, file, stage):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from app import extras, pipeline
 from app.commands.base import FromPreset
-from app.commands.checks import check_config_values, check_devices, check_networks
+from app.commands.checks import check_config_values, check_devices, check_networks, check_start
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Config
 from ddgrasp.config.checks import Count, Range
@@ -32,6 +32,9 @@ class StudyTable2(FromPreset):
     """How many with every object, the same for every row."""
     objects: tuple[str, ...] = ("all",)
     """Names, or all."""
+    paper_generator: str = ""
+    """Run directory or pretrained folder with the paper's own generator, which rows paper_ddg_no_graft and
+    paper_ddg take as it is; without it the study fits one on its recordings."""
     rig: Literal["development", "fr3"] = "development"
     """development (that everything was tuned on) or fr3 (the test rig)."""
     split: Literal["development", "test"] = "development"
@@ -60,8 +63,8 @@ class StudyTable2(FromPreset):
         study = self.planned()
         table2.check_place(study, self.resume)
         if not results.has_students(self.out, study.rows):
-            need = check_networks(study.config, self.out / results.SHARED)
-            print(*need, sep="\n", file=sys.stderr, flush=True)
+            for need in check_networks(study.config, self.out / results.SHARED):
+                print(need, file=sys.stderr, flush=True)
         made = table2.run(study)
         print(*(self.out / name for name in (table2.STUDY_JSON, table2.STUDY_HTML)), sep="\n")
         print(page.describe(made, results.set_name(study.series)))
@@ -73,6 +76,12 @@ class StudyTable2(FromPreset):
         from evaluation.table2 import results, rows
 
         names = rows.chosen(self.rows, self.table)
+        check_start("ddg", "--paper-generator", self.paper_generator)
+        if self.paper_generator and not any(rows.ROWS[name].paper_generator for name in names):
+            raise UserError(
+                f"--paper-generator is {self.paper_generator!r}, and no row asked for has the paper's own "
+                "generator: leave it out, or give --table grafting."
+            )
         series = Series(self.rig, self.objects, self.trials, self.split, self.number)
         series.names()
         if self.rig == "fr3":
@@ -83,9 +92,9 @@ class StudyTable2(FromPreset):
         left_out = {} if self.rows else _impossible(config, names, shared)
         names = tuple(name for name in names if name not in left_out)
         for name in names:
-            _check_row(config, name, shared)
+            _check_row(config, name, shared, self.paper_generator)
         check_devices(config, shared)
-        return Study(config, self.out, names, series, self.workers, left_out)
+        return Study(config, self.out, names, series, self.workers, left_out, self.paper_generator)
 
 
 @dataclass(frozen=True)
@@ -129,11 +138,11 @@ class StudyCauses:
         print(causes.markdown(made["rows"]))
 
 
-def _check_row(config: Config, name: str, shared: Path) -> None:
+def _check_row(config: Config, name: str, shared: Path, paper_from: str = "") -> None:
     from evaluation.table2.rows import ROWS, row_config
     from evaluation.treatments import make_treatment
 
-    check_config_values(row_config(config, ROWS[name]))
+    check_config_values(row_config(config, ROWS[name], paper_from))
     make_treatment(ROWS[name].depth, config)
     if ROWS[name].source == "rig" and artifacts.is_finished(shared / "demos"):
         from demos.stage import STORE

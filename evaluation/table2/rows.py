@@ -147,8 +147,8 @@ def _check_clean(start: str) -> None:
         )
 
 
-def row_config(shared: Config, row: Row) -> Config:
-    """`shared_config` with the row's differences.
+def row_config(shared: Config, row: Row, paper_from: str = "") -> Config:
+    """`shared_config` with the row's differences; `paper_from`: see `paper_generator`.
 
     Raises UserError if the row wants a ripple and the configuration has none.
     """
@@ -163,14 +163,14 @@ def row_config(shared: Config, row: Row) -> Config:
         training = replace(training, **dict.fromkeys(HAND_MADE, 0.0))
     picture = replace(shared.student.picture, fill_holes=row.filled)
     student = replace(shared.student, depth_source=row.source, training=training, picture=picture)
-    ddg = paper_generator(shared.ddg) if row.paper_generator else shared.ddg
+    ddg = paper_generator(shared.ddg, paper_from) if row.paper_generator else shared.ddg
     return replace(shared, student=student, ddg=ddg)
 
 
-def paper_generator(config: DDGConfig) -> DDGConfig:
+def paper_generator(config: DDGConfig, start: str = "") -> DDGConfig:
     """The generator that draws the depth map itself by squared errors of equal weight, sampled undistilled.
 
-    Network, prior and number of training steps stay.
+    Network, prior and number of training steps stay. `start`: run or folder with one that is fitted already.
     """
     return replace(
         config,
@@ -178,5 +178,5 @@ def paper_generator(config: DDGConfig) -> DDGConfig:
         graft=replace(config.graft, noise_threshold=PAPER_THRESHOLD),
         training=replace(config.training, loss_weight=UNIFORM, hole_loss=SQUARED),
         sampling=replace(config.sampling, sampler=DPM_SOLVER, steps=PAPER_EVALUATIONS),
-        init_from="",
+        init_from=start,
     )
