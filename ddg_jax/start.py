@@ -34,5 +34,5 @@ def check(config: DDGConfig) -> None:
         if there != here:
             raise UserError(
                 f"The generator in {source} has ddg.{name} {there!r}, this configuration {here!r}: "
-                "use the same value, or fit a new one (empty ddg.init_from)."
+                "use the same value, or fit a new one (name none to begin with)."
             )

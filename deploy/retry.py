@@ -75,11 +75,13 @@ def still_for(limits: SafetyLimits) -> float:
 
 @dataclass(frozen=True)
 class _Now:
-    """What a control step knows of the arm; arguments of `Retry.__call__` where not said otherwise."""
+    """What a control step knows of the arm; `state` and `met` as given to `Retry.__call__`."""
 
     state: Float[np.ndarray, "8"]
     q_rad: Float[np.ndarray, "7"]
+    """The state's joints, in double precision."""
     grip_m: Float[np.ndarray, "3"]
+    """Where the grip is, by them."""
     met: bool
     pressed_m: Float[np.ndarray, "2"]
     """`aside.pressed_at`."""
@@ -96,8 +98,9 @@ class Retry:
     something in it, lifts it, straight up, then to where objects are lifted to. One that has lifted something
     stays there for as long as it has it.
 
-    Each of these is a generator that yields an action (8,) for every control step, `self._now`; `self._doing`
-    is the one that acts. The one that ends says so before its last action, and what comes next.
+    Each of these but the last is a generator that yields an action (8,) for every control step, `self._now`;
+    `self._doing` is the one that acts. The one that ends says so before its last action (`_end`), and what
+    comes next. Staying goes before all of them: what the hand was doing goes on if it loses what it has.
     """
 
     def __init__(self, still_m: float = STILL_M) -> None:
@@ -200,8 +203,10 @@ class Retry:
             way_m = aside(now.q_rad, now.met, now.landed, now.pressed_m)
             if aside.failed:
                 yield from self._go_up("the hand comes down on something wherever it does")
+                return
             if aside.ended:
                 yield from self._close()
+                return
             if aside.tries > tries:
                 self.begun = "a finger is on something again; steps aside"
             yield _moved(now.state, way_m, OPEN)

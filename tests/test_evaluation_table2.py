@@ -275,7 +275,7 @@ def command(*args: str) -> StudyTable2:
         ),
         (
             ("--table", "grafting", "--paper-generator", "pretrained/ddg"),
-            "use the same value, or fit a new one",
+            "the paper's is 'uniform': give another",
         ),
     ],
 )
@@ -286,6 +286,33 @@ def test_wrong_input_is_one_line_before_anything_is_written(args, message, tmp_p
     told = capsys.readouterr().err
     assert status == 2 and message in told and told.count("\n") == 1
     assert not out.exists()
+
+
+def test_the_paper_s_generator_is_taken_from_elsewhere_and_stays_the_same(tmp_path):
+    def fitted(name: str, **ddg) -> str:
+        folder = tmp_path / name / "ddg"
+        folder.mkdir(parents=True)
+        (folder / "params.msgpack").touch()
+        debug = get_preset("debug")
+        config = replace(debug, ddg=replace(rows.paper_generator(debug.ddg), **ddg))
+        artifacts.finish(folder, "ddg", config, seconds=1.0, metrics={})
+        return str(tmp_path / name)
+
+    def planned(*args: str) -> str:
+        study = command("--rows", "paper_ddg", "sim_gt", "--out", str(tmp_path / "study"), *args).planned()
+        return study.row_config(ROWS["paper_ddg"]).ddg.init_from
+
+    paper, other = fitted("paper"), get_preset("debug").ddg.depth
+    assert planned("--paper-generator", paper) == paper and planned() == ""
+    another = fitted("another", depth=other)
+    with pytest.raises(UserError, match="has ddg.depth.representation .* use the same value"):
+        planned("--paper-generator", another)
+    fitted("study/paper", init_from=paper)  # as the study leaves it when it has taken that one
+    assert planned("--paper-generator", paper, "--resume") == paper
+    with pytest.raises(
+        UserError, match=r"--paper-generator is '', .* was made otherwise \(--paper-generator"
+    ):
+        planned("--resume")
 
 
 def test_a_table_without_its_network_is_made_without_that_row_which_is_said(tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ from app import extras, pipeline
 from app.commands.base import FromPreset
 from app.commands.checks import check_config_values, check_devices, check_networks, check_start
 from ddgrasp import artifacts, contract
-from ddgrasp.config import Config
+from ddgrasp.config import UNIFORM, Config, DDGConfig
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
 
@@ -33,8 +33,8 @@ class StudyTable2(FromPreset):
     objects: tuple[str, ...] = ("all",)
     """Names, or all."""
     paper_generator: str = ""
-    """Run directory or pretrained folder with the paper's own generator, which rows paper_ddg_no_graft and
-    paper_ddg take as it is; without it the study fits one on its recordings."""
+    """Folder with the paper's own generator, for example `paper` of another study, which rows
+    paper_ddg_no_graft and paper_ddg take as it is; without it the study fits one on its recordings."""
     rig: Literal["development", "fr3"] = "development"
     """development (that everything was tuned on) or fr3 (the test rig)."""
     split: Literal["development", "test"] = "development"
@@ -76,11 +76,12 @@ class StudyTable2(FromPreset):
         from evaluation.table2 import results, rows
 
         names = rows.chosen(self.rows, self.table)
-        check_start("ddg", "--paper-generator", self.paper_generator)
-        if self.paper_generator and not any(rows.ROWS[name].paper_generator for name in names):
+        if any(rows.ROWS[name].paper_generator for name in names):
+            _check_paper_generator(self.config.ddg, self.paper_generator, self.out / results.PAPER / "ddg")
+        elif self.paper_generator:
             raise UserError(
                 f"--paper-generator is {self.paper_generator!r}, and no row asked for has the paper's own "
-                "generator: leave it out, or give --table grafting."
+                "generator: leave it out, or ask for --rows paper_ddg."
             )
         series = Series(self.rig, self.objects, self.trials, self.split, self.number)
         series.names()
@@ -136,6 +137,31 @@ class StudyCauses:
         )
         print(self.out / causes.JSON_FILE, self.out / causes.TABLE_FILE, sep="\n")
         print(causes.markdown(made["rows"]))
+
+
+def _check_paper_generator(config: DDGConfig, given: str, made: Path) -> None:
+    """UserError if `given` holds no generator with the paper's loss, or the study's, `made`, is another.
+
+    Whether its network fits is checked with the row.
+    """
+    from ddg_jax import start
+
+    if artifacts.is_finished(made):
+        was = artifacts.read_manifest(made).config["ddg"]["init_from"]
+        if was != given:
+            how = f"--paper-generator {was}" if was else "fitted here"
+            raise UserError(
+                f"--paper-generator is {given!r}, and {made} was made otherwise ({how}): give the same "
+                "again, or choose another --out."
+            )
+    check_start("ddg", "--paper-generator", given)
+    if given:
+        fitted = artifacts.read_manifest(start.folder(replace(config, init_from=given))).config["ddg"]
+        if (weight := fitted["training"]["loss_weight"]) != UNIFORM:
+            raise UserError(
+                f"--paper-generator is {given!r}, fitted with ddg.training.loss_weight {weight!r}; the "
+                f"paper's is {UNIFORM!r}: give another, or leave it out to have one fitted."
+            )
 
 
 def _check_row(config: Config, name: str, shared: Path, paper_from: str = "") -> None:

@@ -20,11 +20,11 @@ INVALID_RGB = (1.0, 0.0, 1.0)
 """Magenta: no depth is drawn in it."""
 MAX_FRAMES = 8
 """Most frames in one film strip."""
-TITLE_IN, GAP_IN, SCALE_IN = 0.3, 0.06, 0.85
-"""Inches above pictures for a title, between them, and beside them for the scale of depth."""
+TITLE_IN, GAP_IN, SCALE_IN, SCALE_HIGH_IN = 0.3, 0.06, 0.85, 1.6
+"""Inches above pictures for a title, between them, beside them for the scale of depth, and its height."""
 LINE_IN, LETTER_IN = 0.18, 0.08
 """Inches for a line of a label beside pictures, and for each letter of it."""
-CURVE_BOX = (0.2, 0.2, 0.76, 0.67)
+CURVE_BOX = (0.22, 0.2, 0.72, 0.67)
 """Left, bottom, width and height of a curve's axes, shares of its picture."""
 
 
@@ -98,8 +98,9 @@ def draw_curve(points: Sequence[tuple[int, float]], title: str, x_label: str, un
     axes.set_ylabel(unit or "no unit", fontsize=9)
     axes.tick_params(labelsize=8)
     axes.locator_params(nbins=5)
-    axes.ticklabel_format(axis="y", scilimits=(-3, 5))  # what is longer has no room beside the axis
-    axes.yaxis.get_offset_text().set_fontsize(8)
+    axes.ticklabel_format(axis="y", scilimits=(-2, 5))  # what is longer has no room beside the axis
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.get_offset_text().set_fontsize(8)
     axes.grid(alpha=0.3)
     return to_png(figure)
 
@@ -139,7 +140,7 @@ def _grid(rows: list[list[np.ndarray]], titles: list[str], labels: list[str], sc
     left_in, right_in = GAP_IN + LINE_IN * lines, SCALE_IN if scale else GAP_IN
     size_in = (
         left_in + (panel_in + GAP_IN) * columns - GAP_IN + right_in,
-        TITLE_IN + (high_in + GAP_IN) * len(rows),
+        max(SCALE_HIGH_IN if scale else 0.0, TITLE_IN + (high_in + GAP_IN) * len(rows)),
     )
     figure = Figure(figsize=size_in)
     margins = {
@@ -156,7 +157,7 @@ def _grid(rows: list[list[np.ndarray]], titles: list[str], labels: list[str], sc
             if c >= len(row):
                 axes.set_axis_off()
                 continue
-            axes.imshow(row[c], interpolation="nearest", aspect="auto")
+            axes.imshow(row[c], interpolation="nearest")
             axes.set_xticks([])
             axes.set_yticks([])
             axes.set_title(titles[c] if r == 0 else "", fontsize=9)
@@ -168,7 +169,7 @@ def _depth_legend(figure: Figure, near_m: float, far_m: float) -> None:
     """A scale of depth, and what no depth is drawn in, right of a `_grid` that left room for it."""
     width_in, height_in = figure.get_size_inches()
     left, wide = 1.0 - (SCALE_IN - 0.15) / width_in, 0.12 / width_in
-    box = (left, 0.5 / height_in, wide, max(0.1, 1.0 - (0.5 + TITLE_IN) / height_in))
+    box = (left, 0.5 / height_in, wide, 1.0 - (0.5 + TITLE_IN) / height_in)
     bar = figure.colorbar(ScalarMappable(Normalize(near_m, far_m), DEPTH_COLORS), cax=figure.add_axes(box))
     bar.set_label("depth (m)", fontsize=8)
     bar.ax.tick_params(labelsize=7)

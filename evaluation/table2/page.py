@@ -29,12 +29,14 @@ def _line(
     study: Mapping[str, Any], tried: Mapping[str, Any] | None, name: str, test: Mapping[str, Any] | None
 ) -> tuple[str, ...]:
     row = ROWS[name]
-    simulated = study["rows"].get(name, {}).get("student", {}).get("simulation", {}).get("own", {})
+    made = study["rows"].get(name, {})
+    simulated = made.get("student", {}).get("simulation", {}).get("own", {})
+    source = f" ({made['generator_from']})" if made.get("generator_from") else ""
     rig = ("not tried", "", "") if tried is None else tuple(_rate(tried.get(group)) for group in _GROUPS)
     pairs = f"{test['only_reference']} / {test['only_row']} of {test['n']}" if test else ""
     p_values = (_p(test["p"]), _p(test["p_holm"])) if test else ("", "")
     own = _rate(simulated.get("success"))
-    return (row.title, TRAINING[row.source], DEPLOYED[row.depth], own, *rig, pairs, *p_values)
+    return (row.title, f"{TRAINING[row.source]}{source}", DEPLOYED[row.depth], own, *rig, pairs, *p_values)
 
 
 def _rate(success: Mapping[str, Any] | None) -> str:

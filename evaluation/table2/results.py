@@ -51,10 +51,10 @@ def has_students(out: Path, rows: Sequence[str]) -> bool:
 def collect(out: Path) -> dict[str, Any]:
     """What study.json holds of rows and trials.
 
-    Keys: `rows.<row>` = {title, training, deployment, ripple_px, student: {name, seconds, simulation}}, of
-    rows whose student is finished; `sets.<set>` = {trials: how they were run, rows: each as
-    `evaluation.rig_trials.tabulate` gives it, tables: see `compare`}. A success rate is {rate, n, successes,
-    low, high}.
+    Keys: `rows.<row>` = {title, training, deployment, generator_from (empty if it was fitted in the study),
+    ripple_px, student: {name, seconds, simulation}}, of rows whose student is finished; `sets.<set>` =
+    {trials: how they were run, rows: each as `evaluation.rig_trials.tabulate` gives it, tables: see
+    `compare`}. A success rate is {rate, n, successes, low, high}.
     """
     rows = {
         name: _describe(row, artifacts.read_artifact(out / STUDENTS / row.student / "student"))
@@ -70,6 +70,7 @@ def _describe(row: Row, student: Artifact) -> dict[str, Any]:
         "title": row.title,
         "training": TRAINING[row.source],
         "deployment": DEPLOYED[row.depth],
+        "generator_from": student.manifest.config["ddg"]["init_from"] if "learned" in row.source else "",
         "ripple_px": student.manifest.config["student"]["training"]["disparity_noise_px"],
         "student": {
             "name": row.student,
