@@ -66,7 +66,7 @@ bench-convolutions: setup  ## training steps and sampler as jaxlib prefers and b
 bench-costs: setup  ## FLOPs and bytes of every stage of preset paper, and what an H100 needs for them
 	$(BIN)/python -m benchmarks.costs $(ARGS)
 
-demo: setup  ## the whole flow, from nothing to the student in the rig (make demo again continues)
+demo: setup  ## the whole flow, from a teacher of its own to the student in the rig (make demo again continues)
 	$(BIN)/ddgrasp run --preset demo --out $(OUT) --resume $(ARGS)
 
 check: setup  ## lint, format and types (pyright runs on Node.js; without one, its wheel is installed)

@@ -24,7 +24,7 @@ class Change:
 
     world: WorldName = "as it is"
     """meshes (the test rig's objects), furniture (its table's end, wall and clutter), dark table, or spring
-    (the arm follows as the Franka driver lets it)."""
+    (the arm follows as the Franka driver's spring has it at full stiffness)."""
     sight: SightName = "stereo"
     """stereo (matched at the policy's size), ideal (no errors), full size (matched at 848x480), or one
     kind of stereo's errors alone (rig/camera_errors.py)."""

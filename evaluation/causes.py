@@ -71,7 +71,7 @@ ROWS: dict[str, Row] = {
     "off_10mm": Row("camera off by 10 mm and 1 degree", "calibration", Change(off=(0.010, 1.0))),
     "furniture": Row("end of the table, wall, clutter", "table and clutter", Change("furniture")),
     "dark_table": Row("dark table", "table and clutter", Change("dark table")),
-    "spring": Row("arm follows as the Franka driver lets it", "dynamics", Change("spring")),
+    "spring": Row("arm follows as the Franka driver's spring", "dynamics", Change("spring")),
     "fr3": Row(
         "FR3 behind its protocol, on the same ground, primitives", "robot model",
         Fr3Bench("primitive", "ideal", bare=True, paired=True), against=IDEAL,

@@ -205,8 +205,8 @@ def check_demos(source: DepthSource, demos: EpisodeStore) -> None:
     """UserError if `source` needs colour, or what pictures are of, and the demos lack it."""
     if source.needs_rgb and "rgb" not in demos.fields:
         raise UserError(
-            f"{demos.path} holds no colour, which the student's depth source needs: collect demos with "
-            "--demos.rgb, or take another student.depth_source."
+            f"{demos.path} holds no colour, which the student's depth source needs: collect demos "
+            "without --demos.no-rgb, or take another student.depth_source."
         )
     if source.needs_views:
         check_views(demos)

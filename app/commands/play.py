@@ -48,7 +48,7 @@ class Play:
     """Names, or all (`ddgrasp objects list` has them)."""
     rig: Literal["development", "fr3"] = "development"
     """development (MuJoCo's Franka, seconds a trial) or fr3 (the test rig: another arm behind Franka's own
-    protocol, meshes; some 15 s a trial)."""
+    protocol, meshes; a minute or so a trial)."""
     noise: Noise = "camera"
     """Whose errors the policy sees: camera (a simulated D455's), none, or generator (the learned ones)."""
     trials: Count = 1
