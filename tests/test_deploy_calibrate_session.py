@@ -194,6 +194,76 @@ def test_an_arm_that_stops_ends_the_run_in_one_line(tmp_path, bench):
     assert "\n" not in str(refused.value) and bench.imager.calls[-1] == "stop"
 
 
+def test_after_something_in_the_way_the_arm_goes_back_and_takes_free_ways_alone(
+    tmp_path, bench, planned, monkeypatch
+):
+    free, limits = bench.arm.command, safety_filter(CONFIG.deploy, INFO, "franka").limits
+    went: list[np.ndarray] = []
+    halfway_rad = np.abs(planned[3] - planned[2]).max() / 2
+
+    def blocked(q_target_rad, close):
+        went.append(bench.arm.q_rad.copy())
+        if np.abs(q_target_rad - planned[3]).max() > halfway_rad:
+            free(q_target_rad, close)
+
+    bench.arm.command = blocked
+    said: list[str] = []
+    found = session.run(fast(), options(tmp_path), said.append)
+    assert "pose 4 of 7: not reached, left out: something is in the way" in said
+    assert found is not None and sum(": 24 of 24 corners" in line for line in said) == 6
+    planning = poses.Bench(limits, LENS, nominal_pose(), BOARD)
+    assert all(poses.is_free(planning, q) for q in went), "no way that was not looked at"
+
+    monkeypatch.setattr(poses, "is_free_way", lambda *way: False)
+    with pytest.raises(UserError, match="none of 7 poses gave a picture"):
+        session.run(fast(), options(tmp_path), said.append)
+    assert said[-1] == "pose 7 of 7: left out, no free way from the last pose that was reached"
+
+
+def test_an_arm_that_gets_neither_on_nor_back_ends_the_run(tmp_path, bench):
+    free = bench.arm.command
+
+    def jammed(q_target_rad, close):
+        if bench.arm.commands < 20:
+            free(q_target_rad, close)
+
+    bench.arm.command = jammed
+    with pytest.raises(
+        UserError, match=r"ended at pose \d of 7: something is in its way, and on the way back"
+    ):
+        session.run(fast(), options(tmp_path), lambda text: None)
+
+
+@pytest.mark.parametrize("trouble", [EOFError(), KeyboardInterrupt(), RobotError("cartesian_reflex")])
+def test_taking_the_board_away_costs_no_calibration(tmp_path, bench, monkeypatch, trouble):
+    def asked(question):
+        if question.startswith("Take hold"):
+            raise trouble
+
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(session, "ask_person", asked)
+    said: list[str] = []
+    assert session.run(fast(), options(tmp_path, yes=False), said.append) is not None
+    assert (tmp_path / "cal.json").exists() and said[-1].startswith("the hand keeps the board")
+
+
+def test_an_arm_that_does_not_stop_is_said(tmp_path, bench, monkeypatch):
+    def refuse():
+        raise RobotError("no answer")
+
+    monkeypatch.setattr(bench.arm, "stop", refuse)
+    said: list[str] = []
+    assert session.run(fast(), options(tmp_path), said.append) is not None
+    assert said[-1] == "the arm did not stop as it should: no answer"
+
+
+@pytest.mark.parametrize("name", ["", "cal.png"])
+def test_where_no_calibration_can_be_written_nothing_moves(tmp_path, bench, name):
+    with pytest.raises(UserError, match="expected the name of a file, for example calibration.json"):
+        session.run(fast(), replace(options(tmp_path), out=tmp_path / name), lambda text: None)
+    assert bench.arm.commands == 0 and bench.imager.calls == []
+
+
 def test_a_dry_run_moves_nothing(tmp_path, bench):
     said: list[str] = []
     assert session.run(fast(), options(tmp_path, dry_run=True), said.append) is None

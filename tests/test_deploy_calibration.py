@@ -99,6 +99,15 @@ def test_a_view_in_which_the_board_slipped_is_left_out():
     assert found.view_rms_px[4] > 3 and np.isnan(found.view_rms_px[7]) and error(found.T_base_cam)[0] < 0.5
 
 
+def test_a_view_of_a_single_line_of_corners_is_left_out():
+    views = synthetic_views(np.random.default_rng(6))
+    line = np.arange(0, 24, 4)
+    views[7] = View(views[7].T_base_grip, Corners(views[7].corners.ids[line], views[7].corners.pixels[line]))
+    assert np.linalg.matrix_rank(np.diff(BOARD.corners_m()[line], axis=0)) == 1, "six corners of one column"
+    found = calibrate(views, LENS, BOARD)
+    assert list(np.flatnonzero(~found.used)) == [7] and np.isnan(found.view_rms_px[7])
+
+
 def test_a_board_that_is_not_seen_is_named():
     views = [View(view.T_base_grip, NOTHING) for view in synthetic_views(np.random.default_rng(0), 8)]
     with pytest.raises(

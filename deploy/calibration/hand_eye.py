@@ -18,7 +18,8 @@ from deploy.interfaces import Lens
 from sensors.charuco_board import CharucoBoard, Corners
 
 MIN_CORNERS = 6
-"""Fewer corners of a view are not used: a plane's pose from them is a guess."""
+"""Fewer corners of a view are not used, nor are those of a single line: a plane's pose from them is a
+guess."""
 MIN_VIEWS = 6
 MIN_SPREAD_RAD = np.radians(5.0)
 """RMS of the hand's turns about the second of their principal axes. With turns about one axis alone the
@@ -68,7 +69,7 @@ def calibrate(views: Sequence[View], lens: Lens, board: CharucoBoard) -> HandEye
 
     Raises UserError: board in too few views, or the hand turned about one axis only.
     """
-    usable = np.array([len(view.corners.ids) >= MIN_CORNERS for view in views], bool)
+    usable = np.array([_tells_pose(view.corners, board) for view in views], bool)
     _check_views(usable, views, board)
     used = usable.copy()
     problem = _Problem(views, lens, board)
@@ -169,7 +170,7 @@ class _Problem:
     def view_rms_px(self, unknowns: np.ndarray) -> np.ndarray:
         """(n,) per view, NaN without enough corners."""
         camera, board = _pose(unknowns[:6]), _pose(unknowns[6:])
-        return np.array([self._rms(self._errors(v, camera, board)) for v in self._views])
+        return np.array([self._rms(view, camera, board) for view in self._views])
 
     def answer(self, unknowns: np.ndarray, start: np.ndarray, used: np.ndarray) -> HandEye:
         """What is reported of (12,) `unknowns`; standard errors by the residuals' own size."""
@@ -202,9 +203,16 @@ class _Problem:
         T_cam_board = T_cam_base @ view.T_base_grip @ T_grip_board
         return project(T_cam_board, self._points[view.corners.ids], self._lens) - view.corners.pixels
 
-    @staticmethod
-    def _rms(errors: np.ndarray) -> float:
-        return _total(errors.ravel()) if len(errors) >= MIN_CORNERS else float("nan")
+    def _rms(self, view: View, T_cam_base: np.ndarray, T_grip_board: np.ndarray) -> float:
+        if not _tells_pose(view.corners, self._board):
+            return float("nan")
+        return _total(self._errors(view, T_cam_base, T_grip_board).ravel())
+
+
+def _tells_pose(corners: Corners, board: CharucoBoard) -> bool:
+    """Whether there are enough of them, and not all on one line."""
+    points = board.corners_m()[corners.ids]
+    return len(points) >= MIN_CORNERS and int(np.linalg.matrix_rank(points - points.mean(axis=0), 1e-6)) == 2
 
 
 def _check_views(used: np.ndarray, views: Sequence[View], board: CharucoBoard) -> None:
@@ -215,8 +223,9 @@ def _check_views(used: np.ndarray, views: Sequence[View], board: CharucoBoard) -
         )
     if used.sum() < MIN_VIEWS:
         raise UserError(
-            f"{used.sum()} of {len(views)} views can be used ({MIN_CORNERS} corners or more that fit the "
-            f"other views), at least {MIN_VIEWS} are needed: more --poses, more light, a flat board."
+            f"{used.sum()} of {len(views)} views can be used ({MIN_CORNERS} corners or more, on more than "
+            f"one line, that fit the other views), at least {MIN_VIEWS} are needed: more --poses, more light, "
+            "a flat board."
         )
     hands = [view.T_base_grip for view, use in zip(views, used, strict=True) if use]
     spread = rotation_spread_rad(hands)[1]

@@ -53,7 +53,7 @@ def plan(
     ordered: list[np.ndarray] = []
     for _ in range(_ROUNDS):
         reached += _reached(bench, count + count // 2, q_start_rad, rng)
-        ordered = _ordered(reached, q_start_rad, lambda a, b: _is_free_way(bench, a, b))[:count]
+        ordered = _ordered(reached, q_start_rad, lambda a, b: is_free_way(bench, a, b))[:count]
         if len(ordered) == count:
             return np.array(ordered)
     raise UserError(
@@ -95,6 +95,12 @@ def is_free(bench: Bench, q_rad: Float[np.ndarray, "7"]) -> bool:
     return bool(apart.min() > LINK_GAP_M)
 
 
+def is_free_way(bench: Bench, a_rad: Float[np.ndarray, "7"], b_rad: Float[np.ndarray, "7"]) -> bool:
+    """Whether all joints at once, straight from (7,) `a_rad` to (7,) `b_rad`, keep clear."""
+    steps = int(np.ceil(np.abs(b_rad - a_rad).max() / _PATH_STEP_RAD))
+    return all(is_free(bench, a_rad + (b_rad - a_rad) * i / max(steps, 1)) for i in range(steps + 1))
+
+
 def _reached(bench: Bench, count: int, q_start_rad: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
     """Up to `count` joint positions with the board in view, in the order in which they were drawn."""
     T_board_grip = invert(bench.board.held_pose())
@@ -111,12 +117,6 @@ def _reached(bench: Bench, count: int, q_start_rad: np.ndarray, rng: np.random.G
         if len(found) == count:
             break
     return found
-
-
-def _is_free_way(bench: Bench, a_rad: np.ndarray, b_rad: np.ndarray) -> bool:
-    """Whether all joints at once, straight from `a_rad` to `b_rad`, keep clear."""
-    steps = int(np.ceil(np.abs(b_rad - a_rad).max() / _PATH_STEP_RAD))
-    return all(is_free(bench, a_rad + (b_rad - a_rad) * i / max(steps, 1)) for i in range(steps + 1))
 
 
 def _random_view(bench: Bench, rng: np.random.Generator) -> np.ndarray:

@@ -78,6 +78,7 @@ def run(
     )
     if options.camera not in IMAGERS:
         raise unknown_name("camera", options.camera, IMAGERS)
+    _check_out(options.out)
     config = for_devices(config, session)
     info = policy_metadata.describe(config.student, config.export, config.world.profile)
     clock: Clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
@@ -87,7 +88,7 @@ def run(
     keep_time_of(robot, clock, session)
     safety = safety_filter(config.deploy, info, "franka")
     driver = Driver(robot, safety, clock, min(options.speed_rad_s, *config.deploy.franka.speed_rad_s))
-    with terminable(), _started(imager, robot) as start_robot:
+    with terminable(), _started(imager, robot, say) as start_robot:
         bench = poses.Bench(safety.limits, imager.lens(), standing.nominal_pose(), options.board)
         say(f"looking for: {options.board.describe()}")
         ways = poses.plan(bench, options.poses, np.array(HOME_RAD), np.random.default_rng(config.seed))
@@ -95,8 +96,11 @@ def run(
         if options.dry_run:
             _look_once(ways, imager, options, say)
             return None
-        taken = _take(driver, imager, ways, options, confirm, say)
-    return _solved(taken, bench.lens, options, config, _truth(imager), say)
+        taken = _take(driver, imager, bench, ways, options, confirm, say)
+        try:  # before a person touches the arm, which may fail: it costs none of the views
+            return _solved(taken, bench.lens, options, config, _truth(imager), say)
+        finally:
+            _give_back(driver, options, say)
 
 
 def describe(found: HandEye, truth: np.ndarray | None) -> list[str]:
@@ -126,6 +130,7 @@ def describe(found: HandEye, truth: np.ndarray | None) -> list[str]:
 def _take(
     driver: Driver,
     imager: Imager,
+    bench: poses.Bench,
     ways: np.ndarray,
     options: CalibrationOptions,
     confirm: Callable[[str], None],
@@ -138,14 +143,19 @@ def _take(
         "robot's right, and clear the table of everything else: the hand closes, then the arm moves through "
         f"{len(ways)} poses. Ready?"
     )
-    number = 0
+    number, stood = 0, np.array(HOME_RAD)
     try:
         driver.grip(close=True)
         for number, q_target in enumerate(ways, start=1):
-            say(f"pose {number} of {len(ways)}: {_one(driver, imager, q_target, options.board, taken)}")
+            if not poses.is_free_way(bench, stood, q_target):  # not the planned one: a pose was left out
+                came = "left out, no free way from the last pose that was reached"
+            elif driver.go(q_target):
+                stood, came = q_target, _view(driver, imager, options.board, taken)
+            else:
+                came = _back(driver, stood)
+            say(f"pose {number} of {len(ways)}: {came}")
             if len(taken.views) >= HOPELESS and not taken.seen:
                 break
-        _give_back(driver, options, say)
     except RobotError as error:
         raise UserError(f"calibration ended at pose {number} of {len(ways)}: {error}.") from error
     if not taken.views:
@@ -157,11 +167,17 @@ def _take(
     return taken
 
 
-def _one(driver: Driver, imager: Imager, q_target: np.ndarray, board: CharucoBoard, taken: Taken) -> str:
-    """One pose and its view; what came of it in a few words. Raises RobotError."""
-    if not driver.go(q_target):
-        driver.rest()
-        return "not reached, left out"
+def _back(driver: Driver, stood_rad: np.ndarray) -> str:
+    """From something in the way to (7,) where the arm stood before, which is known to be free. RobotError."""
+    driver.rest()
+    if not driver.go(stood_rad):
+        raise RobotError("something is in its way, and on the way back: look at what it met")
+    driver.rest()
+    return "not reached, left out: something is in the way"
+
+
+def _view(driver: Driver, imager: Imager, board: CharucoBoard, taken: Taken) -> str:
+    """The view of a pose; what came of it in a few words. Raises RobotError."""
     before = driver.rest()
     try:
         gray = imager.picture()
@@ -184,10 +200,11 @@ def _give_back(driver: Driver, options: CalibrationOptions, say: Callable[[str],
         return
     try:
         ask_person("Take hold of the board: the hand opens. Ready?")
-    except UserError:
+        driver.grip(close=False)
+    except (UserError, EOFError, KeyboardInterrupt):
         say("the hand keeps the board")
-        return
-    driver.grip(close=False)
+    except RobotError as error:
+        say(f"the hand keeps the board: {error}")
 
 
 def _look_once(
@@ -257,8 +274,15 @@ def _truth(imager: Imager) -> np.ndarray | None:
     return np.asarray(imager.truth(), float) if isinstance(imager, KnowsItsPlace) else None
 
 
+def _check_out(out: Path) -> None:
+    """UserError, before anything moves, unless a calibration and a picture beside it can be written."""
+    if out.is_dir() or out.suffix == ".png":
+        raise UserError(f"--out is {out}; expected the name of a file, for example calibration.json.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+
+
 @contextmanager
-def _started(imager: Imager, robot: Robot):
+def _started(imager: Imager, robot: Robot, say: Callable[[str], None]):
     """The imager started, a function that starts the robot; both stopped at the end, come what may."""
     begun = False
 
@@ -275,7 +299,6 @@ def _started(imager: Imager, robot: Robot):
             if begun:
                 robot.stop()
         except RobotError as error:
-            if sys.exc_info()[0] is None:
-                raise UserError(f"the arm did not stop as it should: {error}.") from error
+            say(f"the arm did not stop as it should: {error}")
         finally:
             imager.stop()

@@ -3,6 +3,7 @@
 Written against pyrealsense2 2.59's documented API; it has not been run on a camera by us.
 """
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -79,8 +80,10 @@ class RealSenseImager:
         """Switch the projector on again and close the stream, if it is open."""
         pipeline, self._pipeline = self._pipeline, None
         if pipeline is not None:
-            self._project(True)
-            pipeline.stop()
+            with contextlib.suppress(RuntimeError):  # a camera that has been unplugged
+                self._project(True)
+            with contextlib.suppress(RuntimeError):
+                pipeline.stop()
 
     def _project(self, on: bool) -> None:
         """Its dots would lie on the board."""
