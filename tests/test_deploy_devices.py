@@ -20,11 +20,13 @@ from ddgrasp.presets import get_preset
 from deploy import session
 from deploy.clock import SimClock
 from deploy.devices import franka_hand, registry
-from deploy.devices.franka_hand import FrankaHand
-from deploy.devices.franka_robot import FrankaRobot
+from deploy.devices.franka_hand import FrankaHand, HandError
+from deploy.devices.franka_robot import LOST, FrankaRobot
+from deploy.devices.franka_spring import FrankaSpring
 from deploy.devices.options import Setup
 from deploy.devices.realsense_camera import RealSenseCamera
 from deploy.devices.replay_camera import ReplayCamera
+from deploy.interfaces import RobotError
 from deploy.loop import ControlLoop, LoopReport, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.safety import SafetyFilter, SafetyLimits
@@ -210,11 +212,58 @@ def test_a_stop_that_comes_late_does_not_meet_the_next_command():
 def test_a_stop_that_never_ends_is_the_hand_s_error(monkeypatch):
     monkeypatch.setattr(franka_hand, "END_S", 0.1)
     hand, gripper = called_off((ConnectionError,))
-    with pytest.raises(RuntimeError, match=r"did not answer a stop within 0\.1 s"):
+    with pytest.raises(HandError, match=r"did not answer a stop within 0\.1 s"):
         until(lambda: not hand.width_m())
     assert gripper.begun == ["grasp"]
     hand.stop()
     gripper.stop_may_go.set()
+
+
+class ScriptedSpring(FrankaSpring):
+    """Notes that it is told to brake."""
+
+    def __init__(self):
+        self.told: list[str] = []
+
+    def felt(self):
+        return "", None
+
+    def stay(self):
+        self.told.append("stay")
+
+    def stop(self):
+        self.told.append("stop")
+
+    def release(self):
+        self.told.append("release")
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        ("CommandException", "the gripper failed: gripper: Command failed!"),
+        ("NetworkException", f"{LOST} the gripper of 127.0.0.9 is lost (gripper: Command failed!)"),
+    ],
+)
+def test_a_hand_that_fails_leaves_an_arm_that_is_told_to_brake(error, said):
+    franky = pytest.importorskip("franky", reason="needs pip install -e '.[franka]'")
+    recoveries = []
+    robot, spring = FrankaRobot(FrankaConfig(host="127.0.0.9"), SimClock(), None), ScriptedSpring()
+    robot._errors, robot._lost_by = (franky.Exception, RuntimeError), (franky.NetworkException, RuntimeError)
+    robot._arm = SimpleNamespace(
+        poll_motion=lambda: None,
+        state=SimpleNamespace(q=HOME_RAD),
+        recover_from_errors=lambda: recoveries.append(1),
+    )
+    robot._following, robot._moved = spring, True
+    robot._hand = FrankaHand(SlowGripper(), robot._errors, 70.0)
+    robot._hand._error = getattr(franky, error)("gripper: Command failed!")
+    with pytest.raises(RobotError) as failed:
+        robot.read_state()
+    assert str(failed.value) == said and not recoveries
+    robot.hold()
+    robot.stop()
+    assert spring.told == ["stay", "stop", "release"]
 
 
 @pytest.mark.parametrize(

@@ -224,8 +224,8 @@ def _check_views(used: np.ndarray, views: Sequence[View], board: CharucoBoard) -
     if used.sum() < MIN_VIEWS:
         raise UserError(
             f"{used.sum()} of {len(views)} views can be used ({MIN_CORNERS} corners or more, on more than "
-            f"one line, that fit the other views), at least {MIN_VIEWS} are needed: more --poses, more light, "
-            "a flat board."
+            f"one line, that fit the other views), at least {MIN_VIEWS} are needed: more --poses, more "
+            "light, a flat board."
         )
     hands = [view.T_base_grip for view, use in zip(views, used, strict=True) if use]
     spread = rotation_spread_rad(hands)[1]

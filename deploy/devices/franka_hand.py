@@ -16,6 +16,10 @@ END_S = 2.0
 """Longest wait for the end of a command, and for that of one that was aborted."""
 
 
+class HandError(Exception):
+    """The hand has failed; the arm, which has a connection of its own, need not have."""
+
+
 class FrankaHand:
     """Opens and closes while the arm moves.
 
@@ -39,9 +43,9 @@ class FrankaHand:
         threading.Thread(target=self._guard, args=(self._watch,), name=THREADS, daemon=True).start()
 
     def width_m(self) -> float:
-        """As the gripper last reported it. Raises what stopped it."""
+        """As the gripper last reported it. Raises HandError, of what stopped it."""
         if self._error is not None:
-            raise self._error
+            raise HandError(str(self._error)) from self._error
         return self._width_m
 
     def set(self, close: bool) -> None:

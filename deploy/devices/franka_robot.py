@@ -21,7 +21,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.install import pip_install
 from deploy import kinematics
 from deploy.devices import franka_faults
-from deploy.devices.franka_hand import FrankaHand
+from deploy.devices.franka_hand import FrankaHand, HandError
 from deploy.devices.franka_probe import check_arm
 from deploy.devices.franka_spring import FrankaSpring, priority_kept, touched
 from deploy.devices.options import Setup
@@ -75,7 +75,7 @@ class FrankaRobot:
         franky = self._franky = load_franky()
         check_arm(self._config.host, self._config.model)
         # A socket that breaks comes through libfranka as a bare RuntimeError ("Net Exception").
-        self._errors = (franky.Exception, franky.GripperException, RuntimeError)
+        self._errors = (franky.Exception, RuntimeError)
         self._lost_by = (franky.NetworkException, RuntimeError)
         self._holding = self._moved = self._faulted = self._cut_off = False
         config = self._config
@@ -237,16 +237,22 @@ class FrankaRobot:
     def _reporting(self):
         try:
             yield
+        except HandError as error:  # the arm goes on, and can be told to brake
+            raise RobotError(self._hand_fault(error)) from error
         except self._errors as error:
             raise RobotError(self._fault(error)) from error
+
+    def _hand_fault(self, error: HandError) -> str:
+        said = franka_faults.one_line(error)
+        if isinstance(error.__cause__, self._lost_by):
+            return f"{LOST} the gripper of {self._config.host} is lost ({said})"
+        return f"the gripper failed: {said}"
 
     def _fault(self, error: Exception) -> str:
         """What happened and how the arm stands now, in one line; it is not told to move again."""
         self._faulted = True
         if isinstance(error, self._lost_by):
             return self._lost(error)
-        if isinstance(error, self._franky.GripperException):
-            return f"the gripper failed: {franka_faults.one_line(error)}"
         try:
             recovered = self._recover()
         except self._lost_by:
