@@ -154,6 +154,11 @@ class ControlLoop:
             self._stop_both()
         return self._report
 
+    @property
+    def report(self) -> LoopReport:
+        """As far as `run` has come."""
+        return self._report
+
     def _keep_time(self, max_steps: int | None, on_step: Callable[[Step], bool | None] | None) -> None:
         deadline, previous, done = self._clock.now(), None, max_steps == 0
         self._start_s, started = deadline, time.monotonic()

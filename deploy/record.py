@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -22,6 +22,9 @@ from ddgrasp.files import atomic_write_bytes, atomic_write_text
 from deploy.interfaces import Camera, Filmed, Judge
 from deploy.loop import Step
 from rig.film import Film, contact_sheet
+
+if TYPE_CHECKING:
+    from sensors.recordings.recording import RecordingWriter
 
 STEPS_FILE, REPORT_FILE, FILM_FILE = "steps.jsonl", "report.json", "film.png"
 ENDED = {True: "lifted and held", False: "failed", None: "not judged"}
@@ -45,7 +48,7 @@ class DeploymentRecord:
         self._rows: list[dict[str, Any]] = []
         self._queue: queue.Queue[tuple[np.ndarray, np.ndarray] | None] = queue.Queue()
         self._film: list[tuple[int, UInt8[np.ndarray, "h w 3"], np.ndarray]] = []
-        self.frames = 0
+        self._queued = self._written = 0
         self._trouble = ""
 
     @contextmanager
@@ -80,8 +83,8 @@ class DeploymentRecord:
             return
         depth = step.frame.depth
         depth_mm = depth if depth.dtype == np.uint16 else to_millimetres(depth)
-        row["frame"] = self.frames
-        self.frames += 1
+        row["frame"] = self._queued
+        self._queued += 1
         self._queue.put((rgb, depth_mm))
         self._keep(step.index, rgb, depth_mm)
 
@@ -90,8 +93,11 @@ class DeploymentRecord:
     ) -> None:
         """Writes everything but the frames into `folder`; `report` is a LoopReport as plain values."""
         folder.mkdir(parents=True, exist_ok=True)
+        for row in self._rows:
+            if row.get("frame", 0) >= self._written:
+                row.pop("frame", None)
         atomic_write_text(folder / STEPS_FILE, "".join(json.dumps(row) + "\n" for row in self._rows))
-        values = {**about, "success": success, "frames": self.frames, **report}
+        values = {**about, "success": success, "frames": self._written, **report}
         if self._trouble:
             values["frames_lost"] = self._trouble
         atomic_write_text(folder / REPORT_FILE, json.dumps(values, indent=1, allow_nan=False) + "\n")
@@ -113,19 +119,32 @@ class DeploymentRecord:
             self._film, self._film_every = self._film[::2], 2 * self._film_every
 
     def _write_frames(self, folder: Path) -> None:
-        first = self._queue.get()
-        if first is None:
+        taken = self._queue.get()
+        if taken is None:
             return
         try:
             from sensors.recordings.recording import RecordingWriter
 
             with RecordingWriter(folder, self._meta) as writer:
-                taken: tuple[np.ndarray, np.ndarray] | None = first
-                while taken is not None:
-                    writer.add(*taken)
+                while taken is not None and self._add(writer, *taken):
                     taken = self._queue.get()
         except (UserError, OSError, ImportError) as error:
             self._trouble = str(error)  # the arm goes on; the report says what is missing
+            self._written = 0
+        while taken is not None:  # what cannot be written is not kept in memory either
+            taken = self._queue.get()
+
+    def _add(self, writer: "RecordingWriter", rgb: np.ndarray, depth_mm: np.ndarray) -> bool:
+        """Whether the frame was written. Raises what prevented it if there is none before."""
+        try:
+            writer.add(rgb, depth_mm)
+        except (UserError, OSError) as error:
+            if not self._written:
+                raise
+            self._trouble = f"those after the first {self._written}: {error}"
+            return False
+        self._written += 1
+        return True
 
 
 def verdict(camera: Camera, ask: Callable[[str], bool | None]) -> bool | None:

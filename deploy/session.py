@@ -36,12 +36,14 @@ def deploy(
 ) -> LoopReport:
     """Run the loop; events go to `say` as they happen, what it did into a folder of `options.out`.
 
-    SIGTERM ends it as Ctrl-C does: the robot holds, both devices are stopped, the report comes back. So it
-    does when the robot fails; its `fault` says with what.
+    SIGTERM ends it as Ctrl-C does, and neither cuts the stopping short when it comes again: the robot
+    holds, both devices are stopped, the report comes back. So it does when the robot fails; its `fault`
+    says with what.
 
     Raises UserError for an unknown name, a combination that cannot work, or a device that is absent.
     """
     _check(options)
+    options.out.mkdir(parents=True, exist_ok=True)  # before an arm moves that could not be recorded
     with terminable():
         return _run(for_devices(config, options), policy_path, options, say)
 
@@ -73,16 +75,21 @@ def _run(
     folder = _new_folder(options.out)
     profile = contract.D455.scaled(policy.info.depth_width / contract.D455.width_px)
     kept = DeploymentRecord(camera, profile, f"{options.camera}, D455 profile", config.deploy.film_every)
-    with kept.into(folder):
-        report = loop.run(steps, kept.look)
-        # Before the last frames are on the disk: the simulated arm's world goes on meanwhile.
-        unattended = options.yes or report.interrupted or bool(report.fault)
-        finished = not (options.dry_run or report.interrupted)
-        success = verdict(camera, _unasked if unattended else ask_success) if finished else None
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
     if name := options.object_name or (config.world.objects[0] if options.robot == "sim" else ""):
         about["object"] = name
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
+    try:
+        with kept.into(folder):
+            report = loop.run(steps, kept.look)
+            # Before the last frames are on the disk: the simulated arm's world goes on meanwhile.
+            unattended = options.yes or report.interrupted or bool(report.fault)
+            finished = not (options.dry_run or report.interrupted)
+            success = verdict(camera, _unasked if unattended else ask_success) if finished else None
+    except BaseException:
+        if loop.report.steps:  # a device that fails in a way of its own costs nothing of what was recorded
+            kept.finish(folder, loop.report.as_dict(), None, about)
+        raise
     kept.finish(folder, report.as_dict(), success, about)
     if success is not None:
         say(f"verdict: {ENDED[success]}")
@@ -156,20 +163,23 @@ def _stamp() -> str:
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """Turns the first SIGTERM into KeyboardInterrupt; a second one does not cut the stopping short."""
+    """The first SIGTERM or Ctrl-C is KeyboardInterrupt; a second one does not cut the stopping short."""
+    ending = (signal.SIGTERM, signal.SIGINT)
 
     def interrupt(signum, frame):
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        for number in ending:
+            signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():  # signals are someone else's
         yield
         return
-    previous = signal.signal(signal.SIGTERM, interrupt)
+    previous = [signal.signal(number, interrupt) for number in ending]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in zip(ending, previous, strict=True):
+            signal.signal(number, handler)
 
 
 def describe(report: LoopReport) -> str:

@@ -1,6 +1,8 @@
 """What a deployment leaves: a recording that the generator can be fitted to, steps, report, film, verdict."""
 
 import json
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +15,7 @@ from deploy.devices.options import SessionOptions
 from deploy.interfaces import Frame
 from deploy_support import KinematicRobot, constant_bias, describe, write_policy
 from evaluation.report import deployments
+from sensors.recordings import recording as recording_files
 from sensors.recordings.recording import Recording, find_recordings
 
 DEPTH_MM = np.full((180, 320), 700, np.uint16)
@@ -133,6 +136,61 @@ def test_a_disk_that_takes_no_frames_stops_nothing(run, monkeypatch):
     report, folder = run()
     kept = json.loads((folder / "report.json").read_text())
     assert report.steps == 5 and "No space left" in kept["frames_lost"] and not (folder / "depth").exists()
+
+
+def test_a_disk_that_is_full_after_three_frames_keeps_them(run, monkeypatch):
+    write, files = recording_files._write, []
+
+    def filling(path, data, sync=False):
+        files.append(path)
+        if len(files) == 8:  # half of the fourth frame is there
+            path.touch()
+            raise OSError(28, "No space left on device")
+        write(path, data, sync)
+
+    monkeypatch.setattr(recording_files, "_write", filling)
+    report, folder = run(seconds=0.8)
+    kept = json.loads((folder / "report.json").read_text())
+    rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
+    assert report.steps == len(rows) == 8 and kept["frames"] == len(Recording.open(folder)) == 3
+    assert kept["frames_lost"].startswith("those after the first 3: [Errno 28] No space left")
+    assert [row.get("frame") for row in rows] == [0, 1, 2, *[None] * 5]
+    assert len(list((folder / "color").iterdir())) == len(list((folder / "depth").iterdir())) == 3
+
+
+def test_a_camera_that_fails_as_it_stops_costs_nothing_of_what_was_recorded(run, tmp_path):
+    class Unplugged(ColourCamera):
+        def stop(self):
+            raise RuntimeError("no device connected")
+
+    with pytest.raises(RuntimeError, match="no device connected"):
+        run(Unplugged)
+    (folder,) = (tmp_path / "kept").iterdir()
+    assert len(Recording.open(folder)) == 5
+    assert json.loads((folder / "report.json").read_text())["steps"] == 5
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_does_not_cut_the_stopping_short(run, number):
+    class Stopping(ColourCamera):
+        def stop(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        def read(self):
+            if self._reads == 2:
+                os.kill(os.getpid(), number)
+            return super().read()
+
+    report, folder = run(Stopping, seconds=60.0)
+    assert report.interrupted and report.steps == len(Recording.open(folder)) == 2
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_where_nothing_can_be_kept_nothing_moves(run, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(FileExistsError):
+        run(out=tmp_path / "file")
 
 
 def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):

@@ -235,6 +235,7 @@ class RecordingWriter:
 
         Raises:
             UserError: another type or shape, or another size of depth than the frames before.
+            OSError: a full disk; the frames before are as they were.
         """
         if depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
             raise UserError(
@@ -246,15 +247,18 @@ class RecordingWriter:
         if self._size is not None and depth_mm.shape != self._size:
             raise UserError(f"a recording has one depth size: {self._size}, got {depth_mm.shape}.")
         self._size = depth_mm.shape
-        name = f"{self._frames:06d}"
-        _write(
-            self._temporary / "color" / f"{name}.jpg",
-            _encode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]),
-        )
-        _write(
-            self._temporary / "depth" / f"{name}.png",
-            _encode(".png", depth_mm, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]),
-        )
+        name, bgr = f"{self._frames:06d}", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+        files = {
+            f"color/{name}.jpg": _encode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]),
+            f"depth/{name}.png": _encode(".png", depth_mm, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]),
+        }
+        try:
+            for file, data in files.items():
+                _write(self._temporary / file, data)
+        except OSError:
+            for file in files:
+                (self._temporary / file).unlink(missing_ok=True)
+            raise
         self._frames += 1
         self._invalid += float(np.mean(depth_mm == 0))
 
