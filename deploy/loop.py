@@ -13,7 +13,7 @@ from ddgrasp.errors import UserError
 from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotError, RobotState
 from deploy.pace import Pace
 from deploy.policy import OnnxPolicy
-from deploy.retry import EMPTY_WIDTH_M, Retry, still_for
+from deploy.retry import EMPTY_WIDTH_M, Retry, patience, still_for
 from deploy.safety import APPROACH, NonFiniteAction, SafetyCounts, SafetyFilter
 from deploy.timing import Timings
 
@@ -119,7 +119,8 @@ class ControlLoop:
         self._camera, self._robot, self._policy = camera, robot, policy
         self._safety, self._clock, self._settings, self._say = safety, clock, settings, say
         self._pace = Pace(safety.action_scale_rad)
-        self._retry = Retry(still_for(safety.limits)) if settings.retry else None
+        limits = safety.limits
+        self._retry = Retry(still_for(limits), patience(limits)) if settings.retry else None
         self._report = LoopReport(settings.period_s, safety=safety.counts)
         self._last_frame_s = -math.inf
         self._held_for = ""

@@ -53,11 +53,14 @@ UP_M = 0.03
 ABOVE_M = 0.22
 """Where a hand that went up is high enough to look again, height of the grip."""
 RETREAT_STEPS = 25
-"""Control steps after which it looks again in any case."""
+"""Control steps after which it looks again in any case; a slow arm has more, `patience`."""
 WIDEST_HELD_M = contract.GRIPPER_MAX_WIDTH_M - 0.002
 """Fingers that are closer than this, and not `EMPTY_WIDTH_M`, hold something."""
 LIFTING_STEPS = 60
-"""Control steps given to a lift: from anywhere to where objects are lifted to takes 25, being there 20."""
+"""Control steps given to a lift: from anywhere to where objects are lifted to takes 25, being there 20. A
+slow arm has more, `patience`."""
+BRISK_M_S = 0.17
+"""A hand that can go so fast, as by default a Franka's, gets there in these steps."""
 SAME_WIDTH_M = 0.002
 """Fingers that have moved by less stand on what is between them."""
 DONE_STEPS = 20
@@ -69,8 +72,17 @@ OPEN = -1.0
 def still_for(limits: SafetyLimits) -> float:
     """Metres in `STILL_STEPS` by which a hand within `limits` moves unless it stands still."""
     approach_m_s = limits.approach_m_s if limits.approach_below_m else np.inf
-    fastest_m_s = min(approach_m_s, REACH_M * min(limits.velocity_rad_s))
+    fastest_m_s = min(approach_m_s, _free_m_s(limits))
     return min(STILL_M, STILL_SHARE * fastest_m_s * STILL_STEPS * limits.period_s)
+
+
+def patience(limits: SafetyLimits) -> float:
+    """How many times as long as a brisk arm one within `limits` takes for a way in free air, at least 1."""
+    return max(1.0, BRISK_M_S / _free_m_s(limits))
+
+
+def _free_m_s(limits: SafetyLimits) -> float:
+    return REACH_M * min(limits.velocity_rad_s)
 
 
 @dataclass(frozen=True)
@@ -103,9 +115,12 @@ class Retry:
     comes next. Staying goes before all of them: what the hand was doing goes on if it loses what it has.
     """
 
-    def __init__(self, still_m: float = STILL_M) -> None:
-        """`still_m`: see `still_for`."""
+    def __init__(self, still_m: float = STILL_M, patience: float = 1.0) -> None:
+        """See `still_for` and `patience`."""
         self._still_m = still_m
+        self._lifting_steps, self._retreat_steps = (
+            round(steps * patience) for steps in (LIFTING_STEPS, RETREAT_STEPS)
+        )
         self._landing = Landing(still_m * (FELT_STEPS - 1) / STILL_STEPS)
         self._asides_left = ASIDES
         self._free_nm: deque[np.ndarray] = deque(maxlen=FREE_STEPS)
@@ -222,7 +237,7 @@ class Retry:
 
     def _lift(self) -> Iterator[np.ndarray]:
         """Straight up, then to where objects are lifted to."""
-        for left in reversed(range(LIFTING_STEPS)):
+        for left in reversed(range(self._lifting_steps)):
             if not (left and self._holds()):
                 self._end()
             way_m = contract.LIFT_TARGET_M - self._now.grip_m
@@ -233,7 +248,7 @@ class Retry:
     def _go_up(self, reason: str) -> Iterator[np.ndarray]:
         """Straight up with open fingers, then towards the start pose, until it can look again."""
         self.begun, self._closed_once = f"{reason}; goes up to look again", False
-        for left in reversed(range(RETREAT_STEPS)):
+        for left in reversed(range(self._retreat_steps)):
             height_m = self._now.grip_m[2]
             if not left or (height_m > ABOVE_M and self._widths[-1] > OPEN_WIDTH_M):
                 self._end()

@@ -7,6 +7,7 @@ import pytest
 
 from ddgrasp import contract
 from ddgrasp.layout import ACTION, STATE, closes
+from ddgrasp.presets import get_preset
 from deploy.clock import SimClock
 from deploy.interfaces import RobotState
 from deploy.kinematics import grip_jacobian, grip_pose, grip_position
@@ -25,9 +26,11 @@ from deploy.retry import (
     STILL_M,
     STILL_STEPS,
     Retry,
+    patience,
     still_for,
 )
 from deploy.safety import SafetyFilter, SafetyLimits
+from deploy.setup import safety_filter
 from deploy_support import KinematicRobot, ScriptedCamera, constant_bias, depth_mm, describe, write_policy
 
 HOME = np.array(contract.HOME_RAD)
@@ -154,6 +157,18 @@ def test_an_arm_that_may_only_creep_does_not_stand_still():
     assert still_for(slow) <= 0.03 * STILL_STEPS * contract.CONTROL_DT_S / 2
     crawling = tuple(0.03 * limit for limit in contract.JOINT_VELOCITY_LIMIT_RAD_S)
     assert still_for(replace(SafetyLimits(), velocity_rad_s=crawling)) < still_for(slow)
+
+
+@pytest.mark.parametrize(("dynamics", "longer"), [(1.0, 1.0), (0.2, 1.0), (0.1, 1.95), (0.05, 3.91)])
+def test_a_slow_arm_is_given_the_steps_that_it_takes(dynamics, longer):
+    config = get_preset("demo").deploy
+    config = replace(config, franka=replace(config.franka, dynamics=dynamics))
+    limits = safety_filter(config, describe(), "franka").limits
+    assert patience(limits) == pytest.approx(longer, abs=0.05)
+    retry = Retry(still_for(limits), patience(limits))
+    told(retry, LOW, SHUT, EMPTY_STEPS - 1)
+    acts = told(retry, LOW, SHUT, round(longer * RETREAT_STEPS) + 2)
+    assert sum(a is not None for a in acts) == pytest.approx(longer * RETREAT_STEPS, abs=2)
 
 
 def test_a_hand_at_an_object_goes_straight_up_before_it_turns_to_the_start_pose():
