@@ -1,5 +1,6 @@
 """`ddgrasp deploy`: an exported policy on a robot and a camera chosen by name."""
 
+import contextlib
 import itertools
 import math
 import signal
@@ -86,9 +87,11 @@ def _run(
             unattended = options.yes or report.interrupted or bool(report.fault)
             finished = not (options.dry_run or report.interrupted)
             success = verdict(camera, _unasked if unattended else ask_success) if finished else None
-    except BaseException:
+    except BaseException as error:
         if loop.report.steps:  # a device that fails in a way of its own costs nothing of what was recorded
-            kept.finish(folder, loop.report.as_dict(), None, about)
+            fault = loop.report.fault or f"{type(error).__name__}: {error}"
+            with contextlib.suppress(OSError):
+                kept.finish(folder, {**loop.report.as_dict(), "fault": fault}, None, about)
         raise
     kept.finish(folder, report.as_dict(), success, about)
     if success is not None:

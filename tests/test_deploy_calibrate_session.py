@@ -244,7 +244,7 @@ def test_taking_the_board_away_costs_no_calibration(tmp_path, bench, monkeypatch
     monkeypatch.setattr(session, "ask_person", asked)
     said: list[str] = []
     assert session.run(fast(), options(tmp_path, yes=False), said.append) is not None
-    assert (tmp_path / "cal.json").exists() and said[-1].startswith("the hand keeps the board")
+    assert (tmp_path / "cal.json").exists() and "the board" in said[-1]
 
 
 def test_an_arm_that_does_not_stop_is_said(tmp_path, bench, monkeypatch):

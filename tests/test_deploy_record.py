@@ -167,7 +167,8 @@ def test_a_camera_that_fails_as_it_stops_costs_nothing_of_what_was_recorded(run,
         run(Unplugged)
     (folder,) = (tmp_path / "kept").iterdir()
     assert len(Recording.open(folder)) == 5
-    assert json.loads((folder / "report.json").read_text())["steps"] == 5
+    kept = json.loads((folder / "report.json").read_text())
+    assert kept["steps"] == 5 and kept["fault"] == "RuntimeError: no device connected"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

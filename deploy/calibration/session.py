@@ -98,9 +98,12 @@ def run(
             return None
         taken = _take(driver, imager, bench, ways, options, confirm, say)
         try:  # before a person touches the arm, which may fail: it costs none of the views
-            return _solved(taken, bench.lens, options, config, _truth(imager), say)
-        finally:
+            found = _solved(taken, bench.lens, options, config, _truth(imager), say)
+        except UserError:
             _give_back(driver, options, say)
+            raise
+        _give_back(driver, options, say)
+    return found
 
 
 def describe(found: HandEye, truth: np.ndarray | None) -> list[str]:
@@ -111,7 +114,7 @@ def describe(found: HandEye, truth: np.ndarray | None) -> list[str]:
         f"(closed form, before refinement: {found.closed_form_rms_px:.3f} px)"
     ]
     out = [
-        f"view {i + 1} ({'too few corners' if np.isnan(rms) else f'{rms:.2f} px'})"
+        f"view {i + 1} ({'too few corners, or on one line' if np.isnan(rms) else f'{rms:.2f} px'})"
         for i, rms in enumerate(found.view_rms_px)
         if not found.used[i]
     ]
@@ -204,7 +207,7 @@ def _give_back(driver: Driver, options: CalibrationOptions, say: Callable[[str],
     except (UserError, EOFError, KeyboardInterrupt):
         say("the hand keeps the board")
     except RobotError as error:
-        say(f"the hand keeps the board: {error}")
+        say(f"the hand may have kept the board: {error}")
 
 
 def _look_once(

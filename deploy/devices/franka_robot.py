@@ -65,7 +65,7 @@ class FrankaRobot:
         self._following: FrankaSpring | None = None
         self._errors: tuple[type[Exception], ...] = ()
         self._lost_by: tuple[type[Exception], ...] = ()
-        self._holding = self._moved = self._faulted = self._cut_off = False
+        self._holding = self._moved = self._faulted = self._cut_off = self._hand_lost = False
 
     def start(self) -> None:
         """Connect, check which arm answers, clear its errors, set its limits, then move it to the start pose.
@@ -77,7 +77,7 @@ class FrankaRobot:
         # A socket that breaks comes through libfranka as a bare RuntimeError ("Net Exception").
         self._errors = (franky.Exception, RuntimeError)
         self._lost_by = (franky.NetworkException, RuntimeError)
-        self._holding = self._moved = self._faulted = self._cut_off = False
+        self._holding = self._moved = self._faulted = self._cut_off = self._hand_lost = False
         config = self._config
         realtime = franky.RealtimeConfig
         kernel = realtime.Enforce if config.kernel == "realtime" else realtime.Ignore
@@ -91,6 +91,8 @@ class FrankaRobot:
             if self._confirm is not None:
                 self._go_to_start(gripper)
             self._hand = FrankaHand(gripper, self._errors, config.grip_force_n)
+        except HandError as error:
+            raise UserError(f"on the way to the start pose {self._hand_fault(error)}.") from error
         except self._errors as error:
             if self._moved:
                 raise UserError(f"on the way to the start pose {self._fault(error)}.") from error
@@ -142,7 +144,7 @@ class FrankaRobot:
                 self._following.release()
             self._arm = self._following = None
             if hand is not None:
-                hand.stop(connected=not self._cut_off)
+                hand.stop(connected=not (self._cut_off or self._hand_lost))
 
     def time_s(self) -> float | None:
         """See TimedRobot: the arm's own clock; None once the arm has failed."""
@@ -195,7 +197,10 @@ class FrankaRobot:
         )
         self._moved = True
         self._say("homing the gripper")
-        gripper.homing()
+        try:
+            gripper.homing()
+        except self._errors as error:
+            raise HandError(str(error)) from error
         if away_rad > AT_START_RAD:
             self._say("moving to the start pose")
             slower = min(1.0, self._config.start_dynamics / self._config.dynamics)
@@ -244,7 +249,8 @@ class FrankaRobot:
 
     def _hand_fault(self, error: HandError) -> str:
         said = franka_faults.one_line(error)
-        if isinstance(error.__cause__, self._lost_by):
+        self._hand_lost = isinstance(error.__cause__, self._lost_by)
+        if self._hand_lost:
             return f"{LOST} the gripper of {self._config.host} is lost ({said})"
         return f"the gripper failed: {said}"
 
