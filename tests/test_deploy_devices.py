@@ -242,7 +242,7 @@ class ScriptedSpring(FrankaSpring):
     ("error", "said"),
     [
         ("CommandException", "the gripper failed: gripper: Command failed!"),
-        ("NetworkException", f"{LOST} the gripper of 127.0.0.9 is lost (gripper: Command failed!)"),
+        ("NetworkException", f"{LOST} 127.0.0.9 is lost (the gripper's: gripper: Command failed!)"),
     ],
 )
 def test_a_hand_that_fails_leaves_an_arm_that_is_told_to_brake(error, said):

@@ -251,7 +251,7 @@ class FrankaRobot:
         said = franka_faults.one_line(error)
         self._hand_lost = isinstance(error.__cause__, self._lost_by)
         if self._hand_lost:
-            return f"{LOST} the gripper of {self._config.host} is lost ({said})"
+            return f"{LOST} {self._config.host} is lost (the gripper's: {said})"
         return f"the gripper failed: {said}"
 
     def _fault(self, error: Exception) -> str:
