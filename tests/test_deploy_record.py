@@ -188,7 +188,8 @@ def test_a_second_signal_does_not_cut_the_stopping_short(run, number):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_where_nothing_can_be_kept_nothing_moves(run, tmp_path):
+def test_where_nothing_can_be_kept_nothing_moves(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(KinematicRobot, "start", lambda self: pytest.fail("the robot was started"))
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError):
         run(out=tmp_path / "file")

@@ -169,6 +169,10 @@ def test_a_slow_arm_is_given_the_steps_that_it_takes(dynamics, longer):
     told(retry, LOW, SHUT, EMPTY_STEPS - 1)
     acts = told(retry, LOW, SHUT, round(longer * RETREAT_STEPS) + 2)
     assert sum(a is not None for a in acts) == pytest.approx(longer * RETREAT_STEPS, abs=2)
+    lifting = Retry(still_for(limits), patience(limits))
+    told(lifting, LOW, HOLDING, STILL_STEPS)
+    acts = told(lifting, LOW, HOLDING, round(longer * LIFTING_STEPS) + 5)
+    assert sum(a is not None for a in acts) == pytest.approx(longer * LIFTING_STEPS, abs=2)
 
 
 def test_a_hand_at_an_object_goes_straight_up_before_it_turns_to_the_start_pose():
