@@ -219,6 +219,29 @@ def test_a_stop_that_never_ends_is_the_hand_s_error(monkeypatch):
     gripper.stop_may_go.set()
 
 
+def test_an_arm_without_its_hand_is_told_from_no_arm():
+    robot = FrankaRobot(FrankaConfig(host="127.0.0.9"), SimClock(), None)
+    robot._errors = (RuntimeError,)
+
+    def refused(host: str):
+        raise RuntimeError(f"libfranka gripper: Connection to {host} refused")
+
+    robot._franky = SimpleNamespace(Gripper=refused)
+    with pytest.raises(UserError, match=r"the arm at '127.0.0.9' answers, its gripper does not \(.*in Desk"):
+        robot._gripper()
+
+
+def test_a_width_that_cannot_be_had_is_the_hand_s_error():
+    class Mute:
+        @property
+        def width(self) -> float:
+            raise ConnectionError("no answer")
+
+    with pytest.raises(HandError, match="no answer") as error:
+        FrankaHand(Mute(), (ConnectionError,), 70.0)
+    assert isinstance(error.value.__cause__, ConnectionError)
+
+
 class ScriptedSpring(FrankaSpring):
     """Notes that it is told to brake."""
 

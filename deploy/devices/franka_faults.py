@@ -47,3 +47,11 @@ def no_connection(franky: Any, host: str, model: str, error: BaseException) -> s
         f"no Franka at {host!r} ({said}): unlock the joints, activate FCI in Desk, end other programs that "
         "drive it, and check --host."
     )
+
+
+def no_gripper(host: str, error: BaseException) -> str:
+    """Why the arm answers and its hand does not, and what to do."""
+    return (
+        f"the arm at {host!r} answers, its gripper does not ({one_line(error)}): mount a Franka Hand, choose "
+        "and initialise it as end effector in Desk, end other programs that use it."
+    )

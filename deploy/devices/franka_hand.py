@@ -28,9 +28,12 @@ class FrankaHand:
     """
 
     def __init__(self, gripper: Any, errors: tuple[type[Exception], ...], force_n: float):
-        """`errors` are what the gripper may raise."""
+        """`errors` are what the gripper may raise. Raises HandError if it does not say how wide it is."""
         self._gripper, self._errors, self._force_n = gripper, errors, force_n
-        self._width_m = float(gripper.width)
+        try:
+            self._width_m = float(gripper.width)
+        except errors as error:
+            raise HandError(str(error)) from error
         self._wish: bool | None = None
         self._busy = False
         self._aborting: threading.Thread | None = None

@@ -87,12 +87,13 @@ class FrankaRobot:
                     config.host, relative_dynamics_factor=config.dynamics, realtime_config=kernel
                 )
             self._prepare()
-            gripper = franky.Gripper(config.host)
+            gripper = self._gripper()
             if self._confirm is not None:
                 self._go_to_start(gripper)
             self._hand = FrankaHand(gripper, self._errors, config.grip_force_n)
         except HandError as error:
-            raise UserError(f"on the way to the start pose {self._hand_fault(error)}.") from error
+            way = "on the way to the start pose " if self._moved else ""
+            raise UserError(f"{way}{self._hand_fault(error)}.") from error
         except self._errors as error:
             if self._moved:
                 raise UserError(f"on the way to the start pose {self._fault(error)}.") from error
@@ -185,6 +186,13 @@ class FrankaRobot:
             (arm.joint_acceleration_limit, self._limits.joint_acceleration_rad_s2),
         ):
             limit.set(np.minimum(limit.get(), own))
+
+    def _gripper(self) -> Any:
+        """The hand's connection. Raises UserError: the arm has answered by now, so it is the hand's alone."""
+        try:
+            return self._franky.Gripper(self._config.host)
+        except self._errors as error:
+            raise UserError(franka_faults.no_gripper(self._config.host, error)) from error
 
     def _go_to_start(self, gripper: Any) -> None:
         """Gripper homed and open, the arm at the start pose; a person is asked before either moves."""
