@@ -1,4 +1,4 @@
-"""Layers without parameters that several networks share: sinusoids of a step, folding pixels into channels.
+"""Layers without parameters: sinusoids of a step, folding pixels into channels, ResNet's pooling.
 
 Trained weights depend on every order stated here.
 """
@@ -8,7 +8,7 @@ from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jax.typing import ArrayLike
 from jaxtyping import Float32, Real, Shaped
 
@@ -66,3 +66,21 @@ def depth_to_space(
     b, h, w, c = x.shape
     x = x.reshape(b, h, w, factor, factor, c // factor**2)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, h * factor, w * factor, c // factor**2)
+
+
+def resnet_max_pool(x: Float32[Array, "B H W C"]) -> Float32[Array, "B H//2 W//2 C"]:
+    """(B, H, W, C), at least 0, H and W even -> (B, H/2, W/2, C): maxima of 3x3 pixels, stride 2, padding 1.
+
+    Slices and maxima, an axis at a time: `nn.max_pool`'s gradient is a select-and-scatter, for which a CPU
+    takes four times as long.
+    """
+    return _max_of_three(_max_of_three(x, 1), 2)
+
+
+def _max_of_three(x: Array, axis: int) -> Array:
+    """Of every second pixel along `axis` and the two beside it; 0 before the first."""
+    pairs = x.reshape(*x.shape[:axis], x.shape[axis] // 2, 2, *x.shape[axis + 1 :])
+    even, odd = (lax.index_in_dim(pairs, i, axis + 1, keepdims=False) for i in (0, 1))
+    before = lax.slice_in_dim(odd, 0, odd.shape[axis] - 1, axis=axis)
+    before = jnp.pad(before, [(int(i == axis), 0) for i in range(x.ndim)])
+    return jnp.maximum(jnp.maximum(even, odd), before)

@@ -16,7 +16,7 @@ from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.config import GROUP_CHANNELS, STEM_STRIDE, StudentConfig
 from ddgrasp.contract import CameraProfile
-from learning.layers import space_to_depth
+from learning.layers import resnet_max_pool, space_to_depth
 from mjx_envs.camera import nominal_camera
 from student_jax import preprocess
 
@@ -112,8 +112,7 @@ class Stem(nn.Module):
         """(B, h, w, C) -> (B, h / 4, w / 4, width)."""
         if self.kind == "conv7":
             x = nn.relu(ConvNorm(self.width, 7, 2, self.norm, name="conv7")(x))
-            x = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))  # after relu zeros pad as well as -inf
-            return nn.max_pool(x, window_shape=(3, 3), strides=(2, 2), padding="VALID")
+            return resnet_max_pool(x)
         patches = space_to_depth(x, STEM_STRIDE)
         x = nn.Dense(self.width, use_bias=self.norm == "none", name="patch")(patches)
         return nn.relu(GroupNorm(name="norm")(x) if self.norm == "group" else x)

@@ -1,9 +1,11 @@
 """Sinusoids of a step and folding of pixels into channels, in the orders that trained weights know."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import linen as nn
 
-from learning.layers import depth_to_space, sinusoids, space_to_depth, time_frequencies
+from learning.layers import depth_to_space, resnet_max_pool, sinusoids, space_to_depth, time_frequencies
 from student_jax import denoiser
 
 
@@ -47,3 +49,23 @@ def test_the_two_orders_of_sinusoids():
 
 def test_frequencies_rounded_once_or_at_every_step_agree_to_the_last_digits():
     np.testing.assert_allclose(time_frequencies(128), time_frequencies(128, jnp), rtol=1e-6)
+
+
+def test_resnet_s_pooling_is_flax_s_with_its_gradient():
+    rng = np.random.default_rng(0)
+    x = jnp.asarray(np.maximum(rng.normal(size=(2, 6, 10, 3)), 0.0).astype(np.float32))
+    weight = jnp.asarray(rng.normal(size=(2, 3, 5, 3)).astype(np.float32))
+
+    def flax_s(x):
+        padded = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
+        return nn.max_pool(padded, window_shape=(3, 3), strides=(2, 2), padding="VALID")
+
+    values, gradients = zip(
+        *(
+            (pool(x), jax.grad(lambda x, pool=pool: jnp.sum(pool(nn.relu(x)) * weight))(x))
+            for pool in (flax_s, resnet_max_pool)
+        ),
+        strict=True,
+    )
+    np.testing.assert_array_equal(*values)
+    np.testing.assert_allclose(*gradients, atol=1e-6)
