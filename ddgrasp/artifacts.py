@@ -211,12 +211,7 @@ def begin(
                 f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
             )
         _check_same_config(Path(directory), stage, _config_of(started, path), config, "begun")
-        before = started.get("inputs", {})
-        if difference := next(_differences(before, {name: inputs.get(name) for name in before}), None):
-            raise UserError(
-                f"{directory} was begun with other inputs: {difference}. Use those, another --out, or delete "
-                "the directory."
-            )
+        check_inputs(directory, {name: inputs.get(name) for name in started.get("inputs", {})}, "begun")
     elif write:
         value = {
             upgrades.VERSION_FIELD: upgrades.VERSION,
@@ -225,6 +220,18 @@ def begin(
             "config": config,
         }
         atomic_write_json(path, value)
+
+
+def check_inputs(directory: Path | str, inputs: Mapping[str, str | None], how: str) -> None:
+    """UserError if the stage in `directory` is from others than `inputs`, of those that it noted."""
+    path = Path(directory) / STARTED
+    before = read_json(path).get("inputs", {}) if path.exists() else {}
+    both = {name: value for name, value in inputs.items() if name in before}
+    if difference := next(_differences({name: before[name] for name in both}, both), None):
+        raise UserError(
+            f"{directory} was {how} with other inputs: {difference}. Use those, another --out, or delete the "
+            "directory."
+        )
 
 
 def _check_same_config(

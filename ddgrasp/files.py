@@ -9,6 +9,8 @@ import dataclasses
 import json
 import os
 import shutil
+import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -79,6 +81,10 @@ def atomic_write_json(path: Path | str, value: Any) -> None:
     atomic_write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
 
 
+DAMAGED_NPZ = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What `np.load`, and reading the arrays that it gives, raise for a damaged or truncated .npz."""
+
+
 def read_json(path: Path | str) -> Any:
     """The value in a JSON file; UserError naming the file if it is absent or damaged."""
     path = Path(path)
@@ -87,7 +93,9 @@ def read_json(path: Path | str) -> Any:
     except FileNotFoundError:
         raise UserError(f"{path} does not exist.") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is not valid JSON ({error}): delete it and make it again.") from None
+        raise UserError(
+            f"{path} is not valid JSON ({error}): mend it, or delete it and make it again."
+        ) from None
 
 
 def to_json(value: Any) -> Any:

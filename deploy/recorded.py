@@ -40,7 +40,7 @@ class RecordingBench:
 
     def run(self, trial: Trial, watch: Watch | None = None) -> tuple[TrialResult, Film]:
         """See Bench. A colour picture is drawn in every step, which takes time that is not the robot's."""
-        folder = self._what.folder / f"{trial.index:04d}-{trial.object_name}"
+        folder = episode_folder(self._what.folder, trial.index, trial.object_name)
         about = {**self._what.about, "policy": str(self._policy_path), "object": trial.object_name}
         kept: list[DeploymentRecord] = []
         with ExitStack() as frames:
@@ -64,6 +64,11 @@ class RecordingBench:
         self._bench.close()
 
 
+def episode_folder(folder: Path, index: int, object_name: str) -> Path:
+    """Where trial `index` is kept in `folder`."""
+    return folder / f"{index:04d}-{object_name}"
+
+
 def _report(result: TrialResult) -> dict[str, Any]:
     """What `LoopReport.as_dict` says of a deployment, as far as a trial's result knows it."""
     timings = Timings(
@@ -78,6 +83,7 @@ def _report(result: TrialResult) -> dict[str, Any]:
         "steps": result.steps,
         "holds": result.holds,
         "fault": result.fault,
+        "interrupted": False,
         "safety": result.safety,
         "events": result.events,
         **timings.summary(contract.CONTROL_DT_S),

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
@@ -17,6 +18,7 @@ from jaxtyping import Float, UInt8
 
 from ddgrasp import contract
 from ddgrasp.config import Config
+from ddgrasp.errors import UserError
 from deploy.changes import AS_IT_IS, Change
 from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
@@ -232,6 +234,11 @@ def run_trials(
     try:
         for future in as_completed([executor.submit(_run_in_worker, trial) for trial in trials]):
             yield future.result()
+    except BrokenProcessPool:
+        raise UserError(
+            "a worker was killed, often for want of memory: finished trials are kept, the same command goes "
+            "on; fewer --workers need less."
+        ) from None
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
 

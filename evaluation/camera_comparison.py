@@ -50,6 +50,7 @@ def compare(
 
     Without `real`, the figures measured before (`figures.published`) stand in for them.
     """
+    known, skipped = (figures.published(), []) if real is None else measure_real(real, profile, progress)
     scenes = []
     with progress.task("rig scenes", per_object * len(OBJECTS)) as task:
         for scene in standing_scenes(config, profile, tuple(OBJECTS), per_object, frames, seed):
@@ -58,7 +59,6 @@ def compare(
     stream = figures.rig_stream(np.concatenate([s.depth_mm for s in scenes]), profile, len(scenes))
     name = f"rig {profile.width_px}x{profile.height_px}"
     rig = figures.measure(name, stream, figures.STEPS_PER_PX)
-    known, skipped = (figures.published(), []) if real is None else measure_real(real, profile, progress)
     return Comparison(known, rig, object_losses(scenes), skipped)
 
 

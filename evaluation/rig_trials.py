@@ -17,10 +17,10 @@ from ddgrasp.progress import Progress
 from deploy.changes import Change
 from deploy.fr3_lab import Shapes, stopping_at
 from deploy.fr3_trials import Fr3Bench, Sight
-from deploy.recorded import RecordedBench
+from deploy.recorded import RecordedBench, episode_folder
 from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
-from deploy.trial_log import TrialLog
+from deploy.trial_log import TrialLog, read_log
 from deploy.trials import ENDS, Bench, Rig, Trial, TrialResult, lasting, run_trials
 from evaluation import failure_modes, wilson
 from evaluation.treatments import RECORDED, TreatmentName, make_treatment
@@ -66,6 +66,10 @@ class Series:
         """The objects. UserError for an unknown one, or a choice that the rig does not have."""
         if self.rig == "development" and (self.camera == "coarse" or self.shapes != "mesh"):
             raise UserError("--camera coarse and --shapes are rig fr3's: drop them, or choose --rig fr3.")
+        if self.rig == "development" and self.contact is not None:
+            raise UserError("--contact is rig fr3's, whose arm stops itself: drop it, or choose --rig fr3.")
+        if self.trials > (most := len(seeds.SEEDS[self.split])):
+            raise UserError(f"--trials is {self.trials}: an object has {most} places; choose that or less.")
         known = self.known()
         names = known if self.objects == (EVERYTHING,) else self.objects
         for name in names:
@@ -125,6 +129,7 @@ def run(
     config = series.configured(config, policy)
     header, make = _header(config, policy, series), series.make(config)
     if record:
+        _check_recorded(out)
         make = RecordedBench(make, out / EPISODES, {"robot": f"rig {series.rig}", "camera": series.camera})
     results = run_missing(config, policy, series.plan(), make, header, out, workers, progress, failures)
     table = tabulate(results)
@@ -155,6 +160,16 @@ def run_missing(
                 _keep(out, result, film)
             task.advance(success=sum(r.success for r in log.results.values()) / len(log.results))
     return [log.results[trial.index, False] for trial in trials]
+
+
+def _check_recorded(out: Path) -> None:
+    """UserError if `out` has trials that were run without being recorded: they are not run again."""
+    for done in read_log(out / TRIALS_FILE)[1]:
+        if not episode_folder(out / EPISODES, done.index, done.object_name).is_dir():
+            raise UserError(
+                f"{out} has trials that were not recorded, and trials that it has are not run again: choose "
+                "another --out, or leave out --record."
+            )
 
 
 def _keep(out: Path, result: TrialResult, film: Film) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from app.commands import parse
+from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy import session
 from deploy.devices.options import SessionOptions
@@ -211,6 +212,15 @@ def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
     for words in (f"{judged.name}: lifted and held", f"{other.name}: not judged", "width=device-width"):
         assert words in text
     assert find_recordings(judged.parent), "the page beside them does not disturb a fit"
+    for written, message in (
+        ("{", "not valid JSON"),
+        ("{}", "has no 'success'"),
+        (None, "success\" is 'yes'"),
+    ):
+        text = json.dumps({**values, "success": "yes"}) if written is None else written
+        (other / "report.json").write_text(text)
+        with pytest.raises(UserError, match=message):
+            parse("report", [str(other)]).run()
     (other / "report.json").write_text(json.dumps({**values, "success": None, "dry_run": True}))
     parse("report", [str(other)]).run()
     said = capsys.readouterr().out

@@ -1,6 +1,9 @@
 """Trials that are kept: a deployment's folder each, and the same trials as without."""
 
 import json
+import os
+import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,9 +11,11 @@ import pytest
 from app.lerobot.source import open_source
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import Config, PictureConfig, StudentConfig, WorldConfig
+from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from deploy.recorded import RecordedBench
-from deploy.trials import Rig, Trial
+from deploy.trial_log import TrialLog
+from deploy.trials import Rig, Trial, run_trials
 from deploy_support import write_policy
 from evaluation import rig_trials
 from evaluation.report import deployments
@@ -70,3 +75,44 @@ def test_a_recorded_trial_ends_when_its_watcher_says_so(tmp_path, policy):
     result, _ = bench.run(Trial(3, "cube"), lambda step, camera: step.index == 1)
     bench.close()
     assert result.steps == len(Recording.open(tmp_path / "kept" / "0003-cube")) == 2
+
+
+def test_trials_that_were_not_recorded_are_not_passed_over(tmp_path, policy):
+    out, quiet = tmp_path / "out", Progress(quiet=True)
+    series = Series("development", ("apple",), 1, seconds=0.4)
+    rig_trials.run(CONFIG, policy, series, out, 0, quiet)
+    with pytest.raises(UserError, match="has trials that were not recorded"):
+        rig_trials.run(CONFIG, policy, series, out, 0, quiet, record=True)
+    rig_trials.run(CONFIG, policy, series, tmp_path / "new", 0, quiet, record=True)
+    rig_trials.run(CONFIG, policy, series, tmp_path / "new", 0, quiet, record=True)
+    page = deployments.write(tmp_path / "new", deployments.find(tmp_path / "new" / rig_trials.EPISODES))
+    assert "0000-apple" in page.read_text()
+
+
+def test_a_log_without_a_trial_belongs_to_nobody(tmp_path):
+    TrialLog(tmp_path / "trials.jsonl", {"rig": "fr3"})
+    TrialLog(tmp_path / "trials.jsonl", {"rig": "development"})
+    assert json.loads((tmp_path / "trials.jsonl").read_text()) == {"rig": "development"}
+
+
+@pytest.mark.parametrize(
+    ("series", "message"),
+    [
+        (Series("development", trials=1001), "--trials is 1001: an object has 1000 places"),
+        (Series("development", contact=7.0), "--contact is rig fr3's"),
+        (Series("development", camera="coarse"), "are rig fr3's"),
+    ],
+)
+def test_what_a_rig_does_not_have_is_one_line(series, message):
+    with pytest.raises(UserError, match=message):
+        series.names()
+
+
+def killed(config, policy_path):
+    """A bench that the kernel ends."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_is_one_line():
+    with pytest.raises(UserError, match="a worker was killed"):
+        list(run_trials(CONFIG, Path("policy.onnx"), [Trial(0, "apple")], 1, killed))

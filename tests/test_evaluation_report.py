@@ -12,9 +12,9 @@ import pytest
 
 from app.commands import parse
 from ddgrasp import artifacts
-from ddgrasp.config import Config
+from ddgrasp.config import Config, StudentConfig
 from ddgrasp.errors import UserError
-from ddgrasp.progress import Progress
+from ddgrasp.progress import PICTURES, Progress
 from evaluation import wilson
 from evaluation.report import figures
 from evaluation.report.comparison import differences
@@ -82,6 +82,24 @@ def test_the_table_ends_with_the_student_in_the_rig(run_dir, capsys):
     )
     assert any("success 90.0 % of 10" in line and "this run" in line for line in lines)
     assert any("clean depth: success 70.0 % of 10" in line and "loaded" in line for line in lines)
+
+
+def test_depth_that_is_not_the_generator_s_is_not_called_so(tmp_path):
+    config = replace(CONFIG, student=StudentConfig(depth_source="dextrah"))
+    artifacts.finish(tmp_path / "student", "student", config, seconds=1, metrics=METRICS["student"])
+    said = [row[-1] for row in summary_rows(build_report(tmp_path))]
+    assert any(text.startswith("depth of its training (dextrah): success 60.0 %") for text in said)
+    assert not any("generated" in text for text in said)
+
+
+def test_a_picture_cut_short_is_named(run_dir):
+    pictures = run_dir / "ddg" / PICTURES
+    pictures.mkdir(exist_ok=True)
+    np.savez_compressed(pictures / "maps.npz", depth=np.random.default_rng(0).random((8, 90, 160)))
+    data = (pictures / "maps.npz").read_bytes()
+    (pictures / "maps.npz").write_bytes(data[: len(data) // 2])
+    write_report(run_dir)
+    assert "maps.npz cannot be shown" in (run_dir / "report.html").read_text()
 
 
 def test_an_incomplete_run_says_what_was_not_run(tmp_path):

@@ -122,6 +122,12 @@ def test_a_film_cut_short_is_named(trials):
     assert "cube-0-success.png cannot be shown" in trials_page.write(trials_page.find(trials)).read_text()
 
 
+def test_a_folder_s_name_is_no_html(tmp_path):
+    folder = _trials(tmp_path / "a<b>", [("cube", True)])
+    assert "<code>a&lt;b&gt;</code>" in trials_page.write(trials_page.find(folder)).read_text()
+    assert "a<b>" not in trials_page.write_comparison([trials_page.find(folder)] * 2).read_text()
+
+
 def test_a_missed_deadline_is_red(tmp_path):
     page = trials_page.write(trials_page.find(_trials(tmp_path / "late", [("cube", True)], missed=2)))
     assert "<p class=missed>" in page.read_text() and "2 in 3 steps" in page.read_text()

@@ -1,5 +1,6 @@
 """Recordings from elsewhere: what is kept, what is named and left out, what is refused."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -114,6 +115,29 @@ def test_one_refused_recording_does_not_stop_the_others(tmp_path, capsys):
     assert "refused:" in shown and "none of its 1 frames can be used" in shown
     assert shown.splitlines()[-1].endswith("left out: 0 frames, 1 recordings")
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["a"]
+
+
+def test_a_folder_s_recording_has_its_whole_name(tmp_path, monkeypatch):
+    for name in ("kitchen.1", "kitchen.2"):
+        make_folder(tmp_path / "all" / name)
+    run(tmp_path / "all", "--out", tmp_path / "out")
+    monkeypatch.chdir(tmp_path / "all" / "kitchen.1")
+    run(".", "--out", tmp_path / "here")
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["kitchen.1", "kitchen.2"]
+    assert [p.name for p in (tmp_path / "here").iterdir()] == ["kitchen.1"]
+
+
+def test_depth_that_cannot_be_is_refused_after_a_few_frames(tmp_path):
+    source, read = importers.folder_source(make_folder(tmp_path / "far", frames=12), 0.0, {}), []
+
+    def frames():
+        for frame in source.frames():
+            read.append(frame.name)
+            yield replace(frame, depth=np.full_like(frame.depth, 7000))
+
+    with pytest.raises(UserError, match="median depth 7 m"):
+        importers.import_recording(replace(source, frames=frames), tmp_path / "out")
+    assert len(read) == 5 and not (tmp_path / "out").exists()
 
 
 def test_nothing_to_import_is_one_line(tmp_path):

@@ -112,6 +112,16 @@ def test_resume_with_another_config_is_refused_and_loses_nothing(stages, tmp_pat
     assert artifacts.read_artifact(run_dir / "record") == before
 
 
+def test_a_finished_stage_of_other_material_is_not_taken_for_this_one_s(stages, tmp_path):
+    def make(data: str):
+        inputs = {"data": tmp_path / data}
+        return pipeline.make(stages[0], CONFIG, tmp_path / "run", resume=True, inputs=inputs, quiet=True)
+
+    assert make("a") == make("a")
+    with pytest.raises(UserError, match="was made with other inputs: data is '.*/a' there, '.*/b' here"):
+        make("b")
+
+
 def test_a_child_of_a_replaced_parent_is_refused(stages, tmp_path):
     run_dir = tmp_path / "run"
     _run(stages, run_dir)

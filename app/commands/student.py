@@ -34,7 +34,7 @@ class StudentEval:
     """Seed of the episodes."""
 
     def run(self) -> None:
-        """Prints success on clean and on generated depth, with Wilson intervals, and perception's error."""
+        """Prints success on clean depth and on training's, with Wilson intervals, and perception's error."""
         config = load_config(self.run_dir, "student")
         from ddgrasp.progress import Progress
         from evaluation import wilson

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -65,7 +66,7 @@ def _unusable(deployment: Deployment) -> str:
 
 def _read(deployment: Deployment) -> Episode:
     folder = deployment.folder
-    rows = [json.loads(line) for line in (folder / STEPS_FILE).read_text().splitlines()]
+    rows = _steps(folder / STEPS_FILE)
     recording = Recording.open(folder)
     if len(recording) != len(rows):
         why = recording.skipped_summary() or f"{len(recording)} pictures for {len(rows)} steps"
@@ -84,6 +85,14 @@ def _read(deployment: Deployment) -> Episode:
         pictures=pictures,
         held=np.array([row["action"] is None for row in rows]),
     )
+
+
+def _steps(path: Path) -> list[dict[str, Any]]:
+    """The lines of a steps.jsonl. Raises UserError for a damaged one."""
+    try:
+        return [json.loads(line) for line in path.read_text().splitlines()]
+    except ValueError as error:
+        raise UserError(f"{path} is damaged ({error}): move its folder elsewhere.") from None
 
 
 def actions(rows: Sequence[Mapping[str, Any]]) -> np.ndarray:

@@ -12,7 +12,7 @@ class EvalConfig(Section, name="evaluation"):
     teacher_trials: Count = 300
     """Episodes of the teacher in its own simulation."""
     student_trials: Count = 100
-    """Episodes of the student on clean depth and on generated depth."""
+    """Episodes of the student on clean depth and on that of its training."""
     rig_trials: Count = 120
     """Episodes of the exported student in the pseudo-real rig, the objects of training and the six unseen
     ones in turn."""

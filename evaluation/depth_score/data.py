@@ -5,7 +5,7 @@ geometry, on which every method draws its depth; what the camera itself would ha
 it is the real-vs-real floor, and the reference of paired measures. No method sees it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from jaxtyping import UInt8, UInt16
 from ddgrasp import depth
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_path
+from ddgrasp.files import DAMAGED_NPZ, atomic_path
 from ddgrasp.progress import Progress
 from sensors.recordings.recording import Recording, find_recordings
 
@@ -73,6 +73,7 @@ def record_rig(
         (side, directory / f"{side}_{i:04d}.npz") for side in SIDES for i in range(config.score.trajectories)
     ]
     missing = [file for _, file in names if not file.exists()]
+    _check_colour([file for _, file in names if file.exists()], with_rgb)
     record = _rig_recorder(config, teacher, with_rgb) if missing else None
     with progress.task("rig trajectories", len(names)) as task:
         task.start_at(len(names) - len(missing))
@@ -81,6 +82,15 @@ def record_rig(
                 _save(file, record(side, number))
                 task.advance()
     return [file for _, file in names]
+
+
+def _check_colour(files: Sequence[Path], with_rgb: bool) -> None:
+    """UserError if trajectories were recorded while nothing needed colour, and something does now."""
+    if with_rgb and files and load_episode(files[0]).rgb is None:
+        raise UserError(
+            f"{files[0].parent} was recorded without colour, which the monocular network needs: delete "
+            f"{files[0].parent.parent} to score with it, or take its weights away."
+        )
 
 
 def _rig_recorder(config: Config, teacher: Path, with_rgb: bool) -> Callable[[str, int], Episode]:
@@ -147,7 +157,7 @@ def load_episode(file: Path) -> Episode:
     try:
         with np.load(file) as arrays:
             plain = {name: a.item() if a.ndim == 0 else a for name, a in arrays.items()}
-    except (OSError, ValueError, EOFError) as error:
+    except DAMAGED_NPZ as error:
         raise UserError(f"{file} is damaged ({error}): delete it and run again with --resume.") from None
     return Episode(**{"rgb": None, **plain})
 

@@ -13,7 +13,7 @@ from jaxtyping import UInt16
 
 from ddgrasp.depth import to_metres
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_path
+from ddgrasp.files import DAMAGED_NPZ, atomic_path
 from ddgrasp.progress import Progress
 from evaluation.depth_score import holes
 from evaluation.depth_score.data import Episode
@@ -110,5 +110,5 @@ def _read(file: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(file) as arrays:
             return dict(arrays)
-    except (OSError, ValueError, EOFError) as error:
+    except DAMAGED_NPZ as error:
         raise UserError(f"{file} is damaged ({error}): delete it and run again with --resume.") from None

@@ -1,6 +1,7 @@
 """Two runs or more side by side: what was configured otherwise, and what came of it."""
 
 from collections.abc import Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,11 @@ def write(runs: Sequence[Path], reports: Sequence[Mapping[str, Any]]) -> Path:
     settings, results = differences(reports)
     sections = ("Targets", "Configured otherwise", "Measured")
     verdicts = (
-        f"<p class=verdict>{run}: {verdict(targets(r))}</p>" for run, r in zip(runs, reports, strict=True)
+        f"<p class=verdict>{escape(str(run))}: {verdict(targets(r))}</p>"
+        for run, r in zip(runs, reports, strict=True)
     )
     body = [
-        f"<h1>{' and '.join(run.name for run in runs)}</h1>",
+        f"<h1>{escape(' and '.join(run.resolve().name for run in runs))}</h1>",
         *verdicts,
         contents(sections),
         heading(sections[0]),

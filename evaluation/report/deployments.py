@@ -1,18 +1,19 @@
 """Deployments as one page: how each ended, how it kept time, its film, what happened in it."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from ddgrasp.files import atomic_write_text
+from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_text, read_json
 from deploy.record import ENDED, FILM_FILE, REPORT_FILE, STEPS_FILE
 from evaluation import wilson
 from evaluation.report.html import REPORT_HTML, contents, film, heading, page, table
 
 _HEADER = ("deployment", "policy", "robot", "camera", "ended", "steps", "missed", "holds", "frame to command")
+_NEEDED = ("success", "fault", "events", "steps", "holds", "missed_deadlines", "latency_ms")
 _NOTE = (
     "<p class=note>Missed: control steps left out since the one before took too long. Holds: steps in which "
     "the arm stood still for want of a frame or a state. Frame to command: from a frame in hand to the "
@@ -41,7 +42,19 @@ def find(folder: Path) -> list[Deployment]:
     """Those in `folder`, oldest first; `folder` itself if it is one. Unfinished ones are left out."""
     places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
     finished = (place for place in places if (place / STEPS_FILE).exists() and (place / REPORT_FILE).exists())
-    return [Deployment(place, json.loads((place / REPORT_FILE).read_text())) for place in finished]
+    return [Deployment(place, _report(place / REPORT_FILE)) for place in finished]
+
+
+def _report(path: Path) -> Mapping[str, Any]:
+    """A report, of which people may set `success` by hand. Raises UserError unless it is one."""
+    report = read_json(path)
+    if lacks := [name for name in _NEEDED if name not in report]:
+        raise UserError(
+            f"{path} has no {lacks[0]!r}: it is not what `ddgrasp deploy` leaves; move it elsewhere."
+        )
+    if report["success"] not in (True, False, None):
+        raise UserError(f'{path}: "success" is {report["success"]!r}; expected true, false or null.')
+    return {"interrupted": False, **report}
 
 
 def write(folder: Path, deployments: Sequence[Deployment]) -> Path:

@@ -21,7 +21,7 @@ MEANINGS: dict[str, Meaning] = {
     "objects": Meaning("the same, by object"),
     "per_object": Meaning("the same, by object"),
     "student_clean": Meaning("student in its own simulation, depth without errors"),
-    "student_ddg": Meaning("student in its own simulation, generated depth"),
+    "student_ddg": Meaning("student in its own simulation, depth as in training"),
     "student_rig": Meaning("exported student on the simulated rig"),
     "seen": Meaning("objects that it was trained on", SHARE),
     "unseen": Meaning("objects that it was not trained on", SHARE),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ddgrasp.files import DAMAGED_NPZ
 from ddgrasp.progress import PICTURES, read_curves
 from ddgrasp.stages import ON_REQUEST, STAGES, Stage
 from evaluation.report import figures
@@ -39,7 +40,7 @@ def render_html(report: Mapping[str, Any], run_dir: Path) -> str:
     stages = [stage for stage in (*STAGES, *ON_REQUEST) if stage.name in report["stages"]]
     warning = trial_run(report)
     body = [
-        f"<h1>DiffuDepGrasp-JAX: run <code>{escape(run_dir.name)}</code>, preset {preset}</h1>",
+        f"<h1>DiffuDepGrasp-JAX: run <code>{escape(run_dir.resolve().name)}</code>, preset {preset}</h1>",
         f"<p class=missed>{escape(warning)}</p>" if warning else "",
         *judgement(targets(report)),
         contents([SUMMARY, *(stage.name for stage in stages), ORIGIN]),
@@ -105,7 +106,7 @@ def _picture(path: Path) -> str:
     try:
         with np.load(path) as panels:
             return film(figures.draw_panels(dict(panels)), title)
-    except (ValueError, OSError, EOFError) as error:
+    except DAMAGED_NPZ as error:
         return f"<p>{escape(path.name)} cannot be shown: {escape(str(error))}</p>"
 
 

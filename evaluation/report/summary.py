@@ -189,7 +189,7 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
         ]
         return lines + [_on_backend(row) for row in metrics.get("backends", [])]
     if stage == "student":
-        named = (("student_clean", "clean depth"), ("student_ddg", "generated depth"))
+        named = (("student_clean", "clean depth"), ("student_ddg", _own_depth(report)))
         return [
             f"{text}: success {rate}{_perceived(report[key])}"
             for key, text in named
@@ -212,6 +212,12 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
         for name, value in metrics.items()
         if isinstance(value, (int, float)) and not isinstance(value, bool)
     ][:3]
+
+
+def _own_depth(report: Mapping[str, Any]) -> str:
+    """What the student was trained on, which is not always the generator's."""
+    source = report["config"].get("student", {}).get("depth_source", "learned")
+    return "generated depth" if source == "learned" else f"depth of its training ({source})"
 
 
 def _perceived(student: Mapping[str, Any]) -> str:

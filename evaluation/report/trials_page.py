@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ def write(trials: Trials) -> Path:
     """Writes the page into the trials' folder; returns its path."""
     bad = trials.table["faults"] or any(result.missed_deadlines for result in trials.results)
     body = [
-        f"<h1>Trials <code>{trials.name}</code></h1>",
+        f"<h1>Trials <code>{escape(trials.name)}</code></h1>",
         f"<p class={'missed' if bad else 'verdict'}>{verdict(trials)}</p>",
         contents(_SECTIONS),
         heading(_SECTIONS[0]),
@@ -83,7 +84,7 @@ def write(trials: Trials) -> Path:
         table(("setting", "value"), _settings(trials)),
     ]
     path = trials.folder / REPORT_HTML
-    atomic_write_text(path, page(f"Trials {trials.name}: DiffuDepGrasp-JAX", body))
+    atomic_write_text(path, page(f"Trials {escape(trials.name)}: DiffuDepGrasp-JAX", body))
     return path
 
 
@@ -102,7 +103,9 @@ def compare(all_trials: Sequence[Trials]) -> tuple[tuple[str, ...], list[tuple[s
 def write_comparison(all_trials: Sequence[Trials]) -> Path:
     """Writes `compare` as a page, and its picture, into the first folder; returns the page's path."""
     header, rows = compare(all_trials)
-    verdicts = (f"<p class=verdict>{trials.folder}: {verdict(trials)}</p>" for trials in all_trials)
+    verdicts = (
+        f"<p class=verdict>{escape(str(trials.folder))}: {verdict(trials)}</p>" for trials in all_trials
+    )
     note = (
         "<p class=note>Success: rate of n trials, Wilson 95 % interval. p: McNemar's test, exact; Holm: "
         "corrected for all that are set beside the first.</p>"
@@ -166,7 +169,7 @@ def _modes(results: Sequence[TrialResult]) -> list[str]:
 
 def _films(folder: Path, outcome: str) -> list[str]:
     strips = sorted(folder.glob(f"*-{outcome}.png"))
-    parts = [f"<h3>{strip.stem}</h3>{_film(strip)}" for strip in strips]
+    parts = [f"<h3>{escape(strip.stem)}</h3>{_film(strip)}" for strip in strips]
     return parts or ["<p>No film.</p>"]
 
 
@@ -175,6 +178,6 @@ def _film(strip: Path) -> str:
 
     picture = cv2.imread(str(strip))
     if picture is None:
-        return f"<p>{strip.name} cannot be shown: it is no whole PNG.</p>"
+        return f"<p>{escape(strip.name)} cannot be shown: it is no whole PNG.</p>"
     _, data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
     return film(data.tobytes(), strip.stem, "webp")

@@ -15,7 +15,12 @@ import numpy as np
 from ddgrasp.contract import DEPTH_UNIT_M
 from ddgrasp.depth import from_counts
 from ddgrasp.errors import UserError
-from sensors.recordings.recording import FARTHEST_MEDIAN_M, NEAREST_MEDIAN_M, RecordingWriter
+from sensors.recordings.recording import (
+    FARTHEST_MEDIAN_M,
+    NEAREST_MEDIAN_M,
+    UNIT_CHECK_FRAMES,
+    RecordingWriter,
+)
 from sensors.recordings.sources import RawFrame, Source
 
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
@@ -54,6 +59,8 @@ def import_recording(source: Source, path: Path) -> Imported:
             size = depth_mm.shape
             frames += 1
             writer.add(frame.rgb, depth_mm)
+            if frames == UNIT_CHECK_FRAMES:  # not after an hour
+                _check_unit(source, medians_m)
         writer.meta.update(source.closing_meta())
         _check_unit(source, medians_m)
         if not frames:
@@ -73,12 +80,18 @@ def import_all(sources: list[Source], out: Path) -> tuple[list[Imported], list[s
     done, refused = [], []
     for source in sources:
         try:
-            done.append(import_recording(source, out / source.path.stem))
+            done.append(import_recording(source, out / _name(source.path)))
         except UserError as error:
             refused.append(str(error))
     if not done:
         raise UserError(refused[0])
     return done, refused
+
+
+def _name(source: Path) -> str:
+    """Of the recording made of it: a folder's own, a file's without what says its type."""
+    source = source.resolve()
+    return source.stem if source.suffix in REALSENSE_SUFFIXES else source.name
 
 
 def summary(done: list[Imported], refused: list[str]) -> str:
