@@ -122,8 +122,8 @@ def load_frames(
 def surfaces(
     depth_m: Float[np.ndarray, "N H W"], kind: str, progress: Progress | None = None
 ) -> Float[np.ndarray, "N H W"]:
-    """Recorded depth (N, H, W) metres -> the same with holes filled and noise smoothed away (config.surface),
-    frame by frame.
+    """Recorded depth (N, H, W) metres -> the same with holes filled and noise smoothed away, frame by frame;
+    `kind` as in `ddg.depth.surface`.
     """
     frames = depth_m if progress is None else progress.track(depth_m, "surfaces")
     if kind == PIECEWISE:

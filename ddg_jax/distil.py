@@ -46,7 +46,7 @@ def params_file(steps: int) -> str:
 
 
 def rounds(config: DDGConfig) -> list[int]:
-    """Network evaluations of each student, in the order of training, the last `config.sample_steps`."""
+    """Network evaluations of each student, in the order of training, the last `config.sampling.steps`."""
     counts = [config.sampling.steps]
     while 2 * counts[-1] < config.training.distil_from:
         counts.append(2 * counts[-1])
@@ -56,7 +56,7 @@ def rounds(config: DDGConfig) -> list[int]:
 def distil(
     config: DDGConfig, fitted: Params, frames: Frames, directory: Path, seed: int, progress: Progress
 ) -> Params:
-    """The student of `config.sample_steps` evaluations, averaged parameters.
+    """The student of `config.sampling.steps` evaluations, averaged parameters.
 
     Leaves a file and checkpoints per round in `directory`; rounds whose file is there are not repeated, an
     unfinished one goes on (see `loop.run_steps`).
@@ -120,7 +120,7 @@ def distil_step(
 
     Pure: its noise comes from `train.step_keys`.
 
-    The student's error in x_0 weighs SNR within `config.snr_limits` (eq. 9 there, with a cap).
+    The student's error in x_0 weighs SNR within `config.training.snr_limits` (eq. 9 there, with a cap).
 
     Args:
       limit: the teacher's |x_0| is clipped to it.

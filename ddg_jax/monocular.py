@@ -37,9 +37,9 @@ class MonocularDepth:
         A frame with fewer than two valid pixels has no depth at all.
         """
         measured_m = to_metres(measured_mm)
-        relative = self._prior.from_sim(measured_m, rgb)
         made_m = np.zeros_like(measured_m)
         for i, frame_m in enumerate(measured_m):
-            if np.count_nonzero(frame_m) >= _FEWEST_VALID:
-                made_m[i] = metric_depth(relative[i], frame_m, self._far_m)
+            if np.count_nonzero(frame_m) >= _FEWEST_VALID:  # singly: a prior normalises over its frames
+                relative = self._prior.from_sim(measured_m[i : i + 1], rgb[i : i + 1])[0]
+                made_m[i] = metric_depth(relative, frame_m, self._far_m)
         return to_millimetres(made_m)

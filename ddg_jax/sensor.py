@@ -10,6 +10,7 @@ from jax import Array
 from ddg_jax.graft import graft
 from ddg_jax.representation import decode
 from ddg_jax.sample import Generator, check_aspect, sample
+from ddg_jax.window import mixed
 from ddgrasp.config import Sensor, SensorConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.depth import resize_nearest
@@ -59,8 +60,15 @@ def learned(generator: Generator) -> Sense:
         frames = [generator.prior.from_sim(frame[None], None) for frame in depth.reshape(-1, *size)]
         return np.concatenate(frames).astype(np.float32).reshape(depth.shape)
 
+    def window_on_host(depth_m) -> np.ndarray:
+        depth = np.asarray(depth_m)
+        return mixed(depth.reshape(-1, *depth.shape[-2:]), config.graft.window_px).reshape(depth.shape)
+
     def sense_frame(key: Array, depth_m: Array, rgb: Array | None) -> Array:
         check_aspect(depth_m.shape, config)
+        if config.graft.window_px:
+            seen = jax.ShapeDtypeStruct(depth_m.shape, jnp.float32)
+            depth_m = jax.pure_callback(window_on_host, seen, depth_m, vmap_method="broadcast_all")
         clean = resize_nearest(depth_m, size)
         shape = jax.ShapeDtypeStruct(size, jnp.float32)
         c = jax.pure_callback(prior_on_host, shape, clean, vmap_method="broadcast_all")[None]

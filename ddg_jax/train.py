@@ -141,8 +141,9 @@ def predict_noise(
 def loss_weight(config: DDGConfig, step: Int[AnyArray, " B"]) -> Float[Array, " B"]:
     """Weight of each step's noise error, (B,).
 
-    "uniform" is the paper's 1. "truncated" is clip(SNR, *config.snr_limits) / SNR: per unit of error in x_0
-    no step weighs less than the floor (Salimans & Ho 2022, section 4) nor more than a cap (Hang et al. 2023).
+    "uniform" is the paper's 1. "truncated" is clip(SNR, *config.training.snr_limits) / SNR: per unit of error
+    in x_0 no step weighs less than the floor (Salimans & Ho 2022, section 4) nor more than a cap (Hang et al.
+    2023).
     """
     if config.training.loss_weight == UNIFORM:
         return jnp.ones(step.shape)
@@ -195,7 +196,7 @@ def train_step(
 
 
 def fit(config: DDGConfig, frames: Frames, directory: Path, seed: int, progress: Progress) -> Params:
-    """Trains for `config.train_steps` and returns the averaged parameters.
+    """Trains for `config.training.steps` and returns the averaged parameters.
 
     Checkpoints go to `directory`/checkpoints (see `loop.run_steps`).
     """

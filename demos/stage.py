@@ -17,6 +17,8 @@ STORE = "episodes.zarr"
 _SEED = 30_000
 _MAX_TRIES = 4
 """Give up when less than one attempt in this many succeeds."""
+_FAIR_TRIAL = 60
+"""Episodes to try before that is judged."""
 
 
 def run(job: Job) -> Artifact:
@@ -32,25 +34,29 @@ def run(job: Job) -> Artifact:
 def collect(config: Config, teacher: TeacherPolicy, store: EpisodeStore, progress: Progress) -> int:
     """Fills `store` up to the configured number; returns how many episodes were tried."""
     demos = config.demos
-    tried = 0
+    tried = succeeded = idle = 0
     with progress.task("demos", demos.episodes) as task:
         task.start_at(len(store))
         roller = Roller(config, teacher, demos.parallel, with_rgb=demos.rgb, keep=store.path.parent)
         while (have := len(store)) < demos.episodes:
-            # Keyed by what is there, so that a resumed collection does not repeat episodes.
+            # Keyed by what is there, so that a resumed collection does not repeat episodes, and by how many
+            # batches have added nothing to it.
             key = jax.random.fold_in(jax.random.PRNGKey(_SEED + config.seed), have)
-            rng = np.random.default_rng([config.seed, _SEED, have])
+            key = jax.random.fold_in(key, idle) if idle else key
+            rng = np.random.default_rng([config.seed, _SEED, have, idle])
             actor = noisy_teacher(rng, demos.parallel, demos.action_noise, demos.noise_share)
             episodes = roller.run(key, actor)
             tried += demos.parallel
             for steps, episode in successful(episodes):
+                succeeded += 1
                 if len(store) < demos.episodes:
                     store.append(steps, episode)
                     task.advance()
-            if tried > _MAX_TRIES * (len(store) - have + demos.episodes) or len(store) == have:
+            idle = idle + 1 if len(store) == have else 0
+            if tried >= _FAIR_TRIAL and _MAX_TRIES * succeeded < tried:
                 raise UserError(
-                    f"The teacher succeeded in {len(store) - have} of {demos.parallel} episodes: train it "
-                    "longer (teacher.total_steps) before collecting demos."
+                    f"The teacher succeeded in {succeeded} of {tried} episodes: train it longer "
+                    "(teacher.total_steps) before collecting demos."
                 )
     return tried
 

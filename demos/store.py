@@ -25,7 +25,7 @@ class EpisodeStore:
     """Append-only list of episodes; a folder.
 
     Args:
-      create: make it if it is not there, and allow `append`.
+      create: make it if it is not there, to `append` to.
       compressed: what `append` writes; without, `reader` is quick, and pictures take up to 20 times the disk.
     """
 
@@ -43,7 +43,6 @@ class EpisodeStore:
                 f"The episode store {path} is damaged ({error}): delete it and collect again."
             ) from None
         self.path = path
-        self._writable = create
 
     @property
     def ends(self) -> np.ndarray:

@@ -70,8 +70,14 @@ def host_bytes() -> int:
     free = psutil.virtual_memory().available
     with contextlib.suppress(OSError, ValueError):
         limit, used = (int((_CGROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
-        free = min(free, limit - used)
+        free = min(free, limit - used + _file_cache())
     return free
+
+
+def _file_cache() -> int:
+    """Bytes of files that the container's use counts and that it gives up when it is asked for memory."""
+    lines = (_CGROUP / "memory.stat").read_text().splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith("inactive_file "))
 
 
 def nbytes(tree: Any) -> int:

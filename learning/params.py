@@ -50,13 +50,21 @@ def load_params(
     if target is None:
         return state
     try:
-        restored = serialization.from_state_dict(target, upgrade(state))
+        given = upgrade(state)
+        restored = serialization.from_state_dict(target, given)
+        if more := _names(given) - _names(serialization.to_state_dict(target)):  # which Flax drops
+            raise ValueError(f"{min(more)} is in the file, not in the network")
         if difference := _shape_difference(restored, target):
             raise ValueError(difference)
     except (ValueError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"{path} does not fit this configuration's network ({reason}).") from None
     return restored
+
+
+def _names(state: Any) -> set[str]:
+    """Of every array in nested dicts."""
+    return {jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(state)}
 
 
 def _shape_difference(given: Any, wanted: Any) -> str:

@@ -137,6 +137,8 @@ class Trainer:
             roller = Roller(self._config, self._teacher, wanted - first, self._source.needs_rgb)
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
                 key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
+                if there := first - (wanted - student.dagger.episodes):  # resumed: other scenes than those
+                    key = jax.random.fold_in(key, there)
                 episodes = roller.run(key, actor, lambda _: task.advance())
             frames_io.add_rollouts(self._store, episodes, actor.seen, self._window)
             measured["rollout_success"] = rate = float(episodes.success.mean())

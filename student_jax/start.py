@@ -1,11 +1,24 @@
 """What a student starts from (`student.init_from`): a run or a folder with its parameters."""
 
 from functools import partial
+from operator import attrgetter
+from pathlib import Path
 
+from ddgrasp import artifacts
 from ddgrasp.config import Config, StudentConfig
+from ddgrasp.errors import UserError
 from ddgrasp.shipped import holding, shipped
 from learning.params import Params, load_params
 from student_jax.policy import PARAMS_FILE, param_shapes, told_the_change
+
+_THE_SAME = (
+    "picture.channels", "encoder.output_stride", "hand_view.pitch_m", "head.diffusion_steps",
+)  # fmt: skip
+"""Values whose change leaves arrays of the same shape that mean something else."""
+
+
+def _folder(config: StudentConfig) -> Path:
+    return holding(config.init_from, PARAMS_FILE, "student") or shipped(config.init_from)
 
 
 def load(config: StudentConfig, network: Params) -> Params:
@@ -13,11 +26,26 @@ def load(config: StudentConfig, network: Params) -> Params:
 
     Raises UserError if they do not fit it.
     """
-    source = holding(config.init_from, PARAMS_FILE, "student") or shipped(config.init_from)
-    return load_params(source / PARAMS_FILE, network, partial(told_the_change, config))
+    return load_params(_folder(config) / PARAMS_FILE, network, partial(told_the_change, config))
 
 
 def check(config: Config) -> None:
-    """UserError if the student's network is another one than that of its `init_from`; trains nothing."""
+    """UserError if the student's network is another one than that of its `init_from`, or what its numbers
+    stand for is; trains nothing."""
     if config.student.init_from:
         load(config.student, param_shapes(config.student, config.world.profile))
+        _check_meaning(config.student)
+
+
+def _check_meaning(config: StudentConfig) -> None:
+    source = _folder(config)
+    if not artifacts.is_finished(source):
+        return
+    trained = artifacts.config_from_json(artifacts.read_manifest(source).config).student
+    for name in _THE_SAME:
+        there, here = map(attrgetter(name), (trained, config))
+        if there != here:
+            raise UserError(
+                f"The student in {source} has student.{name} {there!r}, this configuration {here!r}: use the "
+                "same value, or start from nothing (--student.init-from=)."
+            )

@@ -9,6 +9,7 @@ import pytest
 from ddg_jax.generate import Clip, noisy_episodes
 from ddg_jax.prior import make_prior
 from ddg_jax.sample import Generator, generate
+from ddg_jax.sensor import learned
 from ddg_jax.train import init_params
 from ddg_jax.window import mixed
 from ddgrasp.config import DDGConfig, DDGDepthConfig, GraftConfig, SamplingConfig, UNetConfig
@@ -59,3 +60,15 @@ def test_a_generator_with_a_window_is_one_without_on_mixed_depth(by):
     if by == "episodes":
         (episode,) = noisy_episodes(jax.random.key(2), generators[0], [3], lambda i: Clip(0, clean_mm))
         np.testing.assert_allclose(episode.astype(int), to_millimetres(made[0]).astype(int), atol=1)
+
+
+def test_the_camera_model_has_the_window_too():
+    config = replace(CONFIG, graft=replace(CONFIG.graft, window_px=1.2))
+    generators = [Generator(c, init_params(c, jax.random.key(0)), make_prior(c)) for c in (config, CONFIG)]
+    senses = [learned(generator) for generator in generators]
+    clean_m = np.full((2, 16, 24), 0.9, np.float32)
+    clean_m[:, 4:9, 6:15] = 0.6
+    inputs = (clean_m, mixed(clean_m, 1.2))
+    made = [np.asarray(sense(jax.random.key(2), d, None)) for sense, d in zip(senses, inputs, strict=True)]
+    np.testing.assert_allclose(*made, atol=1e-6)
+    assert np.abs(made[0] - np.asarray(senses[1](jax.random.key(2), clean_m, None))).max() > 0.05

@@ -242,6 +242,7 @@ def _changed(config, path, values):
             "'uint8'. Known: float32_m, uint16_mm",
         ),
         ("student.encoder", {"weights": "no"}, "needs|holds no converted weights"),
+        ("student.head", {"features_to_head": True, "aux_to_head": False}, "poses.rounds is 1 with"),
     ],
 )
 def test_names_and_files_are_checked_before_any_stage(section, values, expected, monkeypatch):
@@ -271,10 +272,14 @@ def test_a_start_of_another_network_is_refused_before_any_stage(tmp_path):
     ddg = dataclasses.replace(demo.ddg, unet=unet, init_from="pretrained/ddg")
     with pytest.raises(UserError, match=r"ddg has ddg\.unet\.widths .* configuration \(8, 16, 24\)"):
         check_config_values(dataclasses.replace(demo, ddg=ddg))
-    head = dataclasses.replace(demo.student.head, chunk=demo.student.head.chunk + 1)
-    student = dataclasses.replace(demo.student, head=head, init_from="pretrained/student")
-    with pytest.raises(UserError, match=r"student/params\.msgpack does not fit this configuration's network"):
-        check_networks(dataclasses.replace(demo, student=student), tmp_path)
+    for section, values, expected in (
+        ("student.head", {"chunk": demo.student.head.chunk + 1}, "params.msgpack does not fit this"),
+        ("student.head", {"blocks": 2}, "block2.* is in the file, not in the network"),
+        ("student.picture", {"channels": ("valid", "relief")}, r"student.picture.channels \('relief'"),
+        ("student.encoder", {"output_stride": 16}, "output_stride 8, this configuration 16"),
+    ):
+        with pytest.raises(UserError, match=expected):
+            check_networks(_changed(demo, section.split("."), values), tmp_path)
 
 
 def test_a_fitted_generator_is_found_in_a_run_and_in_its_folder(tmp_path):

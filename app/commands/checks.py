@@ -51,6 +51,11 @@ def check_config_values(config: Config) -> Config:
     if config.teacher.starts_from_file:
         check_start("teacher", "teacher.start", config.teacher.start, "nothing, guide, or ")
     check_source(config)
+    if config.student.poses.rounds and not config.student.head.aux_to_head:
+        raise UserError(
+            f"student.poses.rounds is {config.student.poses.rounds} with student.head.aux_to_head off: poses "
+            "reach the head through what perception reports; --student.poses.rounds 0, or turn it on."
+        )
     if config.student.encoder.weights:
         from student_jax import pretrained_encoder
 

@@ -149,7 +149,7 @@ class UNetConfig(Section, name="ddg.unet"):
 class DDGDiffusionConfig(Section, name="ddg.diffusion"):
     """The forward process (learning/diffusion.py)."""
 
-    steps: Annotated[int, Range(1, 100_000)] = 1000
+    steps: Annotated[int, Range(2, 100_000)] = 1000
     """Steps K of the forward process."""
     schedule: NoiseSchedule = "cosine"
     """Noise schedule: cosine or linear."""

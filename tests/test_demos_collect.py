@@ -1,0 +1,76 @@
+"""Collecting demos: when a teacher is given up, and that the same scene is not tried again and again.
+
+The episodes are made up; the store is real.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
+from ddgrasp.progress import Progress
+from demos import stage
+from demos.store import EpisodeStore
+from ppo import policy
+
+ROOT = Path(__file__).parents[1]
+QUIET = Progress(quiet=True)
+
+
+@pytest.fixture
+def collect(tmp_path, monkeypatch):
+    """Collects `episodes` in batches of `parallel`, of which `succeed(batch number, its key)` do; returns
+    (tried, stored)."""
+
+    def run(episodes, parallel, succeed):
+        batches = []
+
+        def roll(key, actor):
+            batches.append(tuple(np.asarray(key).tolist()))
+            return succeed(len(batches), batches[-1])
+
+        def kept(count):
+            for _ in range(count):
+                yield {"held": np.zeros(3, bool)}, {"object_index": np.int32(0)}
+
+        monkeypatch.setattr(stage, "Roller", lambda *_, **__: SimpleNamespace(run=roll))
+        monkeypatch.setattr(stage, "successful", kept)
+        demo = get_preset("demo")
+        config = replace(demo, demos=replace(demo.demos, episodes=episodes, parallel=parallel))
+        store = EpisodeStore(tmp_path / "episodes.zarr", create=True)
+        return stage.collect(config, policy.load(ROOT / "pretrained" / "teacher"), store, QUIET), len(store)
+
+    return run
+
+
+def test_few_demos_of_a_large_batch_are_enough(collect):
+    assert collect(5, 60, lambda *_: 60) == (60, 5)
+
+
+def test_a_scene_that_fails_is_not_tried_for_ever(collect):
+    """The key of the fourth batch is of a scene in which a good teacher fails."""
+    bad = []
+
+    def succeed(number, key):
+        if number == 4:
+            bad.append(key)
+        return int(key not in bad)
+
+    assert collect(20, 1, succeed) == (21, 20)
+
+
+@pytest.mark.parametrize("parallel", [1, 60, 100])
+def test_a_teacher_that_fails_is_given_up_after_a_fair_trial(collect, parallel):
+    tried = max(60, parallel)
+    with pytest.raises(UserError, match=f"succeeded in 0 of {tried} episodes: train it longer"):
+        collect(20, parallel, lambda *_: 0)
+
+
+def test_a_poor_teacher_is_given_up_and_a_fair_one_is_not(collect):
+    assert collect(100, 60, lambda *_: 15)[1] == 100
+    with pytest.raises(UserError, match="succeeded in 14 of 60"):
+        collect(200, 60, lambda *_: 14)
