@@ -63,7 +63,7 @@ def load_params(
 
 
 def _names(state: Any) -> set[str]:
-    """Of every array in nested dicts."""
+    """The path of every array in nested dicts."""
     return {jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(state)}
 
 

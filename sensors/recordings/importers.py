@@ -89,7 +89,7 @@ def import_all(sources: list[Source], out: Path) -> tuple[list[Imported], list[s
 
 
 def _name(source: Path) -> str:
-    """Of the recording made of it: a folder's own, a file's without what says its type."""
+    """The name of the recording made of it: a folder's own, a file's without what says its type."""
     source = source.resolve()
     return source.stem if source.suffix in REALSENSE_SUFFIXES else source.name
 
