@@ -78,7 +78,7 @@ def resnet_max_pool(x: Float32[Array, "B H W C"]) -> Float32[Array, "B H//2 W//2
 
 
 def _max_of_three(x: Array, axis: int) -> Array:
-    """Of every second pixel along `axis` and the two beside it; 0 before the first."""
+    """The maximum of every second pixel along `axis` and the two beside it; 0 before the first."""
     pairs = x.reshape(*x.shape[:axis], x.shape[axis] // 2, 2, *x.shape[axis + 1 :])
     even, odd = (lax.index_in_dim(pairs, i, axis + 1, keepdims=False) for i in (0, 1))
     before = lax.slice_in_dim(odd, 0, odd.shape[axis] - 1, axis=axis)
