@@ -88,7 +88,7 @@ def object_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """((H, W) bool pixels of the object in (H, W) depth, (N, 3) metres: their points, world frame)."""
     lens = nominal_camera(contract.D455.scaled(depth_m.shape[1] / contract.D455.width_px))
-    v, u = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]]
+    v, u = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]] + 0.5
     rays = np.stack([(u - lens.cx_px) / lens.fx_px, (v - lens.cy_px) / lens.fy_px, np.ones_like(u)], axis=-1)
     points = (depth_m[..., None] * rays) @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
     near = np.linalg.norm(points[..., :2] - object_m[:2], axis=-1) < NEAR_M

@@ -3,7 +3,9 @@
 `ddgrasp run` leaves one, `config.yaml`, in the run's folder; `--config FILE` takes it.
 """
 
+import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_text
 from ddgrasp.presets import PRESETS, get_preset
+from ddgrasp.scaling import scaled
 
 CONFIG_FILE = "config.yaml"
 _PRESET = "preset"
@@ -22,6 +25,8 @@ def write(config: Config, path: Path) -> None:
     import yaml
 
     preset = PRESETS.get(config.preset, Config(config.preset))
+    if config.scale != 1:
+        preset = replace(scaled(replace(preset, scale=config.scale), config.scale), scale=1.0)
     values = {_PRESET: config.preset, **_differences(to_json(preset), to_json(config))}
     text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=110)
     atomic_write_text(path, f"# ddgrasp run --config {path.name}\n{text}")
@@ -36,7 +41,7 @@ def read(path: Path) -> Config:
     import yaml
 
     try:
-        values = yaml.safe_load(path.read_text())
+        values = yaml.load(path.read_text(), _loader())  # noqa: S506 - a safe loader
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "no text"
         raise UserError(f"--config {path} cannot be read ({reason}).") from None
@@ -44,8 +49,38 @@ def read(path: Path) -> Config:
         raise UserError(f"--config {path} is no YAML: {' '.join(str(error).split())}.") from None
     if not isinstance(values, dict) or not isinstance(values.get(_PRESET), str):
         raise UserError(f"--config {path} names no preset: its first line is to be `preset: demo`.")
-    preset = to_json(get_preset(values[_PRESET]))
-    return config_from_json(_merged(preset, values, f"--config {path}", ""))
+    begin = _scaled(get_preset(values[_PRESET]), values.get("scale", 1.0), path)
+    merged = _merged(to_json(begin), values, f"--config {path}", "")
+    try:
+        return config_from_json(merged)
+    except UserError as error:
+        raise UserError(f"--config {path}: {error}") from None
+
+
+def _scaled(preset: Config, factor: Any, path: Path) -> Config:
+    """`preset` with its counts times the file's `scale`; what it says of them counts as it is."""
+    if factor == 1:
+        return preset
+    if isinstance(factor, bool) or not isinstance(factor, (int, float)) or not 0 < factor <= 1:
+        raise UserError(f"--config {path}: scale is {factor!r}; expected more than 0, at most 1.")
+    return scaled(replace(preset, scale=float(factor)), float(factor))
+
+
+def _loader() -> Any:
+    """YAML's safe loader, which reads 3e-4 as a number and refuses a section or setting given twice."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def construct_mapping(self, node, deep=False):
+            names = [self.construct_object(key, deep=True) for key, _ in node.value]
+            if twice := [name for name in names if names.count(name) > 1]:
+                why = f"{twice[0]} is given twice"
+                raise yaml.constructor.ConstructorError(None, None, why, node.start_mark)
+            return super().construct_mapping(node, deep)
+
+    number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+.0123456789"))
+    return Loader
 
 
 def _differences(preset: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str, Any]:

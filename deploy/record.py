@@ -41,9 +41,10 @@ class DeploymentRecord:
     ):
         """`profile` is the policy's picture; `film_every` as in `DeployConfig`."""
         self._camera, self._picture_every, self._film_every = camera, film_every, film_every
+        apart = film_every if isinstance(camera, Filmed) else 1  # steps; a camera's own are all kept
         self._meta = {
             "sensor": sensor, "fx_px": profile.fx_px, "baseline_m": profile.baseline_m,
-            "hz": contract.CONTROL_HZ, "consecutive_frames": True,
+            "hz": contract.CONTROL_HZ / apart, "consecutive_frames": apart == 1,
         }  # fmt: skip
         self._rows: list[dict[str, Any]] = []
         self._queue: queue.Queue[tuple[np.ndarray, np.ndarray] | None] = queue.Queue()

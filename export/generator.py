@@ -119,8 +119,9 @@ def describe(
 
 
 def _rig(artifact: Artifact) -> tuple[dict[str, Any], str, str]:
-    """The camera that a run recorded itself; nothing of a generator that was fitted on other recordings."""
-    if "record" not in artifact.manifest.parents:
+    """The camera that a run recorded itself; nothing of a generator that was fitted on other recordings, or
+    taken from elsewhere (`ddg.init_from`)."""
+    if "record" not in artifact.manifest.parents or artifact.manifest.origin == "loaded":
         return {}, "", ""
     config = artifacts.config_from_json(artifact.manifest.config)
     profile, stereo = config.world.profile, config.record.stereo

@@ -319,7 +319,7 @@ def _improve(config, networks, normalizer, data, key, state, mesh):
         grads = network_params(policy_grads, grads.value)
         updates, opt_state = optimizer.update(grads, opt_state, params)
         if config.target_kl:
-            kl = terms["kl_mean"]
+            kl = jnp.where(learns, terms["kl_mean"], 0.0)  # 0 leaves the step size: nothing has moved yet
             opt_state = steered(opt_state, kl, calm * config.target_kl, calm * STEERED_RATE_MIN)
         params = cast(ppo_losses.PPONetworkParams, optax.apply_updates(params, updates))
         return (params, opt_state), terms

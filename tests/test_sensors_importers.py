@@ -117,6 +117,16 @@ def test_one_refused_recording_does_not_stop_the_others(tmp_path, capsys):
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["a"]
 
 
+def test_numbers_in_names_count_as_numbers(tmp_path):
+    root = make_folder(tmp_path / "a", frames=0)
+    for i in range(12):
+        cv2.imwrite(str(root / "depth" / f"{i}.png"), np.full(SIZE, 600 + i, np.uint16))
+        cv2.imwrite(str(root / "rgb" / f"{i}.png"), np.zeros((*SIZE, 3), np.uint8))
+    importers.import_recording(importers.folder_source(root, 0.0, {}), tmp_path / "out")
+    read = Recording.open(tmp_path / "out")
+    assert [int(read.depth_mm(i).max()) for i in range(12)] == list(range(600, 612))
+
+
 def test_a_folder_s_recording_has_its_whole_name(tmp_path, monkeypatch):
     for name in ("kitchen.1", "kitchen.2"):
         make_folder(tmp_path / "all" / name)

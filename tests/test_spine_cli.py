@@ -324,3 +324,26 @@ def test_a_count_below_one_is_named_with_its_minimum(section, name):
     for value in (0, -3):
         with pytest.raises(UserError, match=rf"{section}\.{name} is {value}; expected at least 1\."):
             _with(section, **{name: value})
+
+
+def test_of_an_option_given_twice_the_last_counts():
+    config = parse("run", ["--preset", "demo", "--preset", "laptop"]).config
+    assert config == PRESETS["laptop"]
+
+
+def test_a_flag_may_say_what_is_so_already():
+    for flag, filled in (("fill-holes", True), ("no-fill-holes", False)):
+        given = parse("student train", ["--preset", "demo", f"--student.picture.{flag}"])
+        assert given.config.student.picture.fill_holes == filled
+
+
+def test_what_comes_with_the_project_is_not_measured_over():
+    with pytest.raises(UserError, match="comes with the project, .*give --out FOLDER"):
+        parse("teacher eval", ["pretrained", "--trials", "1"]).run()
+
+
+def test_a_teacher_s_world_is_its_run_s_wherever_the_run_stands(tmp_path):
+    config = dataclasses.replace(PRESETS["demo"], world=PRESETS["ppo_paper"].world)
+    artifacts.finish(tmp_path / "teacher", "teacher", config, seconds=1.0, metrics={})
+    for args in ([str(tmp_path), "--trials", "5"], ["--trials", "5", str(tmp_path)]):
+        assert parse("teacher eval", args).world == config.world

@@ -62,6 +62,19 @@ def test_a_run_at_scale_comes_back(tmp_path):
     assert config_file.read(tmp_path / "config.yaml") == small
 
 
+def test_a_scale_written_by_hand_is_applied(tmp_path):
+    (tmp_path / "mine.yaml").write_text("preset: demo\nscale: 0.01\ndemos: {episodes: 120}\n")
+    read, small = config_file.read(tmp_path / "mine.yaml"), scaled(PRESETS["demo"], 0.01)
+    assert read == replace(small, demos=replace(small.demos, episodes=120)) and small.demos.episodes < 120
+    config_file.write(read, tmp_path / "again.yaml")
+    assert config_file.read(tmp_path / "again.yaml") == read
+
+
+def test_a_number_may_be_written_as_on_the_command_line(tmp_path):
+    (tmp_path / "mine.yaml").write_text("preset: debug\nteacher: {learning_rate: 3e-4}\n")
+    assert config_file.read(tmp_path / "mine.yaml").teacher.learning_rate == 3e-4
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -76,6 +89,8 @@ def test_a_run_at_scale_comes_back(tmp_path):
         ("preset: demo\nteacher: {num_envs: 0}", "teacher.num_envs is 0; expected at least 1"),
         ("preset: demo\nteacher: {num_envs: many}", "teacher.num_envs is 'many'; expected"),
         ("preset: [", "is no YAML"),
+        ("preset: demo\nteacher: {num_envs: 64}\nteacher: {epochs: 1}", "teacher is given twice"),
+        ("preset: demo\nscale: 3", "scale is 3; expected more than 0, at most 1"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named(text, said, tmp_path):

@@ -115,10 +115,10 @@ def parse(name: str, args: Sequence[str]) -> Command:
     elif cls is Calibrate:
         options["default"] = Calibrate(get_preset(_option(args, "--preset") or DEFAULT_PRESET))
     elif cls is TeacherEval:
-        options["default"] = with_world_of(shipped(args[0]) if args and args[0][0] != "-" else None)
+        options["default"] = with_world_of(next((shipped(arg) for arg in args if _is_run(arg)), None))
     program, whole = f"ddgrasp {name}", HELP_ALL in args
     given = ["--help" if arg == HELP_ALL else arg for arg in args]
-    read = partial(tyro.cli, cls, prog=program, args=given, config=(tyro.conf.FlagCreatePairsOff,), **options)
+    read = partial(tyro.cli, cls, prog=program, args=given, **options)
     command = _found(parsed(read, program, whole))
     check_options(command)
     return command
@@ -128,6 +128,11 @@ def _found(command: Any) -> Any:
     """`command` with the places of what it reads that comes with this project (`shipped`)."""
     given = {field.name: getattr(command, field.name) for field in fields(command) if field.name != "out"}
     return replace(command, **{name: shipped(path) for name, path in given.items() if isinstance(path, Path)})
+
+
+def _is_run(arg: str) -> bool:
+    """Whether an argument is a folder, which options of `teacher eval` are not."""
+    return bool(arg) and arg[0] != "-" and shipped(arg).is_dir()
 
 
 def _base(args: Sequence[str], default_preset: str) -> Config:
@@ -193,10 +198,11 @@ _PRESET_HELP = (
 
 
 def _option(args: Sequence[str], name: str) -> str | None:
-    """Value of `--name value` or `--name=value` among `args`."""
+    """Value of `--name value` or `--name=value` among `args`, the last one, as the parser takes it."""
+    value = None
     for index, arg in enumerate(args):
         if arg == name and index + 1 < len(args):
-            return args[index + 1]
+            value = args[index + 1]
         if arg.startswith(f"{name}="):
-            return arg.split("=", 1)[1]
-    return None
+            value = arg.split("=", 1)[1]
+    return value

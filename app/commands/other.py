@@ -51,12 +51,10 @@ class WeightsList:
 
         there = store.installed(self.out)
         for name, entry in catalog.ENTRIES.items():
-            manifest = there.get(name)
-            state = (
-                f"installed in {self.out / name}, from {manifest.source_file}"
-                if manifest
-                else "not installed"
-            )
+            folder = name if name in there else f"{name}_metric"
+            manifest = there.get(folder)
+            place = self.out / folder
+            state = f"installed in {place}, from {manifest.source_file}" if manifest else "not installed"
             lines = {"file": entry.file, "published": entry.published, "licence": entry.licence}
             lines |= {"used for": entry.used_for, "here": state}
             print(name, *(f"  {title:<10} {text}" for title, text in lines.items()), "", sep="\n")

@@ -42,6 +42,7 @@ class RigFr3:
             print(f"FR3 at {self.host} before {self.object_name!r}. Drive it: {drive}", flush=True)
             while rig.running():
                 time.sleep(0.2)
+            raise UserError(f"the FR3 rig at {self.host} has ended; what it said is above.")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,9 @@ from app.commands.checks import check_config_values, check_devices, check_object
 from ddgrasp import artifacts
 from ddgrasp.config import Backend, HostsConfig, WorldConfig
 from ddgrasp.config.checks import Count, Seed
+from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
+from ddgrasp.shipped import PRETRAINED
 from ddgrasp.stages import get_stage
 
 
@@ -60,6 +62,8 @@ class TeacherEval:
         """Runs the trials, prints a row per object, keeps figures and pictures."""
         check_objects(self.world)
         directory = self.run_dir / "teacher"
+        if self.out is None:
+            _check_own(directory, "give --out FOLDER")
         teacher = artifacts.read_artifact(directory).hash
         from ddgrasp.progress import Progress
         from evaluation import teacher_trials
@@ -99,6 +103,7 @@ class TeacherCompare:
 
         config = load_config(self.run_dir, "teacher")
         directory, results = self.run_dir / "teacher", {}
+        _check_own(directory, "copy it and name the copy")
         policy = load_policy(directory)
         for name, result in evaluate_backends(config.world, policy, self.backends, self.trials, self.seed):
             success = wilson.success(result["success"]["successes"], result["success"]["n"])
@@ -106,6 +111,12 @@ class TeacherCompare:
             results[name] = result
             measured.save(directory, results, self.seed)
         print(f"{directory / measured.BACKENDS_FILE}: `ddgrasp report {self.run_dir}` shows it.")
+
+
+def _check_own(directory: Path, remedy: str) -> None:
+    """UserError for a folder that comes with the project: what was measured of it is not replaced."""
+    if directory.resolve().is_relative_to(PRETRAINED.resolve()):
+        raise UserError(f"{directory} comes with the project, with its own measurements: {remedy}.")
 
 
 def with_world_of(run_dir: Path | None) -> TeacherEval:

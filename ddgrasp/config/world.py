@@ -30,11 +30,11 @@ class RewardConfig(Section, name="world.reward"):
     lift: Weight = 10.0
     """w2: for an object near the lift target, per metre."""
     orient: Weight = 0.5
-    """w3: for keeping the object's orientation once it is lifted, per radian."""
+    """w3: for turning the hand upright, as it is at the lift target, once it is lifted, per radian."""
     accel: Weight = 3e-5
     """w4: penalty on joint accelerations, per (rad/s^2)^2."""
     bonus_base: Annotated[float, Range(1, 1000, above=True)] = 1.1
-    """c1 > 1: the bonus for success at its first step."""
+    """c1 > 1: the bonus for success, times c2 already at its first step."""
     bonus_growth: Annotated[float, Range(1, 1000, above=True)] = 1.08
     """c2 > 1: by which the bonus grows with every further step of success."""
     bonus_max_count: Annotated[int, Range(0, 10_000)] = 10

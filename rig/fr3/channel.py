@@ -68,4 +68,6 @@ class Channel:
 
     def close(self) -> None:
         """Ends the connection."""
+        with contextlib.suppress(OSError):
+            self._file.close()  # which holds it open as well
         self._socket.close()

@@ -103,7 +103,10 @@ class Rig:
     def _tick(self) -> None:
         while not self._requests.empty():
             asked, answer = self._requests.get()
-            answer.put(self.answer(asked))
+            try:
+                answer.put(self.answer(asked))
+            except (KeyError, TypeError, ValueError) as error:  # a request may not take the arm down
+                answer.put({"error": f"{asked!r}: {error!r}"})
         if time.monotonic() < self._away_until_s:
             self._server.hold_once()
             return
@@ -200,8 +203,15 @@ def _listen(host: str, request: Any) -> socketserver.ThreadingTCPServer:
 
     class Handler(socketserver.StreamRequestHandler):
         def handle(self) -> None:
-            for line in self.rfile:
-                self.wfile.write(json.dumps(request(json.loads(line))).encode() + b"\n")
+            slowed = False
+            try:
+                for line in self.rfile:
+                    asked = json.loads(line)
+                    slowed = asked["on"] if asked.get("ask") == "slow" else slowed
+                    self.wfile.write(json.dumps(request(asked)).encode() + b"\n")
+            finally:
+                if slowed:  # who asked for it has gone
+                    request({"ask": "slow", "on": False})
 
     class Listener(socketserver.ThreadingTCPServer):
         allow_reuse_address, daemon_threads, block_on_close = True, True, False

@@ -4,6 +4,7 @@ Only pictures and what the camera is are kept: no pose, no CAD, no pairing. A fr
 named and left out; a source none of whose frames can be used, or whose depth is in another unit, is refused.
 """
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -170,7 +171,8 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
 
     `depth_unit_m` 0 takes millimetres for integers, metres for floats.
     """
-    files = sorted(p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
+    pictures = (p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
+    files = sorted(pictures, key=_in_time)
     if not files:
         raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
     if not depth_unit_m:
@@ -185,6 +187,12 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
             yield RawFrame(file.name, _read_depth(file), None if color is None else _read_rgb(color))
 
     return Source(folder, frames, depth_unit_m, meta)
+
+
+def _in_time(file: Path) -> list[tuple[int, str]]:
+    """Numbers in a name count as numbers: 10.png comes after 9.png."""
+    parts = re.split(r"(\d+)", file.name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _is_pair(folder: Path) -> bool:
