@@ -53,7 +53,7 @@ def collect(config: Config, teacher: TeacherPolicy, store: EpisodeStore, progres
                     store.append(steps, episode)
                     task.advance()
             idle = idle + 1 if len(store) == have else 0
-            if tried >= _FAIR_TRIAL and _MAX_TRIES * succeeded < tried:
+            if len(store) < demos.episodes and tried >= _FAIR_TRIAL and _MAX_TRIES * succeeded < tried:
                 raise UserError(
                     f"The teacher succeeded in {succeeded} of {tried} episodes: train it longer "
                     "(teacher.total_steps) before collecting demos."

@@ -236,8 +236,8 @@ def run_trials(
             yield future.result()
     except BrokenProcessPool:
         raise UserError(
-            "a worker was killed, often for want of memory: finished trials are kept, the same command goes "
-            "on; fewer --workers need less."
+            "a worker was killed, often for want of memory: finished trials are kept, the same command (with "
+            "--resume where it has one) goes on; fewer workers need less."
         ) from None
     finally:
         executor.shutdown(wait=True, cancel_futures=True)

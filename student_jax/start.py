@@ -44,7 +44,8 @@ def _check_meaning(config: StudentConfig) -> None:
     trained = artifacts.config_from_json(artifacts.read_manifest(source).config).student
     for name in _THE_SAME:
         there, here = map(attrgetter(name), (trained, config))
-        if there != here:
+        unused = name == "hand_view.pitch_m" and not config.hand_view.size_px
+        if there != here and not unused:
             raise UserError(
                 f"The student in {source} has student.{name} {there!r}, this configuration {here!r}: use the "
                 "same value, or start from nothing (--student.init-from=)."

@@ -48,7 +48,7 @@ def collect(tmp_path, monkeypatch):
 
 
 def test_few_demos_of_a_large_batch_are_enough(collect):
-    assert collect(5, 60, lambda *_: 60) == (60, 5)
+    assert collect(5, 60, lambda *_: 6) == (60, 5)
 
 
 def test_a_scene_that_fails_is_not_tried_for_ever(collect):

@@ -4,6 +4,7 @@ Only pictures and what the camera is are kept: no pose, no CAD, no pairing. A fr
 named and left out; a source none of whose frames can be used, or whose depth is in another unit, is refused.
 """
 
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -91,7 +92,7 @@ def import_all(sources: list[Source], out: Path) -> tuple[list[Imported], list[s
 
 def _name(source: Path) -> str:
     """The name of the recording made of it: a folder's own, a file's without what says its type."""
-    source = source.resolve()
+    source = Path(os.path.abspath(source))  # a link keeps its name
     return source.stem if source.suffix in REALSENSE_SUFFIXES else source.name
 
 
