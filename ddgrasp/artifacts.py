@@ -226,12 +226,17 @@ def check_inputs(directory: Path | str, inputs: Mapping[str, str | None], how: s
     """UserError if the stage in `directory` is from others than `inputs`, of those that it noted."""
     path = Path(directory) / STARTED
     before = read_json(path).get("inputs", {}) if path.exists() else {}
-    both = {name: value for name, value in inputs.items() if name in before}
+    both = {name: value for name, value in inputs.items() if name in before and not _moved(before[name], how)}
     if difference := next(_differences({name: before[name] for name in both}, both), None):
         raise UserError(
             f"{directory} was {how} with other inputs: {difference}. Use those, another --out, or delete the "
             "directory."
         )
+
+
+def _moved(noted: str, how: str) -> bool:
+    """Whether a finished stage's material is not where it was: what is finished does not need it."""
+    return how == "made" and Path(noted).is_absolute() and not Path(noted).exists()
 
 
 def _check_same_config(

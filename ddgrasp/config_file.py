@@ -18,6 +18,8 @@ from ddgrasp.scaling import scaled
 
 CONFIG_FILE = "config.yaml"
 _PRESET = "preset"
+_MERGE = "tag:yaml.org,2002:merge"
+"""YAML's `<<`."""
 
 
 def write(config: Config, path: Path) -> None:
@@ -72,7 +74,7 @@ def _loader() -> Any:
 
     class Loader(yaml.SafeLoader):
         def construct_mapping(self, node, deep=False):
-            names = [self.construct_object(key, deep=True) for key, _ in node.value]
+            names = [self.construct_object(key, deep=True) for key, _ in node.value if key.tag != _MERGE]
             if twice := [name for name in names if names.count(name) > 1]:
                 why = f"{twice[0]} is given twice"
                 raise yaml.constructor.ConstructorError(None, None, why, node.start_mark)

@@ -24,10 +24,9 @@ class TrialLog:
         self._path = path
         self.results: dict[tuple[int, bool], TrialResult] = {}
         lines = list(_complete_lines(path))
-        begun = len(lines) > 1  # a header alone is of a series that ended before its first trial
-        if begun and lines[0] != header:
+        if lines and lines[0] != header:
             raise UserError(
-                f"{path} holds trials of another policy, configuration or rule: delete {path.parent} to "
+                f"{path} was begun with another policy, configuration or rule: delete {path.parent} to "
                 "start them anew, or choose another --out."
             )
         for line in lines[1:]:

@@ -89,10 +89,11 @@ def test_trials_that_were_not_recorded_are_not_passed_over(tmp_path, policy):
     assert "0000-apple" in page.read_text()
 
 
-def test_a_log_without_a_trial_belongs_to_nobody(tmp_path):
+def test_a_log_without_a_trial_belongs_to_whom_began_it(tmp_path):
+    """Its first trial may be under way."""
     TrialLog(tmp_path / "trials.jsonl", {"rig": "fr3"})
-    TrialLog(tmp_path / "trials.jsonl", {"rig": "development"})
-    assert json.loads((tmp_path / "trials.jsonl").read_text()) == {"rig": "development"}
+    with pytest.raises(UserError, match="was begun with another policy"):
+        TrialLog(tmp_path / "trials.jsonl", {"rig": "development"})
 
 
 @pytest.mark.parametrize(

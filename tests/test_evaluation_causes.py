@@ -63,7 +63,7 @@ def test_the_table_is_kept_and_its_trials_are_not_run_again(tmp_path, policy):
     log = (out / "ideal" / rig_trials.TRIALS_FILE).read_bytes()
     assert causes.run(CONFIG, policy, names, SERIES, out, 0)["rows"] == made["rows"]
     assert (out / "ideal" / rig_trials.TRIALS_FILE).read_bytes() == log
-    with pytest.raises(UserError, match="trials of another policy, configuration or rule"):
+    with pytest.raises(UserError, match="begun with another policy, configuration or rule"):
         causes.run(CONFIG, policy, names, Series("development", ("cube",), 1, number=1, seconds=0.5), out, 0)
 
 

@@ -242,7 +242,6 @@ def _changed(config, path, values):
             "'uint8'. Known: float32_m, uint16_mm",
         ),
         ("student.encoder", {"weights": "no"}, "needs|holds no converted weights"),
-        ("student.head", {"features_to_head": True, "aux_to_head": False}, "poses.rounds is 1 with"),
     ],
 )
 def test_names_and_files_are_checked_before_any_stage(section, values, expected, monkeypatch):
@@ -274,6 +273,7 @@ def test_a_start_of_another_network_is_refused_before_any_stage(tmp_path):
         check_config_values(dataclasses.replace(demo, ddg=ddg))
     for section, values, expected in (
         ("student.head", {"chunk": demo.student.head.chunk + 1}, "params.msgpack does not fit this"),
+        ("student.head", {"features_to_head": True, "aux_to_head": False}, "poses.rounds is 2 with"),
         ("student.head", {"blocks": 2}, "block2.* is in the file, not in the network"),
         ("student.picture", {"channels": ("valid", "relief")}, r"student.picture.channels \('relief'"),
         ("student.encoder", {"output_stride": 16}, "output_stride 8, this configuration 16"),

@@ -113,6 +113,9 @@ def test_resume_with_another_config_is_refused_and_loses_nothing(stages, tmp_pat
 
 
 def test_a_finished_stage_of_other_material_is_not_taken_for_this_one_s(stages, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+
     def make(data: str):
         inputs = {"data": tmp_path / data}
         return pipeline.make(stages[0], CONFIG, tmp_path / "run", resume=True, inputs=inputs, quiet=True)
@@ -120,6 +123,8 @@ def test_a_finished_stage_of_other_material_is_not_taken_for_this_one_s(stages, 
     assert make("a") == make("a")
     with pytest.raises(UserError, match="was made with other inputs: data is '.*/a' there, '.*/b' here"):
         make("b")
+    (tmp_path / "a").rename(tmp_path / "moved")
+    assert make("moved") == make("b")  # what is finished does not need it any more
 
 
 def test_a_child_of_a_replaced_parent_is_refused(stages, tmp_path):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ddgrasp import artifacts
-from ddgrasp.config import Config, ScoreConfig, WorldConfig
+from ddgrasp.config import Config, ScoreConfig, StudentConfig, WorldConfig
 from ddgrasp.config.checks import Range, check_value, kinds
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import PRETRAINED, holding, shipped
@@ -51,11 +51,6 @@ def check_config_values(config: Config) -> Config:
     if config.teacher.starts_from_file:
         check_start("teacher", "teacher.start", config.teacher.start, "nothing, guide, or ")
     check_source(config)
-    if config.student.poses.rounds and not config.student.head.aux_to_head:
-        raise UserError(
-            f"student.poses.rounds is {config.student.poses.rounds} with student.head.aux_to_head off: poses "
-            "reach the head through what perception reports; --student.poses.rounds 0, or turn it on."
-        )
     if config.student.encoder.weights:
         from student_jax import pretrained_encoder
 
@@ -124,6 +119,7 @@ def check_networks(config: Config, run_dir: Path) -> list[str]:
     from student_jax import start
 
     if "student" in left:
+        _check_head(config.student)
         start.check(config)
     need_of = {"demos": demos_memory.need, "ddg": ddg_memory.need, "student": student_memory.need}
     needs = []
@@ -131,6 +127,15 @@ def check_networks(config: Config, run_dir: Path) -> list[str]:
         needs.append(need_of[name](config))
         memory.check(needs[-1], run_dir)
     return [str(need) for need in needs]
+
+
+def _check_head(student: StudentConfig) -> None:
+    """UserError where the head would be trained on poses that do not reach it."""
+    if student.poses.rounds and not student.head.aux_to_head:
+        raise UserError(
+            f"student.poses.rounds is {student.poses.rounds} with student.head.aux_to_head off: poses reach "
+            "the head through what perception reports; --student.poses.rounds 0, or turn it on."
+        )
 
 
 def check_start(stage: str, option: str, folder: str, others: str = "") -> None:
