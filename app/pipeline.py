@@ -93,7 +93,7 @@ def make(
     if artifacts.is_finished(directory):
         artifact = artifacts.read_artifact(directory)
         artifacts.check_config(artifact, config)
-        artifacts.check_inputs(directory, {name: job.identity()[name] for name in job.inputs}, "made")
+        artifacts.check_inputs(directory, {name: job.identity()[name] for name in job.inputs})
         progress.note(f"finished before ({artifact.manifest.seconds:.0f} s{_origin(artifact)})")
     else:
         artifact = _work(job, leads)

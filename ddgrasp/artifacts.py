@@ -211,7 +211,8 @@ def begin(
                 f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
             )
         _check_same_config(Path(directory), stage, _config_of(started, path), config, "begun")
-        check_inputs(directory, {name: inputs.get(name) for name in started.get("inputs", {})}, "begun")
+        before = started.get("inputs", {})
+        _check_same_inputs(directory, before, {name: inputs.get(name) for name in before}, "begun")
     elif write:
         value = {
             upgrades.VERSION_FIELD: upgrades.VERSION,
@@ -222,21 +223,27 @@ def begin(
         atomic_write_json(path, value)
 
 
-def check_inputs(directory: Path | str, inputs: Mapping[str, str | None], how: str) -> None:
-    """UserError if the stage in `directory` is from others than `inputs`, of those that it noted."""
+def check_inputs(directory: Path | str, inputs: Mapping[str, str]) -> None:
+    """UserError if the finished stage in `directory` noted other `inputs` than these; a path that is there no
+    more is let pass, since what is finished does not need it."""
     path = Path(directory) / STARTED
-    before = read_json(path).get("inputs", {}) if path.exists() else {}
-    both = {name: value for name, value in inputs.items() if name in before and not _moved(before[name], how)}
-    if difference := next(_differences({name: before[name] for name in both}, both), None):
+    noted = read_json(path).get("inputs", {}) if path.exists() else {}
+    there = {
+        name: value
+        for name, value in noted.items()
+        if name in inputs and not (Path(value).is_absolute() and not Path(value).exists())
+    }
+    _check_same_inputs(directory, there, {name: inputs[name] for name in there}, "made")
+
+
+def _check_same_inputs(
+    directory: Path | str, there: Mapping[str, str], here: Mapping[str, str | None], how: str
+) -> None:
+    if difference := next(_differences(there, here), None):
         raise UserError(
             f"{directory} was {how} with other inputs: {difference}. Use those, another --out, or delete the "
             "directory."
         )
-
-
-def _moved(noted: str, how: str) -> bool:
-    """Whether a finished stage's material is not where it was: what is finished does not need it."""
-    return how == "made" and Path(noted).is_absolute() and not Path(noted).exists()
 
 
 def _check_same_config(

@@ -28,7 +28,7 @@ def write(config: Config, path: Path) -> None:
 
     preset = PRESETS.get(config.preset, Config(config.preset))
     if config.scale != 1:
-        preset = replace(scaled(replace(preset, scale=config.scale), config.scale), scale=1.0)
+        preset = replace(scaled(preset, config.scale), scale=1.0)
     values = {_PRESET: config.preset, **_differences(to_json(preset), to_json(config))}
     text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=110)
     atomic_write_text(path, f"# ddgrasp run --config {path.name}\n{text}")
@@ -51,21 +51,14 @@ def read(path: Path) -> Config:
         raise UserError(f"--config {path} is no YAML: {' '.join(str(error).split())}.") from None
     if not isinstance(values, dict) or not isinstance(values.get(_PRESET), str):
         raise UserError(f"--config {path} names no preset: its first line is to be `preset: demo`.")
-    begin = _scaled(get_preset(values[_PRESET]), values.get("scale", 1.0), path)
-    merged = _merged(to_json(begin), values, f"--config {path}", "")
+    preset = get_preset(values[_PRESET])
     try:
+        if (scale := values.get("scale", 1.0)) != 1:
+            preset = scaled(replace(preset, scale=scale), scale)
+        merged = _merged(to_json(preset), values, f"--config {path}", "")
         return config_from_json(merged)
     except UserError as error:
         raise UserError(f"--config {path}: {error}") from None
-
-
-def _scaled(preset: Config, factor: Any, path: Path) -> Config:
-    """`preset` with its counts times the file's `scale`; what it says of them counts as it is."""
-    if factor == 1:
-        return preset
-    if isinstance(factor, bool) or not isinstance(factor, (int, float)) or not 0 < factor <= 1:
-        raise UserError(f"--config {path}: scale is {factor!r}; expected more than 0, at most 1.")
-    return scaled(replace(preset, scale=float(factor)), float(factor))
 
 
 def _loader() -> Any:

@@ -79,9 +79,9 @@ def _views(demos: EpisodeStore, number: int, rows: tuple[int, int]) -> Views:
 
 
 def useful_steps(held: Bool[np.ndarray, " T"], held_steps: int) -> int:
-    """Number of an episode's first steps up to `held_steps` with the object in the hand."""
-    enough = np.flatnonzero(np.cumsum(held) >= held_steps)
-    return int(enough[0]) + 1 if len(enough) else len(held)
+    """Number of an episode's first steps up to `held_steps` with the object in the hand, at least one."""
+    enough = np.flatnonzero(np.cumsum(held) >= max(1, held_steps))
+    return max(1, int(enough[0]) + (held_steps > 0)) if len(enough) else len(held)
 
 
 def stretch(useful: int, steps: int, seed: Sequence[int]) -> range:

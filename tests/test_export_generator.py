@@ -177,6 +177,17 @@ def test_more_evaluations_than_a_file_holds_are_refused(tmp_path):
         exported.export_generator(tmp_path, tmp_path / "generator.onnx", steps=51)
 
 
+@pytest.mark.parametrize(("origin", "licence"), [("trained", "Apache-2.0"), ("loaded", "")])
+def test_a_generator_from_elsewhere_is_not_the_rig_s(tmp_path, origin, licence):
+    config = Config("test", ddg=CAMERA)
+    record = artifacts.finish(tmp_path / "record", "record", config, seconds=1.0, metrics={})
+    fitted = artifacts.finish(
+        tmp_path / "ddg", "ddg", config, seconds=1.0, metrics={}, parents=[record], origin=origin
+    )
+    described = exported.describe(fitted, CAMERA)
+    assert described.licence == licence and bool(described.camera) == (origin == "trained")
+
+
 def test_the_file_names_the_recordings_camera(tmp_path):
     generator = made(CAMERA)
     finished(generator, tmp_path / "ddg")

@@ -90,7 +90,7 @@ def test_a_number_may_be_written_as_on_the_command_line(tmp_path):
         ("preset: demo\nteacher: {num_envs: many}", "teacher.num_envs is 'many'; expected"),
         ("preset: [", "is no YAML"),
         ("preset: demo\nteacher: {num_envs: 64}\nteacher: {epochs: 1}", "teacher is given twice"),
-        ("preset: demo\nscale: 3", "scale is 3; expected more than 0, at most 1"),
+        ("preset: demo\nscale: 3", "scale is 3; expected above 0, up to 1"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named(text, said, tmp_path):

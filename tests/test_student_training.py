@@ -99,7 +99,7 @@ def test_steps_with_the_object_in_the_hand_are_drawn_less():
 
 def test_a_demo_ends_after_so_many_steps_with_the_object():
     held = np.array([0, 1, 0, 1, 1, 1], bool)
-    assert [useful_steps(held, n) for n in (1, 2, 3, 9)] == [2, 4, 5, 6]
+    assert [useful_steps(held, n) for n in (0, 1, 2, 3, 9)] == [1, 2, 4, 5, 6]
 
 
 def test_gripper_labels_are_sharp():

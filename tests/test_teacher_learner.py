@@ -2,11 +2,14 @@
 
 import contextlib
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.training import types
+from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 
 from app.commands import parse
@@ -14,6 +17,7 @@ from ddgrasp.config import Config, EvalConfig, TeacherConfig, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
+from mjx_envs import devices
 from ppo import learner
 from ppo import policy as teacher_policy
 from ppo import train as ppo_train
@@ -111,3 +115,30 @@ def test_missing_teacher_and_indivisible_batch_are_named(tmp_path):
         teacher_policy.load(tmp_path)
     with pytest.raises(UserError, match="num_envs 8 is no multiple of teacher.minibatches 3"):
         dataclasses.replace(TEACHER, minibatches=3)
+
+
+def test_kl_does_not_steer_a_policy_that_does_not_learn_yet():
+    """While the critic warms up the policy stands still, and its KL says nothing of its step size."""
+    config = dataclasses.replace(TEACHER, target_kl=0.02, learning_rate=2e-5, critic_warmup=2)
+    key, mesh = jax.random.key(0), devices.make_mesh()
+    networks = learner.make_networks(config)
+    params = learner.network_params(networks.policy_network.init(key), networks.value_network.init(key))
+    normalizer = running_statistics.init_state(specs.Array((40,), jnp.dtype("float32")))
+    seen = jax.random.normal(key, (8, 4, 40))
+    act = ppo_networks.make_inference_fn(networks)((normalizer, params.policy))
+    action, extras = act(seen, key)
+    steps = jnp.ones((8, 4))
+    data = types.Transition(
+        observation=seen, action=action, reward=jax.random.normal(key, (8, 4)), discount=steps,
+        next_observation=seen,
+        extras={"policy_extras": extras, "state_extras": {"truncation": 0 * steps}},
+    )  # fmt: skip
+    begun = learner.make_optimizer(config).init(params)
+    zero = jnp.zeros((), jnp.int32)
+    state: Any = learner.LearnerState(params, normalizer, begun, None, key, zero, zero)  # pyright: ignore
+    improve = jax.jit(lambda state: learner.improve(config, mesh, state, data, {})[:2])
+    rates = []
+    for _ in range(3):
+        state, metrics = improve(state)
+        rates.append(float(metrics["policy/learning_rate"]))
+    assert rates[:2] == pytest.approx([2e-5, 2e-5]) and rates[2] <= 1.01e-4

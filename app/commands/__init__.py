@@ -28,7 +28,7 @@ from app.commands.student import Deploy, Export, StudentEval, StudentPerception,
 from app.commands.study import StudyCauses, StudyTable2
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
 from app.commands.trials import DeployTrials
-from ddgrasp import config_file
+from ddgrasp import artifacts, config_file
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
@@ -115,7 +115,7 @@ def parse(name: str, args: Sequence[str]) -> Command:
     elif cls is Calibrate:
         options["default"] = Calibrate(get_preset(_option(args, "--preset") or DEFAULT_PRESET))
     elif cls is TeacherEval:
-        options["default"] = with_world_of(next((shipped(arg) for arg in args if _is_run(arg)), None))
+        options["default"] = with_world_of(_teacher_s_run(args))
     program, whole = f"ddgrasp {name}", HELP_ALL in args
     given = ["--help" if arg == HELP_ALL else arg for arg in args]
     read = partial(tyro.cli, cls, prog=program, args=given, **options)
@@ -130,9 +130,10 @@ def _found(command: Any) -> Any:
     return replace(command, **{name: shipped(path) for name, path in given.items() if isinstance(path, Path)})
 
 
-def _is_run(arg: str) -> bool:
-    """Whether an argument is a folder, which options of `teacher eval` are not."""
-    return bool(arg) and arg[0] != "-" and shipped(arg).is_dir()
+def _teacher_s_run(args: Sequence[str]) -> Path | None:
+    """The run among the arguments of `teacher eval`, wherever it stands."""
+    places = (shipped(arg) for arg in args if arg and arg != _option(args, "--out"))
+    return next((place for place in places if artifacts.is_finished(place / "teacher")), None)
 
 
 def _base(args: Sequence[str], default_preset: str) -> Config:

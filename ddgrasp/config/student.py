@@ -185,8 +185,9 @@ class StudentTrainingConfig(Section, name="student.training"):
     """Weight of the diffusion loss on pictures; 0 trains the head on what perception reports instead."""
     held_weight: Annotated[float, Range(0, 1000, above=True)] = 0.4
     """How often a step with the object in the hand is drawn, relative to one before the grasp."""
-    demo_held_steps: Annotated[int, Range(1, 10_000)] = 20
-    """Steps of a demo kept from the grasp on: the lift and a little of the hold."""
+    demo_held_steps: Annotated[int, Range(0, 10_000)] = 20
+    """Steps of a demo kept from the grasp on: the lift and a little of the hold; 0 keeps the
+    approach alone."""
     demo_stretch_steps: Annotated[int, Range(0, 10_000)] = 0
     """Steps in a row kept of each demo, from a random one on; 0 keeps all. A demo is one placement of object
     and camera: with short stretches as many pictures for the generator show more of them."""

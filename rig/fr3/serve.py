@@ -207,7 +207,7 @@ def _listen(host: str, request: Any) -> socketserver.ThreadingTCPServer:
             try:
                 for line in self.rfile:
                     asked = json.loads(line)
-                    slowed = asked["on"] if asked.get("ask") == "slow" else slowed
+                    slowed = asked.get("on") if asked.get("ask") == "slow" else slowed
                     self.wfile.write(json.dumps(request(asked)).encode() + b"\n")
             finally:
                 if slowed:  # who asked for it has gone
