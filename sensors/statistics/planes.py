@@ -4,8 +4,6 @@ A stereo camera's matches bend flat surfaces into bumps some 10 to 20 pixels wid
 takes them for the surface; a plane does not.
 """
 
-import warnings
-
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -51,18 +49,19 @@ def on_planes(inverse: Float[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
 
 def _largest(inverse: np.ndarray, left: Bool[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"] | None:
     """(H, W) the plane that most of the pixels `left` are near; None if there is no large one."""
-    from sklearn.exceptions import UndefinedMetricWarning
     from sklearn.linear_model import RANSACRegressor
+
+    from sensors.statistics.plane import Plane
 
     rows, columns = np.nonzero(left[::STRIDE_PX, ::STRIDE_PX])
     if len(rows) < max(_POINTS, LEAST_SHARE * left[::STRIDE_PX, ::STRIDE_PX].size):
         return None
     pixels = np.stack([rows, columns], axis=1) * STRIDE_PX
     values = inverse[pixels[:, 0], pixels[:, 1]]
-    search = RANSACRegressor(residual_threshold=TOLERANCE_PER_M, max_trials=_TRIALS, random_state=0)
-    with warnings.catch_warnings():  # of a trial that a single pixel is near
-        warnings.simplefilter("ignore", UndefinedMetricWarning)
-        search.fit(pixels, values)
+    search = RANSACRegressor(
+        Plane(), min_samples=_POINTS, residual_threshold=TOLERANCE_PER_M, max_trials=_TRIALS, random_state=0
+    )
+    search.fit(pixels, values)
     everywhere = np.indices(inverse.shape).reshape(2, -1).T
     return search.predict(everywhere).reshape(inverse.shape).astype(np.float32)
 
