@@ -113,7 +113,7 @@ class GraspEnv(MjxEnv):
             hold_count=jnp.zeros((), jnp.int32),
             grasped=jnp.zeros((), bool),
             total_reward=jnp.zeros(()),
-            latency=self._latency(rng, qpos),
+            latency=self._latency(rng, qpos, rest),
         )
         obs = self._get_obs(state, episode)
         metrics = {f"reward/{name}": jnp.zeros(()) for name in rewards.TERMS}
@@ -191,13 +191,15 @@ class GraspEnv(MjxEnv):
         grip_pose = kinematics.grip_pose(qpos[QPOS.arm], jnp)
         return rewards.distances(self.config.reward, qpos, grasp_pos, grasp_quat, grip_pose)
 
-    def _latency(self, rng, qpos) -> Latency | None:
-        """At the start: the robot holds its pose, gripper open."""
+    def _latency(self, rng, qpos, rest_height) -> Latency | None:
+        """At the start: the robot holds its pose, gripper open, or closed on what it starts with in hand."""
         share = self.config.random.latency_share
         if share == 0:
             return None
         late = jax.random.uniform(jax.random.fold_in(rng, 1)) < share
-        return Latency(late, grasp_math.controls(qpos[QPOS.arm], jnp.zeros(contract.ACTION_SIZE), jnp))
+        in_hand = jnp.where(qpos[QPOS.object_pos][2] > rest_height, 1.0, -1.0)
+        still = jnp.zeros(contract.ACTION_SIZE).at[ACTION.gripper].set(in_hand)
+        return Latency(late, grasp_math.controls(qpos[QPOS.arm], still, jnp))
 
     def _delayed(self, latency: Latency | None, controls) -> tuple[jax.Array, Latency | None]:
         """The controls in force now, and what is on its way then."""

@@ -9,7 +9,7 @@ import pytest
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig, WorldConfig
-from ddgrasp.layout import OBSERVATION, QPOS
+from ddgrasp.layout import OBSERVATION, QPOS, QVEL
 from mjx_envs import grasp_math, kinematics, randomize, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import AutoReset, GraspEnv
@@ -243,3 +243,25 @@ def test_latency_delays_commands_by_one_step_in_its_share_of_the_episodes():
     assert np.abs(prompt[0, :, 3]).min() > 0.01 and prompt[0, :, 7].max() < -0.004
     assert np.abs(delayed[0]).max() < 1e-3  # holds still
     np.testing.assert_allclose(delayed[1], np.broadcast_to(prompt[0, :1], delayed[1].shape), atol=1e-3)
+
+
+def test_a_late_command_does_not_drop_what_an_episode_starts_with_in_the_hand():
+    random = replace(NOTHING, held_share=1.0, latency_share=1.0)
+    env = GraspEnv(WorldConfig(objects=("cube",), random=random))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 32))
+    close = jnp.zeros((32, 8)).at[:, 7].set(1.0)
+    height = np.asarray(state.data.qpos[:, QPOS.object_pos][:, 2])
+    step = jax.jit(jax.vmap(env.step))
+    for _ in range(5):
+        state = step(state, close)
+    np.testing.assert_allclose(state.data.qpos[:, QPOS.object_pos][:, 2], height, atol=0.01)
+
+
+def test_an_episode_whose_physics_blows_up_ends():
+    """On the C engine, which left alone would go on from its first state."""
+    env = GraspEnv(WorldConfig(objects=("cube",)))
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    thrown = state.replace(data=replace(state.data, qvel=state.data.qvel.at[QVEL.object_angular].set(1e12)))
+    after = jax.jit(env.step)(thrown, jnp.zeros(8))
+    assert after.done == 1.0 and after.info["truncation"] == 0.0
+    np.testing.assert_array_equal(after.data.qpos, state.data.qpos)

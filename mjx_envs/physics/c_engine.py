@@ -19,6 +19,8 @@ class CpuPhysics:
 
     def __init__(self, sim_dt_s: float, substeps: int, layout: SlotLayout):
         self._model = scene.build_model(sim_dt_s, layout)
+        # What blew up stays so and ends the episode, as with MJX; MuJoCo would go on from its first state.
+        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._substeps = substeps
         self._index = ModelIndex(self._model)
         self._batches: dict[tuple[int, int], _HostBatch] = {}
