@@ -25,6 +25,7 @@ from ddgrasp.config import (
     HeadConfig,
     HostsConfig,
     PriorSource,
+    RandomConfig,
     SamplingConfig,
     Section,
     SensorConfig,
@@ -162,6 +163,10 @@ def test_stages_that_do_not_fit_each_other_are_refused():
         ({"world": dataclasses.replace(config.world, camera_scale=0.125)}, "the camera's crop window has 56"),
         ({"export": dataclasses.replace(config.export, ddim_steps=51)}, "export.ddim_steps is 51; expected"),
         ({"deploy": dataclasses.replace(config.deploy, execute_steps=3)}, "deploy.execute_steps is 3"),
+        (
+            {"world": WorldConfig(random=RandomConfig(held_share=0.1))},
+            "world.random.held_share is 0.1; expected 0 in a run: .*by teacher.held_share",
+        ),
     ):
         with pytest.raises(UserError, match=expected):
             dataclasses.replace(config, **changes)
@@ -199,11 +204,14 @@ def test_choices_are_those_that_the_code_knows():
         "demos collect --demos.noise-share 1.5 => demos.noise_share is 1.5; expected 0 to 1",
         "demos collect --demos.parallel 1000000 => demos.parallel is 1000000; expected at most 65536",
         "record --record.stereo.block-px 4 => record.stereo.block_px is 4; expected an odd number",
+        "record --record.stereo.flat-window-px 8 => record.stereo.flat_window_px is 8; expected an odd number",
+        "record --record.stereo.left-right-px 0 => left_right_px is 0; expected 1 to 100",
         "record --record.frames -1 => record.frames is -1; expected at least 1",
         "record import x --depth-unit-m 5 => --depth-unit-m is 5.0; expected 0 to 1",
         "ddg fit --ddg.unet.widths 8 8 => expected one number per level in each",
         "ddg fit --ddg.training.learning-rate inf => expected a finite number",
         "ddg fit --ddg.prior.in-sim deph => Unknown ddg.prior.in_sim 'deph'. Did you mean 'depth'?",
+        "ddg fit --preset laptop --ddg.sampling.sampler progressive => give --ddg.sampling.spacing quadratic",
         "ddg fit --data nowhere => --data is nowhere, which does not exist",
         "ddg sample --model x --data x --seed -1 => --seed is -1; expected at least 0",
         "ddg distil --model x --data x --out x --evaluations 0 => --evaluations is 0; expected at least 1",

@@ -28,7 +28,7 @@ SEED = 2
 
 
 def test_ppo_from_nothing_learns_to_lift_and_hold():
-    config = Config("test", world=WORLD, teacher=TEACHER, seed=SEED)
+    config = Config("test", teacher=TEACHER, seed=SEED)
     env = AutoReset(GraspEnv(WORLD))
     state, iterate = initial(config, env)(), compile_iteration(config, env)
 

@@ -124,6 +124,7 @@ class Config(Section):
     def check(self) -> None:
         """See `Section.check`."""
         self._check_picture()
+        self._check_exploring_starts()
         head = self.student.head
         if self.export.ddim_steps > head.diffusion_steps:
             raise self.export.error(
@@ -131,6 +132,14 @@ class Config(Section):
             )
         if self.deploy.execute_steps > head.chunk:
             raise self.deploy.error("execute_steps", f"1 to {head.chunk} (student.head.chunk), or 0")
+
+    def _check_exploring_starts(self) -> None:
+        """PPO takes the teacher's; the world's would be in demos and trials alone."""
+        for name in ("pregrasp_share", "pregrasp_turn_rad", "held_share"):
+            if getattr(self.world.random, name) > 0:
+                raise self.world.random.error(
+                    name, f"0 in a run: only training has exploring starts, by teacher.{name}"
+                )
 
     def _check_picture(self) -> None:
         """The student's picture is cut out of the camera's crop window, never enlarged."""

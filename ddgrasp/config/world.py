@@ -69,12 +69,13 @@ class RandomConfig(Section, name="world.random"):
     joint_rad: Annotated[float, Range(0, math.pi)] = 0.1
     """Initial arm joints around home."""
     pregrasp_share: Share = 0.0
-    """Share of episodes that start with the hand above the object (exploring starts, for training only)."""
+    """Share of episodes that start with the hand above the object: exploring starts, which in a run only
+    training has, by teacher.pregrasp_share."""
     pregrasp_turn_rad: Annotated[float, Range(0, math.pi / 2)] = 0.0
-    """The hand's yaw there, off the grasp's by up to this."""
+    """The hand's yaw there, off the grasp's by up to this: in a run by teacher.pregrasp_turn_rad."""
     held_share: Share = 0.0
-    """Share of episodes that start with the object in the hand, anywhere up to the lift target (exploring
-    starts, for training only)."""
+    """Share of episodes that start with the object in the hand, anywhere up to the lift target: in a run by
+    teacher.held_share."""
     other_pose_share: Share = 0.5
     """Share of episodes in which an object that can both lie and stand rests in its other pose."""
     size: Annotated[float, Range(0, 0.5)] = 0.05
