@@ -127,15 +127,17 @@ class CameraProfile:
     """The window a policy sees (450 x 580 at scale 1, paper III-C1)."""
 
     def scaled(self, scale: float) -> "CameraProfile":
-        """The same camera with `scale` times the pixels per side (0.25: 1280 -> 320)."""
+        """The same camera with `scale` times the pixels per side (0.25: 1280 -> 320), rounded; what rounding
+        adds or takes is shared by both sides, so that a centred axis stays so."""
+        width_px, height_px = round(self.width_px * scale), round(self.height_px * scale)
         return replace(
             self,
-            width_px=round(self.width_px * scale),
-            height_px=round(self.height_px * scale),
+            width_px=width_px,
+            height_px=height_px,
             fx_px=self.fx_px * scale,
             fy_px=self.fy_px * scale,
-            cx_px=self.cx_px * scale,
-            cy_px=self.cy_px * scale,
+            cx_px=width_px / 2 + (self.cx_px - self.width_px / 2) * scale,
+            cy_px=height_px / 2 + (self.cy_px - self.height_px / 2) * scale,
             crop_height_px=round(self.crop_height_px * scale),
             crop_width_px=round(self.crop_width_px * scale),
         )

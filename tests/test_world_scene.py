@@ -1,5 +1,7 @@
 """Scene, objects, kinematics and the task's geometry, by value."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -107,3 +109,16 @@ def test_observation_has_forty_numbers_in_the_contracts_order():
     np.testing.assert_allclose(obs[18:21], kinematics.grip_pose(qpos[:7])[0])
     np.testing.assert_array_equal(obs[25:32], qpos[9:16])
     assert obs[39] == pytest.approx(np.log(3))
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.25, 1 / 3, 0.5, 0.7, 1.0])
+def test_the_camera_looks_through_its_picture_s_centre_at_every_scale(scale):
+    """The FR3 rig's renderer draws no other."""
+    camera = contract.D455.scaled(scale)
+    assert (camera.cx_px, camera.cy_px) == (camera.width_px / 2, camera.height_px / 2)
+    assert camera.fx_px / camera.width_px == pytest.approx(contract.D455.fx_px / 1280, rel=2e-3)
+
+
+def test_a_camera_off_its_centre_stays_off_it():
+    camera = replace(contract.D455, cx_px=contract.D455.cx_px + 8.0).scaled(0.25)
+    assert camera.cx_px == camera.width_px / 2 + 2.0
