@@ -119,12 +119,13 @@ class Progress:
             return
         plain = {name: float(value) for name, value in values.items()}
         self.directory.mkdir(parents=True, exist_ok=True)
-        with open(self.directory / CURVES, "a") as file:
-            file.write(json.dumps(to_json({"step": int(step), **plain})) + "\n")
         if self._writer is None:
             from tensorboardX import SummaryWriter
 
+            _end_line(self.directory / CURVES)
             self._writer = SummaryWriter(str(self.directory / "tb"))
+        with open(self.directory / CURVES, "a") as file:
+            file.write(json.dumps(to_json({"step": int(step), **plain})) + "\n")
         for name, value in plain.items():
             self._writer.add_scalar(name, value, int(step))
 
@@ -233,6 +234,13 @@ def read_curves(directory: Path | str) -> dict[str, list[tuple[int, float]]]:
             if value is not None:
                 curves.setdefault(name, {})[step] = value
     return {name: sorted(points.items()) for name, points in curves.items()}
+
+
+def _end_line(path: Path) -> None:
+    """Ends a line that a crash cut off, so that the next one is not lost with it."""
+    with contextlib.suppress(FileNotFoundError), open(path, "rb+") as file:
+        if file.read()[-1:] not in (b"", b"\n"):
+            file.write(b"\n")
 
 
 def _format(value: Any) -> str:

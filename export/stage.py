@@ -21,7 +21,7 @@ BATCH_ONE_CHECKS = 4
 
 
 def run(job: Job) -> Artifact:
-    """Writes the run's student as one ONNX file; a finished one is made again (it takes seconds).
+    """Writes the run's student as one ONNX file (seconds).
 
     Raises:
         UserError: no finished student, or ONNX and JAX disagree by more than config.export.max_abs_diff

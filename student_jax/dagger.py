@@ -31,6 +31,8 @@ from student_jax.depth_source import DepthSource, check_demos
 from student_jax.policy import PARAMS_FILE, init_params
 
 PLAN = "plan.json"
+ACTED = "acted.json"
+"""How the last round of DAgger went that was acted, for one that is interrupted after that."""
 CHECKPOINTS = "checkpoints"
 """Folder of the unfinished fit on pictures; a folder in it per phase."""
 LOG_EVERY = 20
@@ -124,7 +126,6 @@ class Trainer:
         """One round: roll out if that was not done yet, then fit on everything."""
         student = self._student
         wanted = demo_count + number * student.dagger.episodes
-        measured = {}
         if len(self._store) < wanted:
             first = len(self._store)
             share = student.dagger.teacher_share * (1 - (number - 1) / max(1, student.dagger.rounds - 1))
@@ -141,9 +142,16 @@ class Trainer:
                     key = jax.random.fold_in(key, there)
                 episodes = roller.run(key, actor, lambda _: task.advance())
             frames_io.add_rollouts(self._store, episodes, actor.seen, self._window)
-            measured["rollout_success"] = rate = float(episodes.success.mean())
+            rate = float(episodes.success.mean())
+            atomic_write_json(self._directory / ACTED, {"round": number, "rollout_success": rate})
             self._progress.note(f"round {number}: {rate:.0%} success with the teacher taking {share:.0%}")
-        return measured | self._fit(f"dagger-{number}", student.dagger.steps)
+        return self._acted(number) | self._fit(f"dagger-{number}", student.dagger.steps)
+
+    def _acted(self, number: int) -> dict[str, float]:
+        """Success of round `number`'s episodes, by this attempt or the one before; nothing if it is lost."""
+        path = self._directory / ACTED
+        last = json.loads(path.read_text()) if path.exists() else {}
+        return {"rollout_success": last["rollout_success"]} if last.get("round") == number else {}
 
     def _fit(self, phase: str, steps: int) -> dict[str, float]:
         """`steps` optimiser steps on all frames, from the current parameters."""

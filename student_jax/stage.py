@@ -16,7 +16,7 @@ from demos.store import EpisodeStore
 from mjx_envs.render.batch_render import check_renderer
 from ppo import policy as teacher_policy
 from student_jax import evaluate, frames_io, pretrained_encoder
-from student_jax.dagger import Trainer
+from student_jax.dagger import ACTED, Trainer
 from student_jax.depth_source import make_source
 from student_jax.head import POSES
 
@@ -33,7 +33,8 @@ def run(job: Job) -> Artifact:
     metrics = evaluate.closed_loop(config, teacher, source, trainer.params, progress)
     metrics |= {"tried": trainer.history, "frames": trainer.frame_count, "encoder_weights": encoder_weights}
     shutil.rmtree(directory / frames_io.CACHE, ignore_errors=True)
-    (directory / POSES).unlink(missing_ok=True)
+    for name in (POSES, ACTED):
+        (directory / name).unlink(missing_ok=True)
     loaded = config.student.init_from and not _trains(config)
     return job.finish(metrics, origin="loaded" if loaded else "trained")
 

@@ -244,6 +244,10 @@ def test_curves_count_a_repeated_step_once_and_skip_a_torn_line(tmp_path):
     with open(tmp_path / "curves.jsonl", "a") as file:
         file.write('{"step": 3, "lo')
     assert read_curves(tmp_path) == {"loss": [(1, 3.0), (2, 1.5)], "success": [(2, 0.5)]}
+    third = Progress(tmp_path, quiet=True)
+    third.scalars(3, loss=1.0)
+    third.close()
+    assert read_curves(tmp_path)["loss"] == [(1, 3.0), (2, 1.5), (3, 1.0)]
     assert list((tmp_path / "tb").glob("events*"))
 
 

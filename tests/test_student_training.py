@@ -11,6 +11,7 @@ import pytest
 from ddgrasp import contract
 from ddgrasp.config import (
     Config,
+    DaggerConfig,
     EncoderConfig,
     HandViewConfig,
     HeadConfig,
@@ -18,6 +19,7 @@ from ddgrasp.config import (
     StudentTrainingConfig,
 )
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json
 from ddgrasp.gripper import WidthChange
 from ddgrasp.layout import OBSERVATION, closes
 from ddgrasp.progress import Progress
@@ -26,7 +28,7 @@ from mjx_envs.camera import nominal_camera
 from student_jax import train
 from student_jax.act import StudentActor, keep_clean
 from student_jax.augment import disparity_noise, unseen_objects
-from student_jax.dagger import CHECKPOINTS, Trainer
+from student_jax.dagger import ACTED, CHECKPOINTS, Trainer
 from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gripper, with_change
 from student_jax.frames_io import useful_steps
 from student_jax.policy import Aux, init_params, position_to_world
@@ -189,6 +191,19 @@ def test_a_fit_interrupted_and_resumed_ends_as_an_uninterrupted_one(tmp_path):
     again._phase("demos", lambda: again._fit("demos", 5))
     jax.tree.map(np.testing.assert_array_equal, again.params, whole.params)
     assert again.history == whole.history and not folder.exists()
+
+
+def test_a_round_interrupted_after_its_episodes_keeps_their_success(tmp_path):
+    student = dataclasses.replace(CONFIG, dagger=DaggerConfig(rounds=2, episodes=1, steps=0))
+    config = Config("test", student=student)
+    trainer = Trainer(config, cast(Any, None), cast(Any, None), tmp_path, Progress(quiet=True))
+    for episode in columns_of((6, 6)):
+        steps = dict(zip(("depth_mm", "state", "action", "observation", "held"), episode, strict=True))
+        trainer._store.append(steps, {"from_demo": np.bool_(False)})
+    assert trainer._dagger(1, 1) == {}
+    atomic_write_json(tmp_path / ACTED, {"round": 1, "rollout_success": 0.25})
+    assert trainer._dagger(1, 1) == {"rollout_success": 0.25}
+    assert trainer._dagger(2, 0) == {}
 
 
 def test_the_head_learns_actions_from_poses():
