@@ -17,7 +17,7 @@ from ddgrasp.layout import ACTION, closes
 from deploy import kinematics
 
 _BISECTIONS = 12
-"""Halvings when a step must end inside the workspace: 1/4096 of the step, below 0.1 mm."""
+"""Halvings when a step is too long for the hand: 1/4096 of the step, below 0.1 mm."""
 APPROACH = "approach"
 """Cause of a change by which a hand that comes down makes a part of a step, straight on."""
 _NEWTON_STEPS = 3
@@ -126,31 +126,45 @@ class SafetyFilter:
 
     def _limit_step(self, q_rad: np.ndarray, step: np.ndarray, causes: list[str]) -> np.ndarray:
         """(7,) `step` within acceleration, velocity and position limits; the later one wins."""
-        limits, dt = self.limits, self.limits.period_s
-        change = np.array(limits.acceleration_rad_s2) * dt * dt
-        limited = np.clip(step, self._last_step_rad - change, self._last_step_rad + change)
-        step = self._noted(limited, step, "joint_acceleration", causes)
-        largest = np.array(limits.velocity_rad_s) * dt
+        step = self._noted(self._accelerated(step), step, "joint_acceleration", causes)
         # All joints alike: the hand goes where it was told to, more slowly.
-        slower = min(1.0, float((largest / np.maximum(np.abs(step), 1e-9)).min()))
+        slower = min(1.0, float((self._largest_rad / np.maximum(np.abs(step), 1e-9)).min()))
         step = self._noted(step if slower == 1.0 else slower * step, step, "joint_velocity", causes)
-        step = self._noted(self._gently_down(q_rad, step), step, APPROACH, causes)
-        # A joint measured outside its range may only come back, and no faster than the limit above.
-        room_down = np.minimum(np.array(limits.lower_rad) - q_rad, largest)
-        room_up = np.maximum(np.array(limits.upper_rad) - q_rad, -largest)
-        room_down, room_up = -self._braked(-room_down), self._braked(room_up)
-        return self._noted(np.clip(step, room_down, room_up), step, "joint_position", causes)
+        step = self._noted(self._in_room(q_rad, step), step, "joint_position", causes)
+        # Last: a joint cut by itself may be the one that was raising the hand.
+        return self._noted(self._gently_down(q_rad, step), step, APPROACH, causes)
+
+    @property
+    def _largest_rad(self) -> np.ndarray:
+        return np.array(self.limits.velocity_rad_s) * self.limits.period_s
+
+    def _accelerated(self, step: np.ndarray) -> np.ndarray:
+        """(7,) `step`, no further from the last one than a joint may accelerate."""
+        change = np.array(self.limits.acceleration_rad_s2) * self.limits.period_s**2
+        return np.clip(step, self._last_step_rad - change, self._last_step_rad + change)
+
+    def _in_room(self, q_rad: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """(7,) `step`, from which every joint can still stop before its limit.
+
+        A joint measured outside its range may only come back, no faster than the largest step.
+        """
+        room_down = np.minimum(np.array(self.limits.lower_rad) - q_rad, self._largest_rad)
+        room_up = np.maximum(np.array(self.limits.upper_rad) - q_rad, -self._largest_rad)
+        return np.clip(step, -self._braked(-room_down), self._braked(room_up))
 
     def _gently_down(self, q_rad: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """(7,) `step`, shortened so that the grip point comes down about as fast as it may where low."""
+        """(7,) `step`, shortened so that the grip point comes down no faster than it may where low."""
         limits = self.limits
         if not limits.approach_below_m:
             return step
         way_m = limits.approach_m_s * limits.period_s
-        here_m, there_m = kinematics.grip_position(q_rad)[2], kinematics.grip_position(q_rad + step)[2]
-        if there_m >= limits.approach_below_m or here_m - there_m <= way_m:
-            return step
-        return step * way_m / (here_m - there_m)
+        here_m = kinematics.grip_position(q_rad)[2]
+
+        def gentle(part: np.ndarray) -> bool:
+            there_m = kinematics.grip_position(q_rad + part)[2]
+            return bool(there_m >= limits.approach_below_m or here_m - there_m <= way_m)
+
+        return step if gentle(step) else _shorten(step, gentle)
 
     def _braked(self, room_rad: np.ndarray) -> np.ndarray:
         """(7,) the longest step towards a limit `room_rad` (7,) away after which the joint can still stop.
@@ -191,12 +205,11 @@ class SafetyFilter:
 
     def _slide(self, q_rad: np.ndarray, step: np.ndarray) -> np.ndarray:
         """(7,) `step` without what leads out of the box (Newton steps), within the other limits."""
-        largest = np.array(self.limits.velocity_rad_s) * self.limits.period_s
         for _ in range(_NEWTON_STEPS):
             target = q_rad + step
             correction = np.linalg.pinv(kinematics.position_jacobian(target)) @ -self._overshoot_m(target)
-            target = np.clip(target + correction, self.limits.lower_rad, self.limits.upper_rad)
-            step = np.clip(target - q_rad, -largest, largest)
+            step = np.clip(self._accelerated(step + correction), -self._largest_rad, self._largest_rad)
+            step = self._in_room(q_rad, step)
         return step
 
     def _overshoot_m(self, q_rad: np.ndarray) -> np.ndarray:

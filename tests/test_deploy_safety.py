@@ -1,5 +1,6 @@
 """Every limit of the safety filter, and that each change is counted."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -200,6 +201,30 @@ def test_non_finite_action_is_refused(bad, place):
     with pytest.raises(NonFiniteAction):
         filter_.target(HOME, values)
     assert filter_.counts.commands == 0
+
+
+def test_from_any_pose_a_step_keeps_the_curve_of_braking_and_the_slow_way_down():
+    """Those of an FR3 at all of its speed, sliding along the workspace's borders included."""
+    config = get_preset("debug")
+    info = policy_metadata.describe(config.student, config.export, config.world.profile)
+    fast = replace(config.deploy, franka=replace(config.deploy.franka, dynamics=1.0))
+    limits = safety_filter(fast, info, "franka").limits
+    rng, lower, upper = np.random.default_rng(0), np.array(limits.lower_rad), np.array(limits.upper_rad)
+    change = np.array(limits.acceleration_rad_s2) * limits.period_s**2
+    causes, low = Counter(), 0
+    for _ in range(500):
+        filter_, q = SafetyFilter(limits, 0.1), np.clip(HOME + rng.normal(0, 0.5, 7), lower, upper)
+        target, _, changed = filter_.target(q, rng.choice([-1.0, 1.0], 8))
+        step = target - q
+        room = np.where(step > 0, upper - q, q - lower)
+        assert (np.abs(step) <= filter_._braked(room) + 1e-9).all()
+        assert (np.abs(step) <= change + 1e-9).all()
+        here_m, there_m = (kinematics.grip_position(x)[2] for x in (q, target))
+        if "workspace" not in changed and there_m < limits.approach_below_m:
+            low += 1
+            assert here_m - there_m <= limits.approach_m_s * limits.period_s + 1e-9
+        causes.update(changed)
+    assert min(causes["workspace"], causes["joint_position"], low) > 20
 
 
 def test_a_joint_comes_to_its_limit_no_faster_than_it_can_brake():
