@@ -202,18 +202,32 @@ class EpisodeNoise:
         root, rest = (self._normals.array(np.sqrt(part)) for part in (share, 1 - share))
         return root * self._shared + rest * self._normals.draw(self._shape(self._count))
 
-    def reset(self, cameras: Sequence[int] | None = None) -> None:
-        """Begins new episodes, of the given cameras or of all. UserError for what is no list of cameras."""
+    def reset(self, cameras: Sequence[int] | Sequence[bool] | None = None) -> None:
+        """Begins new episodes, of the given cameras or of all: their numbers, or a mask of all of them.
+
+        UserError for what is neither.
+        """
         if self._shared is None:
             return
         try:
-            chosen = list(range(self._count)) if cameras is None else [int(number) for number in cameras]
+            chosen = list(range(self._count)) if cameras is None else self._numbers(cameras)
         except (TypeError, ValueError):
-            raise UserError(f"Cameras {cameras!r} are to be reset; expected numbers, as in [0, 2].") from None
+            raise UserError(
+                f"Cameras {cameras!r} are to be reset; expected numbers, as in [0, 2], or a mask of "
+                f"{self._count}."
+            ) from None
         if not all(0 <= number < self._count for number in chosen):
             raise UserError(f"Cameras {chosen} are to be reset; there are 0 to {self._count - 1}.")
         if chosen:
             self._shared[chosen] = self._normals.draw(self._shape(len(chosen)))
+
+    def _numbers(self, cameras: Sequence[int] | Sequence[bool]) -> list[int]:
+        given = np.asarray(cameras)
+        if given.dtype != bool:
+            return [int(number) for number in cameras]
+        if given.shape != (self._count,):
+            raise ValueError
+        return np.flatnonzero(given).tolist()
 
     def _shape(self, count: int) -> tuple[int, ...]:
         return (count, self._info.planes(self._steps), self._info.height_px, self._info.width_px)

@@ -41,12 +41,13 @@ class DryRun:
         return state
 
     def command(self, q_target_rad: Float[np.ndarray, "7"], close: bool) -> None:
-        """Keeps it and says it: joint steps in mrad, where the grip point would go, the gripper."""
+        """Keeps it and says it: where the grip point is, joint steps in mrad, where they would take it, the
+        gripper."""
         self.sent.append(Sent(self._q_rad.copy(), q_target_rad.copy(), close))
         steps = " ".join(f"{1e3 * step:+4.0f}" for step in q_target_rad - self._q_rad)
-        x, y, z = kinematics.grip_position(q_target_rad)
+        here, there = (_metres(kinematics.grip_position(q)) for q in (self._q_rad, q_target_rad))
         hand = "close" if close else "open"
-        self._say(f"would send {steps} mrad, grip at {x:.3f} {y:.3f} {z:.3f} m, {hand}")
+        self._say(f"grip at {here} m, would send {steps} mrad, to {there} m, {hand}")
 
     def hold(self) -> None:
         """Nothing moves."""
@@ -54,6 +55,10 @@ class DryRun:
     def stop(self) -> None:
         """Disconnects."""
         self._robot.stop()
+
+
+def _metres(place_m: np.ndarray) -> str:
+    return " ".join(f"{value:.3f}" for value in place_m)
 
 
 def draw(sent: Sequence[Sent], limits: SafetyLimits, period_s: float) -> bytes:

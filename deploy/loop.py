@@ -124,7 +124,7 @@ class ControlLoop:
         self._report = LoopReport(settings.period_s, safety=safety.counts)
         self._last_frame_s = -math.inf
         self._held_for = ""
-        self._closed = self._touches = False
+        self._closed = self._touches = self._checked = False
         self._start_s = self._last_s = 0.0
 
     def run(
@@ -197,7 +197,7 @@ class ControlLoop:
         state = self._robot.read_state()
         timings.sense_s.append(time.perf_counter() - started)
         problem = problem or _state_problem(state)
-        self._report.width_m = float(state.width_m)
+        self._report.width_m = float(state.width_m) if np.isfinite(state.width_m) else None
         self._tell_touch(state.met)
         action, own, inferring = None, None, False
         started = time.perf_counter()
@@ -258,12 +258,13 @@ class ControlLoop:
             return frame, f"stale frame: {age}"
         if frame.timestamp_s < previous_s:
             return frame, f"stale frame: older than the one before ({age})"
-        if self._report.steps == 0:
+        if not self._checked:
             self._check_camera(frame)
+            self._checked = bool(np.any(frame.depth > 0))
         return frame, self._policy.check_frame(frame.depth)
 
     def _check_camera(self, frame: Frame) -> None:
-        """A camera that can never fit is the user's to change, before anything moves."""
+        """A camera that can never fit is the user's to change, before the policy moves anything."""
         problem = self._policy.check_fit(frame.depth) or self._policy.check_unit(frame.depth)
         if problem:
             raise UserError(
@@ -293,7 +294,7 @@ class ControlLoop:
         self._policy.forget()
         self._pace.forget()
         if self._retry is not None:
-            self._retry.reset()
+            self._retry.held()
         self._report.holds += 1
         kind = reason.split(":")[0]
         if kind != self._held_for:
@@ -315,7 +316,8 @@ class ControlLoop:
         """Says so if the hand was told to close and has nothing in it."""
         if not self._closed:
             return
-        width_m = self._report.width_m = float(self._robot.read_state().width_m)
+        width_m = float(self._robot.read_state().width_m)
+        self._report.width_m = width_m if np.isfinite(width_m) else None
         if width_m < EMPTY_WIDTH_M:
             self._log("empty", f"the gripper closed to {1e3 * width_m:.1f} mm: nothing in the hand")
 

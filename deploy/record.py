@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 from ddgrasp import contract
 from ddgrasp.depth import to_millimetres
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_bytes, atomic_write_text
+from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from deploy.interfaces import Camera, Filmed, Judge
 from deploy.loop import Step
 from rig.film import Film, contact_sheet
@@ -97,11 +97,11 @@ class DeploymentRecord:
         for row in self._rows:
             if row.get("frame", 0) >= self._written:
                 row.pop("frame", None)
-        atomic_write_text(folder / STEPS_FILE, "".join(json.dumps(row) + "\n" for row in self._rows))
+        atomic_write_text(folder / STEPS_FILE, "".join(json.dumps(to_json(row)) + "\n" for row in self._rows))
         values = {**about, "success": success, "frames": self._written, **report}
         if self._trouble:
             values["frames_lost"] = self._trouble
-        atomic_write_text(folder / REPORT_FILE, json.dumps(values, indent=1, allow_nan=False) + "\n")
+        atomic_write_text(folder / REPORT_FILE, json.dumps(to_json(values), indent=1) + "\n")
         if self._film:
             steps, rgb, depth_mm = zip(*self._film, strict=True)
             film = Film(steps, np.stack(rgb), np.stack(depth_mm))

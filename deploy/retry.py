@@ -127,15 +127,19 @@ class Retry:
         self.reset()
 
     def reset(self) -> None:
-        """Start of an episode, or the arm was held: what was before does not count."""
+        """Start of an episode: what was before does not count."""
+        self.held()
+        self._lifted_steps = 0
+        self._stay_rad: np.ndarray | None = None
+
+    def held(self) -> None:
+        """The arm was held: what was before does not count, except that something is lifted."""
         self.begun = ""
         """Why it took over in the last call, empty if it did not."""
         self.done = False
         """Whether that was because nothing is left to do."""
         self._end()
         self._closed_once = False
-        self._lifted_steps = 0
-        self._stay_rad: np.ndarray | None = None
 
     def __call__(
         self, state: Float[np.ndarray, "8"], met: bool = False, felt_nm: Float[np.ndarray, "7"] | None = None

@@ -37,16 +37,16 @@ def deploy(
 ) -> LoopReport:
     """Run the loop; events go to `say` as they happen, what it did into a folder of `options.out`.
 
-    SIGTERM ends it as Ctrl-C does, and neither cuts the stopping short when it comes again: the robot
-    holds, both devices are stopped, the report comes back. So it does when the robot fails; its `fault`
-    says with what.
+    SIGTERM and a terminal that is closed end it as Ctrl-C does, and none cuts the stopping short when it
+    comes again: the robot holds, both devices are stopped, the report comes back. So it does when the robot
+    fails; its `fault` says with what.
 
     Raises UserError for an unknown name, a combination that cannot work, or a device that is absent.
     """
     _check(options)
     options.out.mkdir(parents=True, exist_ok=True)  # before an arm moves that could not be recorded
     with terminable():
-        return _run(for_devices(config, options), policy_path, options, say)
+        return _run(for_devices(config, options), policy_path, options, _survived(say))
 
 
 def _run(
@@ -88,9 +88,12 @@ def _run(
             finished = not (options.dry_run or report.interrupted)
             success = verdict(camera, _unasked if unattended else ask_success) if finished else None
     except BaseException as error:
-        if loop.report.steps:  # a device that fails in a way of its own costs nothing of what was recorded
-            fault = loop.report.fault or f"{type(error).__name__}: {error}"
+        if not loop.report.steps:
             with contextlib.suppress(OSError):
+                folder.rmdir()
+        else:  # a device that fails in a way of its own costs nothing of what was recorded
+            fault = loop.report.fault or f"{type(error).__name__}: {error}"
+            with contextlib.suppress(OSError, ValueError):
                 kept.finish(folder, {**loop.report.as_dict(), "fault": fault}, None, about)
         raise
     kept.finish(folder, report.as_dict(), success, about)
@@ -102,6 +105,16 @@ def _run(
         atomic_write_bytes(path, dry_run.draw(driven.sent, safety.limits, 1.0 / policy.info.control_hz))
         say(f"drawn: {path}")
     return report
+
+
+def _survived(say: Callable[[str], None]) -> Callable[[str], None]:
+    """`say`, which ends nothing where nobody hears it any more: the terminal may be gone."""
+
+    def quietly(text: str) -> None:
+        with contextlib.suppress(OSError):
+            say(text)
+
+    return quietly
 
 
 def ask_success(question: str) -> bool | None:
@@ -154,10 +167,14 @@ def keep_time_of(robot: Robot, clock: Clock, options: SessionOptions) -> None:
 
 
 def _new_folder(out: Path) -> Path:
-    """One that does not exist, named after the time of day."""
+    """A new one, named after the time of day: two deployments that begin in the same second have two."""
     stamp = _stamp()
-    names = (stamp if not again else f"{stamp}-{again}" for again in itertools.count())
-    return next(folder for name in names if not (folder := out / name).exists())
+    for again in itertools.count():
+        folder = out / (f"{stamp}-{again}" if again else stamp)
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+    raise AssertionError
 
 
 def _stamp() -> str:
@@ -166,8 +183,13 @@ def _stamp() -> str:
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """The first SIGTERM or Ctrl-C is KeyboardInterrupt; a second one does not cut the stopping short."""
-    ending = (signal.SIGTERM, signal.SIGINT)
+    """The first SIGTERM, Ctrl-C or hang-up is KeyboardInterrupt; a second one does not cut stopping short.
+
+    What runs under nohup goes on without its terminal.
+    """
+    ending = [signal.SIGTERM, signal.SIGINT]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        ending.append(signal.SIGHUP)
 
     def interrupt(signum, frame):
         for number in ending:

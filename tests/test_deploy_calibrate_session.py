@@ -78,7 +78,7 @@ class DrawnImager:
     blind = False
 
     def __init__(self, arm: Arm):
-        self._arm, self.calls = arm, []
+        self._arm, self.calls, self.taken = arm, [], 0
         self._rng = np.random.default_rng(0)
 
     def start(self):
@@ -94,6 +94,7 @@ class DrawnImager:
         self.calls.append("stop")
 
     def picture(self):
+        self.taken += 1
         size = (2 * LENS.width_px, 2 * LENS.height_px)
         gray = np.full(size[::-1], 120, np.uint8)
         if not self.blind:
@@ -192,6 +193,39 @@ def test_an_arm_that_stops_ends_the_run_in_one_line(tmp_path, bench):
     with pytest.raises(UserError, match=r"ended at pose \d of 7: the arm stopped itself: .*\.$") as refused:
         session.run(fast(), options(tmp_path), lambda text: None)
     assert "\n" not in str(refused.value) and bench.imager.calls[-1] == "stop"
+
+
+def test_an_arm_that_stops_late_costs_none_of_the_views_before(tmp_path, bench):
+    command = bench.arm.command
+
+    def stops(q_target_rad, close):
+        if bench.imager.taken == 6:
+            raise RobotError("the arm stopped itself: cartesian_reflex (it met something)")
+        command(q_target_rad, close)
+
+    bench.arm.command = stops
+    said: list[str] = []
+    found = session.run(fast(), options(tmp_path), said.append)
+    assert found is not None and len(json.loads((tmp_path / "cal.json").read_text())["views"]) == 6
+    assert any("ended at pose 7 of 7" in line and line.endswith("the views before it") for line in said)
+
+
+def test_after_an_arm_has_met_something_it_goes_back(tmp_path, bench, planned, monkeypatch):
+    """It gave way by itself: pushing on would be another contact."""
+    read = bench.arm.read_state
+
+    def met():
+        state = read()
+        near = 0.03 < np.abs(state.q_rad - planned[3]).max() < 0.2 and len(touches) == 0
+        if near:
+            touches.append(state.q_rad)
+        return replace(state, met="12 N" if near else "")
+
+    touches: list[np.ndarray] = []
+    monkeypatch.setattr(bench.arm, "read_state", met)
+    said: list[str] = []
+    session.run(fast(), options(tmp_path), said.append)
+    assert "pose 4 of 7: not reached, left out: something is in the way" in said and len(touches) == 1
 
 
 def test_after_something_in_the_way_the_arm_goes_back_and_takes_free_ways_alone(

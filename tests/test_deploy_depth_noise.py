@@ -112,7 +112,11 @@ def test_noise_of_an_episode_lasts_and_ends_with_it(generator):
     assert abs(alike(first[0, 1], first[1, 1])) < 0.02
     with pytest.raises(UserError, match=r"Cameras \[2\] are to be reset; there are 0 to 1"):
         noise.reset([2])
-    for wrong in (1, ["a"]):  # the tests' own check of types would stop these at the door
+    before = noise.next()
+    noise.reset([False, True])
+    after = noise.next()
+    assert alike(before[0, 1], after[0, 1]) > 0.7 and abs(alike(before[1, 1], after[1, 1])) < 0.02
+    for wrong in (1, ["a"], [True]):  # the tests' own check of types would stop these at the door
         with pytest.raises(UserError, match="are to be reset; expected numbers, as in"):
             type(noise).reset.__wrapped__(noise, wrong)
     with pytest.raises(UserError, match="steps is 2; this noise was begun with 6"):

@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -19,7 +20,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy import session
 from deploy.clock import SimClock
-from deploy.devices import franka_hand, registry
+from deploy.devices import franka_hand, franka_probe, franka_robot, registry
 from deploy.devices.franka_hand import FrankaHand, HandError
 from deploy.devices.franka_robot import LOST, FrankaRobot
 from deploy.devices.franka_spring import FrankaSpring
@@ -219,16 +220,57 @@ def test_a_stop_that_never_ends_is_the_hand_s_error(monkeypatch):
     gripper.stop_may_go.set()
 
 
-def test_an_arm_without_its_hand_is_told_from_no_arm():
+@pytest.mark.parametrize("answers", [False, True])
+def test_an_arm_without_its_hand_is_told_from_no_arm(monkeypatch, answers):
+    """One that another program has takes the connection and stays silent: franky would wait for ever."""
+    monkeypatch.setattr(franka_probe, "ANSWER_S", 0.3)
     robot = FrankaRobot(FrankaConfig(host="127.0.0.9"), SimClock(), None)
     robot._errors = (RuntimeError,)
 
     def refused(host: str):
+        assert answers
         raise RuntimeError(f"libfranka gripper: Connection to {host} refused")
 
     robot._franky = SimpleNamespace(Gripper=refused)
-    with pytest.raises(UserError, match=r"the arm at '127.0.0.9' answers, its gripper does not \(.*in Desk"):
+    said = "refused" if answers else "timed out"
+    with socket.create_server(("127.0.0.9", franka_probe.GRIPPER_PORT)) as server:
+        if answers:
+            threading.Thread(target=lambda: server.accept()[0].sendall(bytes(14)), daemon=True).start()
+        with pytest.raises(UserError, match=rf"answers, its gripper does not \(.*{said}.*in Desk"):
+            robot._gripper()
+    with pytest.raises(UserError, match=r"its gripper does not \(.*refused"):
         robot._gripper()
+
+
+class Homing:
+    """A hand that homes, or does not; a future of franky's too."""
+
+    def __init__(self, homed: bool | None):
+        self._homed, self.stopped = homed, False
+
+    def homing_async(self) -> "Homing":
+        return self
+
+    def wait(self, timeout: float) -> bool:
+        return self._homed is not None
+
+    def get(self) -> bool | None:
+        return self._homed
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
+def test_a_hand_that_does_not_home_ends_the_start(monkeypatch):
+    monkeypatch.setattr(franka_robot, "HOMING_S", 0.05)
+    robot = FrankaRobot(FrankaConfig(host="127.0.0.9"), SimClock(), None)
+    robot._home(Homing(True))
+    with pytest.raises(HandError, match="homing failed: take away what is between its fingers"):
+        robot._home(Homing(False))
+    never = Homing(None)
+    with pytest.raises(HandError, match="homing did not end within 0.05 s"):
+        robot._home(never)
+    assert never.stopped
 
 
 def test_a_width_that_cannot_be_had_is_the_hand_s_error():

@@ -352,7 +352,7 @@ def test_dry_run_says_and_draws_what_it_would_send_and_moves_nothing(tmp_path, r
     loop = ControlLoop(ScriptedCamera(clock, [depth_mm()]), dry, policy, safety, clock, LoopSettings(0.1))
     assert loop.run(3).fault == ""
     np.testing.assert_allclose(rig.channel.ask("state")["q_rad"], before, atol=2e-3)
-    assert len(dry.sent) == 3 and said[0].startswith("would send  +50   +0")
+    assert len(dry.sent) == 3 and "m, would send  +50   +0" in said[0]
     assert draw(dry.sent, safety.limits, 0.1).startswith(b"\x89PNG")
 
 
@@ -414,7 +414,7 @@ def test_start_asks_first_then_homes_and_moves_slowly_to_the_start_pose():
             robot.start()
         robot.stop()
         np.testing.assert_allclose(rig.channel.ask("state")["q_rad"], away, atol=2e-3)
-        assert "home its gripper and move to the start pose (0.03 rad away) at 5% of its speed" in asked[0]
+        assert "and move to the start pose (0.03 rad away) at 5% of its speed" in asked[0]
         robot, clock = connect(config, asked.append)
         before_s = rig.channel.ask("state")["time_s"]
         robot.start()
@@ -423,6 +423,25 @@ def test_start_asks_first_then_homes_and_moves_slowly_to_the_start_pose():
         fastest_s = 0.03 / (config.franka.start_dynamics * min(contract.PANDA.joint_velocity_rad_s))
         assert state["time_s"] - before_s > fastest_s
         robot.stop()
+
+
+def test_ctrl_c_on_the_way_to_the_start_pose_stops_the_arm(monkeypatch):
+    away = HOME_RAD + np.array([0.5, 0, 0, 0, 0, 0, 0])
+    with Fr3Rig("127.0.0.16", primitive("cube"), q_rad=away) as rig:
+        robot, _ = connect(config_for(rig.host), lambda question: None)
+
+        def on_the_way(arm):
+            while abs(arm.state.q[0] - away[0]) < 0.02:
+                time.sleep(0.01)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(robot, "_wait_at_start", lambda: on_the_way(robot._arm))
+        with pytest.raises(KeyboardInterrupt):
+            robot.start()
+        kept = robot._arm  # whoever still has it does not keep it moving
+        robot.stop()
+        assert stands(rig) and abs(rig.channel.ask("state")["q_rad"][0] - HOME_RAD[0]) > 0.3
+        del kept
 
 
 def test_killed_server_ends_the_lab_s_own_command_with_a_report(tmp_path, open_gl):

@@ -11,6 +11,8 @@ import pytest
 
 from ddgrasp.errors import UserError
 from deploy.clock import RealClock, SimClock
+from deploy.dry_run import DryRun
+from deploy.kinematics import grip_position
 from deploy.loop import ControlLoop, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.safety import SafetyFilter, SafetyLimits
@@ -147,6 +149,24 @@ def test_wrong_unit_is_refused_before_anything_moves(tmp_path):
     with pytest.raises(UserError, match="median 1 cannot be mm"):
         loop.run(max_steps=3)
     assert "command" not in robot.calls
+
+
+def test_the_unit_is_looked_at_in_the_first_frame_that_shows_something(tmp_path):
+    loop, robot, _ = make_loop(tmp_path, ["unplugged", BAD["void"], depth_mm(1)])
+    with pytest.raises(UserError, match="median 1 cannot be mm"):
+        loop.run(max_steps=4)
+    assert "command" not in robot.calls
+
+
+def test_a_dry_run_says_where_the_grip_is_not_where_the_filter_lets_it_go():
+    """A hand that stands 4 mm lower than its floor: the table is higher than it is said to be."""
+    said: list[str] = []
+    robot = KinematicRobot(SimClock(), np.array([0.0, 0.9, 0.0, -1.9, 0.0, 2.8, 0.785]))
+    dry = DryRun(robot, said.append)
+    dry.read_state()
+    dry.command(HOME_RAD, close=False)
+    here, there = (" ".join(f"{x:.3f}" for x in grip_position(q)) for q in (robot.q_rad, HOME_RAD))
+    assert said[0].startswith(f"grip at {here} m, would send ") and said[0].endswith(f"to {there} m, open")
 
 
 def test_slow_steps_skip_deadlines_and_never_burst(tmp_path):

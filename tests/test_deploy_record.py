@@ -93,6 +93,31 @@ def test_a_step_before_which_the_arm_gave_way_says_to_what(run, monkeypatch):
     assert [row.get("felt_nm") for row in rows] == [None, [1.235] * 7, None, None, None]
 
 
+def test_a_width_that_is_no_number_costs_no_report(run, monkeypatch):
+    read = KinematicRobot.read_state
+    monkeypatch.setattr(KinematicRobot, "read_state", lambda self: replace(read(self), width_m=float("nan")))
+    report, folder = run()
+    assert report.holds == 5 and json.loads((folder / "report.json").read_text())["width_m"] is None
+    rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
+    assert [row["width_m"] for row in rows] == [None] * 5
+
+
+def test_two_that_begin_in_the_same_second_have_two_folders(tmp_path, monkeypatch):
+    monkeypatch.setattr(session, "_stamp", lambda: "20261127-080000")
+    folders = [session._new_folder(tmp_path).name for _ in range(3)]
+    assert folders == ["20261127-080000", "20261127-080000-1", "20261127-080000-2"]
+
+
+def test_one_that_never_began_leaves_no_folder(run, tmp_path):
+    class Absent(ColourCamera):
+        def start(self):
+            raise UserError("no camera")
+
+    with pytest.raises(UserError, match="no camera"):
+        run(Absent)
+    assert list((tmp_path / "kept").iterdir()) == []
+
+
 def test_two_in_a_second_are_two_recordings_of_one_folder(run, tmp_path):
     folders = {run()[1] for _ in range(2)}
     assert {recording.path for recording in find_recordings(tmp_path / "kept")} == folders
@@ -172,8 +197,10 @@ def test_a_camera_that_fails_as_it_stops_costs_nothing_of_what_was_recorded(run,
     assert kept["steps"] == 5 and kept["fault"] == "RuntimeError: no device connected"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_second_signal_does_not_cut_the_stopping_short(run, number):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as where nothing was said about it
+
     class Stopping(ColourCamera):
         def stop(self):
             os.kill(os.getpid(), signal.SIGINT)
@@ -184,7 +211,10 @@ def test_a_second_signal_does_not_cut_the_stopping_short(run, number):
                 os.kill(os.getpid(), number)
             return super().read()
 
-    report, folder = run(Stopping, seconds=60.0)
+    def say(text):  # a terminal that was closed
+        raise OSError(5, "Input/output error")
+
+    report, folder = run(Stopping, say, seconds=60.0)
     assert report.interrupted and report.steps == len(Recording.open(folder)) == 2
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

@@ -205,6 +205,15 @@ def test_a_hand_that_has_lifted_something_stays_there_until_it_has_lost_it():
     assert retry(state(lifted, OPEN)) is None, "it has dropped it: the policy's turn"
 
 
+def test_a_step_without_a_frame_gives_nothing_that_is_lifted_back_to_the_policy():
+    lifted, retry = HOME + np.array([0, 0.09, 0, 0.53, 0, -0.58, 0]), Retry()
+    told(retry, lifted, HOLDING, DONE_STEPS)
+    retry.held()
+    action = retry(state(lifted, HOLDING))
+    assert action is not None and closes(action) and not retry.begun
+    assert retry(state(lifted, OPEN)) is None
+
+
 def test_what_was_before_a_reset_does_not_count():
     retry = Retry()
     told(retry, LOW, OPEN, STILL_STEPS)

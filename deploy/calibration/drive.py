@@ -27,11 +27,17 @@ class Driver:
         self._close = False
 
     def go(self, q_target_rad: Float[np.ndarray, "7"]) -> bool:
-        """All joints at once to (7,) `q_target_rad`; whether the arm got there. Raises RobotError."""
+        """All joints at once to (7,) `q_target_rad`; whether the arm got there, and met nothing on the way.
+
+        Raises RobotError.
+        """
         best_rad, best_s = np.inf, self._clock.now()
         due_s = best_s
         while True:
-            q = self._robot.read_state().q_rad
+            state = self._robot.read_state()
+            q = state.q_rad
+            if state.met:
+                return False
             left_rad = float(np.abs(q_target_rad - q).max())
             if left_rad < ARRIVED_RAD:
                 return True

@@ -17,7 +17,7 @@ from ddgrasp.files import atomic_write_bytes
 from deploy import kinematics
 from deploy.calibration import picture, poses, standing
 from deploy.calibration.drive import Driver
-from deploy.calibration.hand_eye import HandEye, View, calibrate
+from deploy.calibration.hand_eye import MIN_VIEWS, HandEye, View, calibrate
 from deploy.calibration.standing import Calibration
 from deploy.clock import RealClock, RobotClock
 from deploy.devices.options import SessionOptions, Setup
@@ -139,7 +139,10 @@ def _take(
     confirm: Callable[[str], None],
     say: Callable[[str], None],
 ) -> Taken:
-    """A view of every pose that is reached. Raises UserError if the arm fails or the board is never seen."""
+    """A view of every pose that is reached, or of those before the arm failed, if they can suffice.
+
+    Raises UserError if they cannot, or the board is never seen.
+    """
     taken = Taken()
     confirm(
         "Hold the board between the fingers by the middle of its upper margin, its printed face to the "
@@ -160,7 +163,10 @@ def _take(
             if len(taken.views) >= HOPELESS and not taken.seen:
                 break
     except RobotError as error:
-        raise UserError(f"calibration ended at pose {number} of {len(ways)}: {error}.") from error
+        ended = f"calibration ended at pose {number} of {len(ways)}: {error}"
+        if taken.seen < MIN_VIEWS:
+            raise UserError(f"{ended}.") from error
+        say(f"{ended}; goes on with the views before it")
     if not taken.views:
         raise UserError(f"none of {len(ways)} poses gave a picture; what happened is said above.")
     if not taken.seen:

@@ -1,8 +1,8 @@
-"""Which control unit answers at an address, if any.
+"""Which control unit answers at an address, if any, and whether its hand does.
 
 Where another program holds the arm, franky's own connection waits for ever, and stops every thread meanwhile;
 and it cannot tell a Panda from an unsuitable library. So one `Connect` of Franka's published protocol
-(libfranka-common, research_interface/robot/service_types.h) comes first.
+(libfranka-common, research_interface/robot/service_types.h and gripper/types.h) comes first.
 """
 
 import socket
@@ -10,15 +10,15 @@ import struct
 
 from ddgrasp.errors import UserError
 
-ROBOT_PORT = 1337
+ROBOT_PORT, GRIPPER_PORT = 1337, 1338
 ANSWER_S = 5.0
 FIRST_FR3_VERSION = 6
 """Robot server version: a Panda's is at most 5, an FR3's at least this (libfranka's compatibility table)."""
-_HEADER = struct.Struct("<III")
+_HEADER, _GRIPPER_HEADER = struct.Struct("<III"), struct.Struct("<HII")
 """Command, its number, size of the whole message."""
 _ANSWER = struct.Struct("<HH")
-"""Status, robot server version."""
-_CONNECT, _OUR_VERSION = 0, 10
+"""Status, server version."""
+_CONNECT, _OUR_VERSION, _OUR_GRIPPER_VERSION = 0, 10, 3
 
 
 def check_arm(host: str, model: str) -> None:
@@ -35,16 +35,27 @@ def check_arm(host: str, model: str) -> None:
         )
 
 
+def check_hand(host: str) -> None:
+    """Raises OSError unless the gripper of the control unit at `host` answers; given up at once as well."""
+    if len(_answer(host, GRIPPER_PORT, _GRIPPER_HEADER, _OUR_GRIPPER_VERSION)) < _ANSWER.size:
+        raise OSError("it refuses connections")
+
+
+def _answer(host: str, port: int, header: struct.Struct, version: int) -> bytes:
+    """What the server at `port` answers to `Connect`, without its header. Raises OSError."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as states,
+        socket.create_connection((host, port), ANSWER_S) as connection,
+    ):
+        states.bind(("", 0))  # where the server sends its state
+        request = struct.pack("<HH", version, states.getsockname()[1])
+        connection.sendall(header.pack(_CONNECT, 0, header.size + len(request)) + request)
+        return connection.makefile("rb").read(header.size + _ANSWER.size)[header.size :]
+
+
 def _server_version(host: str) -> int:
     try:
-        with (
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as states,
-            socket.create_connection((host, ROBOT_PORT), ANSWER_S) as connection,
-        ):
-            states.bind(("", 0))  # where the unit sends its state
-            request = struct.pack("<HH", _OUR_VERSION, states.getsockname()[1])
-            connection.sendall(_HEADER.pack(_CONNECT, 0, _HEADER.size + len(request)) + request)
-            answer = connection.makefile("rb").read(_HEADER.size + _ANSWER.size)
+        answer = _answer(host, ROBOT_PORT, _HEADER, _OUR_VERSION)
     except TimeoutError as error:
         raise UserError(
             f"the control unit at {host!r} does not answer within {ANSWER_S:g} s: end other programs that "
@@ -55,6 +66,6 @@ def _server_version(host: str) -> int:
             f"no Franka at {host!r} ({error.strerror or error}): unlock the joints, activate FCI in Desk and "
             "check --host."
         ) from error
-    if len(answer) < _HEADER.size + _ANSWER.size:
+    if len(answer) < _ANSWER.size:
         raise UserError(f"the control unit at {host!r} refuses connections: activate FCI in Desk.")
-    return _ANSWER.unpack(answer[_HEADER.size :])[1]
+    return _ANSWER.unpack(answer)[1]

@@ -22,7 +22,7 @@ from ddgrasp.install import pip_install
 from deploy import kinematics
 from deploy.devices import franka_faults
 from deploy.devices.franka_hand import FrankaHand, HandError
-from deploy.devices.franka_probe import check_arm
+from deploy.devices.franka_probe import check_arm, check_hand
 from deploy.devices.franka_spring import FrankaSpring, priority_kept, touched
 from deploy.devices.options import Setup
 from deploy.interfaces import Clock, RobotError, RobotState
@@ -30,6 +30,8 @@ from deploy.interfaces import Clock, RobotError, RobotState
 AT_START_RAD = 0.01
 """No joint further than this from the start pose: the arm is there."""
 START_S = 120.0
+HOMING_S = 60.0
+"""Longest wait, on this machine's clock; a hand takes some five seconds, a slow rig more."""
 RISE_M = 0.002
 """A hand goes up that is to be higher by more, in a control step: away from what it pressed on."""
 LOST = "the connection to"
@@ -140,6 +142,8 @@ class FrankaRobot:
                 with self._reporting():
                     if self._following is not None:
                         self._following.stop()
+                    else:  # on the way to the start pose
+                        self._arm.stop()
         finally:
             if self._following is not None:
                 self._following.release()
@@ -190,8 +194,9 @@ class FrankaRobot:
     def _gripper(self) -> Any:
         """The hand's connection. Raises UserError: the arm has answered by now, so it is the hand's alone."""
         try:
+            check_hand(self._config.host)
             return self._franky.Gripper(self._config.host)
-        except self._errors as error:
+        except (OSError, *self._errors) as error:
             raise UserError(franka_faults.no_gripper(self._config.host, error)) from error
 
     def _go_to_start(self, gripper: Any) -> None:
@@ -199,21 +204,32 @@ class FrankaRobot:
         assert self._confirm is not None
         away_rad = float(np.max(np.abs(np.asarray(self._arm.state.q) - HOME_RAD)))
         self._confirm(
-            f"The {self._limits.name} at {self._config.host} will home its gripper and move to the start "
-            f"pose ({away_rad:.2f} rad away) at {self._config.start_dynamics:.0%} of its speed. "
-            "Is the way clear?"
+            f"The {self._limits.name} at {self._config.host} will home its gripper, which drops what it "
+            f"holds, and move to the start pose ({away_rad:.2f} rad away) at "
+            f"{self._config.start_dynamics:.0%} of its speed. Is the way clear?"
         )
         self._moved = True
         self._say("homing the gripper")
-        try:
-            gripper.homing()
-        except self._errors as error:
-            raise HandError(str(error)) from error
+        self._home(gripper)
         if away_rad > AT_START_RAD:
             self._say("moving to the start pose")
             slower = min(1.0, self._config.start_dynamics / self._config.dynamics)
             self._arm.move(self._to(np.array(HOME_RAD), relative_dynamics_factor=slower), asynchronous=True)
             self._wait_at_start()
+
+    def _home(self, gripper: Any) -> None:
+        """Raises HandError."""
+        try:
+            homing, end_s = gripper.homing_async(), time.monotonic() + HOMING_S
+            while not homing.wait(_POLL_S):  # in parts, so that Ctrl-C is heard
+                if time.monotonic() > end_s:
+                    gripper.stop()
+                    raise HandError(f"homing did not end within {HOMING_S:g} s: see what holds its fingers")
+            homed = homing.get()
+        except self._errors as error:
+            raise HandError(str(error)) from error
+        if not homed:
+            raise HandError("homing failed: take away what is between its fingers, try again")
 
     def _wait_at_start(self) -> None:
         """Until the joints are there. Raises UserError if they are not in `START_S` of the arm's time."""

@@ -77,10 +77,13 @@ class RealSenseCamera:
         except RuntimeError as error:
             raise UserError(
                 f"no RealSense depth and colour streams {size[0]}x{size[1]} at {self._stream_hz} Hz "
-                f"({error}); check the USB 3 cable and camera.serial {self._serial!r}."
+                f"({error}); check the USB 3 cable and deploy.realsense.serial {self._serial!r}."
             ) from error
         self._pipeline = pipeline
-        self._unit_m = active.get_device().first_depth_sensor().get_depth_scale()
+        sensor = active.get_device().first_depth_sensor()
+        if sensor.supports(rs.option.emitter_enabled):  # a calibration that was killed leaves it off
+            sensor.set_option(rs.option.emitter_enabled, 1.0)
+        self._unit_m = sensor.get_depth_scale()
         intrinsics = active.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
         self._stream = self._checked(intrinsics)
 
