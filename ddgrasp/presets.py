@@ -118,8 +118,8 @@ DEMO = Config(
     evaluation=EvalConfig(student_trials=60),
     score=ScoreConfig(trajectories=24, kid_subset_size=150, tsne_maps=3000),
 )
-"""For two cores; the student starts from the pretrained one. 23 minutes on two AMD EPYC cores on 2026-11-22;
-not timed by itself since the generator takes six evaluations and the rig tries unseen objects."""
+"""For two cores; the student starts from the pretrained one. 48 minutes on two Intel Xeon cores on 2026-11-27
+(docs/results.md)."""
 
 LAPTOP = Config(
     preset="laptop",
