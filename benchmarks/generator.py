@@ -51,9 +51,10 @@ def scenes(config: DDGConfig, count: int) -> np.ndarray:
 
 def make_generator(config: DDGConfig, params: Any, batch: int, sampler: str, steps: int) -> Generator:
     """The configuration's network with that sampler, `batch` frames at once."""
+    spacing = "quadratic" if sampler == PROGRESSIVE else config.sampling.spacing
     changed = replace(
         config,
-        sampling=replace(config.sampling, sampler=sampler, steps=steps, batch_size=batch),
+        sampling=replace(config.sampling, sampler=sampler, steps=steps, spacing=spacing, batch_size=batch),
         training=replace(config.training, distil_from=16),
     )
     return Generator(changed, params, make_prior(changed))

@@ -160,8 +160,10 @@ def _sampled_by(config: Config, sampler: Sampler) -> Any:
         training = replace(training, distil_from=16)
         if training.hole_loss == CROSS_ENTROPY:
             training = replace(training, hole_loss=SQUARED)
-    steps = 4 if sampler == PROGRESSIVE else ddg.sampling.steps
-    return replace(ddg, training=training, sampling=replace(ddg.sampling, sampler=sampler, steps=steps))
+    sampling = replace(ddg.sampling, sampler=sampler)
+    if sampler == PROGRESSIVE:
+        sampling = replace(sampling, steps=4, spacing="quadratic")
+    return replace(ddg, training=training, sampling=sampling)
 
 
 def sampler(name: Sampler, config: Config) -> Program:

@@ -97,7 +97,8 @@ def timesteps(steps: int, count: int, spacing: str = "trailing") -> Int32[np.nda
 
     "leading" ends at 0 and starts short of K-1; "trailing" starts at K-1, where x is pure noise, and ends
     short of 0; "linspace" has both ends (Lin et al. 2024, table 2). "quadratic" is trailing with steps
-    that grow as a square, so that the last ones are short (Song et al. 2021, appendix D.2).
+    that grow as a square, so that the last ones are short (Song et al. 2021, appendix D.2). A single step is
+    K-1 in all of them: no other takes pure noise for what it is.
     """
     if not 1 <= count <= steps:
         raise UserError(f"Sampling steps must lie in 1..{steps} (the schedule's length), not {count}.")
@@ -112,6 +113,8 @@ def timesteps(steps: int, count: int, spacing: str = "trailing") -> Int32[np.nda
         visited = np.round(np.linspace(0, steps - 1, count))[::-1]
     else:
         raise unknown_name("timestep spacing", spacing, SPACINGS)
+    if count == 1:
+        visited = np.array([steps - 1])
     return visited.astype(np.int32)
 
 

@@ -91,6 +91,14 @@ def test_the_teacher_visits_the_students_steps_and_those_between():
         np.testing.assert_array_equal(end, diffusion.previous_steps(student))
 
 
+@pytest.mark.parametrize("spacing", ["linspace", "leading"])
+def test_steps_that_are_no_halves_of_others_are_not_distilled(spacing):
+    """Those of 4 evaluations are not every second of 8: the student would be asked what it never saw."""
+    assert (diffusion.timesteps(1000, 8, spacing)[::2] != diffusion.timesteps(1000, 4, spacing)).any()
+    with pytest.raises(UserError, match=f"spacing is {spacing}; .*give --ddg.sampling.spacing quadratic"):
+        dataclasses.replace(DISTILLED, sampling=dataclasses.replace(DISTILLED.sampling, spacing=spacing))
+
+
 def test_one_step_to_the_target_ends_where_the_teacher_does():
     made = diffusion.make_schedule("cosine", 1000)
     x_k, x_end = jax.random.normal(jax.random.key(0), (2, 3, 4, 5))

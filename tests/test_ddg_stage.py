@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from app.commands import parse
 from ddg_jax import stage
 from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator, generate, predict
@@ -200,6 +201,24 @@ def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings
         make_job("ddg", again, tmp_path / "x", Progress(tmp_path / "x", quiet=True), data=recordings)
     )
     jax.tree.map(np.testing.assert_array_equal, load_params(loaded.directory / "params.msgpack"), before)
+
+
+def test_a_model_whose_steps_cannot_be_halved_is_distilled_to_quadratic_ones(
+    fitted, recordings, tmp_path, capsys
+):
+    ddg = dataclasses.replace(
+        CONFIG.ddg,
+        init_from=str(fitted.directory),
+        sampling=dataclasses.replace(CONFIG.ddg.sampling, sampler="ddim", spacing="linspace"),
+    )
+    model = tmp_path / "model" / "ddg"
+    progress = Progress(model, quiet=True)
+    stage.run(make_job("ddg", dataclasses.replace(CONFIG, ddg=ddg), model, progress, data=recordings))
+    folders = ["--model", str(model), "--data", str(recordings), "--out", str(tmp_path)]
+    parse("ddg distil", [*folders, "--evaluations", "8", "--steps", "2"]).run()
+    made = Generator.load(tmp_path / "ddg").config.sampling
+    assert (made.sampler, made.steps, made.spacing) == ("progressive", 8, "quadratic")
+    assert "steps are linspace, which cannot be halved" in capsys.readouterr().err
 
 
 def test_flicker_is_counted_within_recordings_only():

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ddgrasp.config import HeadConfig, StudentConfig
+from ddgrasp.config import SPACINGS, HeadConfig, StudentConfig
 from ddgrasp.errors import UserError
 from learning import diffusion as s
 from student_jax.policy import noise_schedule
@@ -116,6 +116,8 @@ def test_timestep_spacing():
     assert s.timesteps(11, 3, "linspace").tolist() == [10, 5, 0]
     assert s.timesteps(1000, 4, "quadratic").tolist() == [999, 561, 249, 61]
     assert s.timesteps(10, 8, "quadratic").tolist() == [9, 7, 5, 4, 3, 2, 1, 0]  # none twice, none below 0
+    for spacing in SPACINGS:
+        assert s.timesteps(1000, 1, spacing).tolist() == [999]  # pure noise
     assert s.previous_steps(np.array([800, 0])).tolist() == [0, -1]
     with pytest.raises(UserError, match="trailing"):
         s.timesteps(10, 2, "trailling")

@@ -8,7 +8,7 @@ from app.commands.base import OneStage
 from app.commands.checks import check_config_values, check_data, stage_folder
 from ddgrasp import artifacts
 from ddgrasp.config.checks import Count, Seed, Steps, Text
-from ddgrasp.config.ddg import Sampler
+from ddgrasp.config.ddg import HALVED_SPACINGS, PROGRESSIVE, Sampler
 from ddgrasp.stages import get_stage
 
 
@@ -75,14 +75,23 @@ class DDGDistil:
 
     def run(self) -> None:
         """Distils the model into the run's folder ddg."""
+        from ddgrasp.progress import Progress
+
         check_data("--data", self.data)
         fitted = artifacts.read_artifact(_fitted(self.model))
         config = artifacts.config_from_json(fitted.manifest.config)
-        training = config.ddg.training
+        training, spacing = config.ddg.training, config.ddg.sampling.spacing
+        if spacing not in HALVED_SPACINGS:
+            Progress(name="ddg distil").note(
+                f"the model's steps are {spacing}, which cannot be halved: the distilled one's are quadratic"
+            )
+            spacing = "quadratic"
         ddg = replace(
             config.ddg,
             init_from=str(fitted.directory.resolve()),
-            sampling=replace(config.ddg.sampling, sampler="progressive", steps=self.evaluations),
+            sampling=replace(
+                config.ddg.sampling, sampler=PROGRESSIVE, steps=self.evaluations, spacing=spacing
+            ),
             training=training if self.steps is None else replace(training, distil_steps=self.steps),
         )
         config = replace(config, ddg=ddg)

@@ -36,6 +36,8 @@ DPM_SOLVER, DDIM, DDPM, PROGRESSIVE = SAMPLERS = get_args(Sampler)
 Spacing = Literal["leading", "trailing", "linspace", "quadratic"]
 SPACINGS: tuple[Spacing, ...] = get_args(Spacing)
 """Spacing of the diffusion steps that a sampler visits: learning/diffusion.py, timesteps."""
+HALVED_SPACINGS: tuple[Spacing, ...] = ("trailing", "quadratic")
+"""Those whose every second step is one of half as many: what progressive distillation needs."""
 
 _Metres = Annotated[float, Range(0, 1000, above=True)]
 _Evaluations = Annotated[int, Range(1, 10_000)]
@@ -272,6 +274,12 @@ class DDGConfig(Section, name="ddg"):
             )
         if self.sampling.sampler != PROGRESSIVE:
             return
+        if self.sampling.spacing not in HALVED_SPACINGS:
+            raise UserError(
+                f"ddg.sampling.spacing is {self.sampling.spacing}; sampler progressive makes one step of "
+                f"two, as {' and '.join(HALVED_SPACINGS)} ones alone allow: give --ddg.sampling.spacing "
+                "quadratic."
+            )
         halvings, rest = divmod(self.training.distil_from, steps)
         if rest or halvings < 2 or halvings & (halvings - 1):
             raise UserError(
