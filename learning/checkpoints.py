@@ -11,6 +11,8 @@ from ddgrasp.errors import UserError
 
 KEPT = 2
 """Checkpoints in a folder: should the newest be lost with the disk's last write, there is one before."""
+UNREADABLE = (ValueError, KeyError, TypeError, OSError)
+"""What Orbax raises of a checkpoint that is damaged or of another structure."""
 
 State = TypeVar("State")
 
@@ -24,7 +26,9 @@ class Checkpoints:
     def __init__(self, directory: Path, keep: int = KEPT):
         self.directory = directory
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
-        self._manager = ocp.CheckpointManager(directory.absolute(), options=options)
+        # Named, or Orbax guesses from the newest one what all hold, which a damaged one does not say.
+        handler = ocp.StandardCheckpointHandler()
+        self._manager = ocp.CheckpointManager(directory.absolute(), options=options, item_handlers=handler)
 
     def __enter__(self) -> "Checkpoints":
         return self
@@ -40,26 +44,33 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def restore(self, target: State) -> State:
-        """The newest checkpoint.
+        """The newest checkpoint that can be read; newer ones, which are damaged then, are deleted.
 
         Args:
           target: a state of the same structure, of arrays or of jax.ShapeDtypeStruct with the shardings that
             the result shall have; they need not be those it was saved from.
 
-        Raises UserError if there is none, or it does not fit `target`.
+        Raises UserError if there is none, or none fits `target`; they are all kept then.
         """
         if self.latest is None:
             raise UserError(f"{self.directory} holds no checkpoint: start without resuming.")
+        unread: dict[int, Exception] = {}
+        for step in sorted(self._manager.all_steps(), reverse=True):
+            try:
+                restored: Any = self._manager.restore(step, args=ocp.args.StandardRestore(target))
+            except UNREADABLE as error:
+                unread[step] = error
+                continue
+            for damaged in unread:  # one of another configuration would have others beside it
+                self._manager.delete(damaged)
+            return restored
+        newest = str(unread[self.latest]).partition("\n")[0].partition(" [tensorstore")[0]
+        reason = newest.partition(". ")[0].rstrip(":.")
         path = self.directory / str(self.latest)
-        try:
-            restored: Any = self._manager.restore(self.latest, args=ocp.args.StandardRestore(target))
-        except (ValueError, KeyError, TypeError) as error:
-            reason = str(error).partition("\n")[0].partition(". ")[0].rstrip(":.")
-            raise UserError(
-                f"The checkpoint {path} does not fit this training ({reason}): it is of another "
-                "configuration or version; delete the folder to start afresh."
-            ) from None
-        return restored
+        raise UserError(
+            f"The checkpoint {path} does not fit this training ({reason}): it is of another "
+            "configuration or version, or damaged; delete the folder to start afresh."
+        )
 
     def restore_or(self, first: State) -> State:
         """The newest checkpoint, shaped like `first`; `first` itself if there is none."""

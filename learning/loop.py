@@ -1,12 +1,14 @@
 """The loop of optimiser steps: whole-state checkpoints, exact resume, curves."""
 
 import contextlib
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jax import Array
 from jaxtyping import Float
 
+from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress, Task
 from learning.checkpoints import Checkpoints, intact
 from learning.train_state import TrainState
@@ -47,27 +49,46 @@ def run_steps(
 
     Returns:
       The state, and the scalars of the last step; none if there was nothing left to do.
+
+    Raises:
+      UserError: a scalar of `shown` is not finite at a point or where a checkpoint is due; none is written of
+        that step.
     """
     metrics: Metrics = {}
     with contextlib.ExitStack() as stack:
         saved = None if checkpoints is None else stack.enter_context(Checkpoints(checkpoints))
+        newest = None if saved is None else saved.latest
         state = state if saved is None else saved.restore_or(state)
         done = int(state.step)
+        if newest not in (None, done):
+            progress.note(f"{label}: the checkpoint of step {newest} is damaged, going on from {done}")
         task = stack.enter_context(progress.task(label, steps))
         task.start_at(done)
         try:
             for step in range(done, steps):
                 state, metrics = step_function(state, step)
-                if (step + 1) % log_every == 0 or step + 1 == steps:
+                logged = (step + 1) % log_every == 0 or step + 1 == steps
+                due = saved is not None and (step + 1) % every == 0
+                if (logged or due) and (name := _diverged(metrics, shown)):
+                    raise UserError(
+                        f"{label}: {name} is {float(metrics[name])} after {step + 1} steps: the training has "
+                        "diverged; begin anew with a smaller learning rate."
+                    )
+                if logged:
                     _report(first_point + step + 1, metrics, task, progress, curve, shown)
                 else:
                     task.advance()
                 if saved is not None and (step + 1) % every == 0:
                     saved.save(step + 1, state)
         finally:
-            if saved is not None and intact(state):
+            if saved is not None and intact(state) and not _diverged(metrics, shown):
                 saved.save(int(state.step), state)
     return state, _floats(metrics)
+
+
+def _diverged(metrics: Metrics, shown: Sequence[str]) -> str:
+    """The first of the scalars `shown` that is not finite; empty if all are."""
+    return next((name for name in shown if not math.isfinite(metrics.get(name, 0.0))), "")
 
 
 def _report(

@@ -1,6 +1,7 @@
 """The shared training machinery on a problem of two numbers: state, optimiser, checkpoints, loop."""
 
 import dataclasses
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -140,9 +141,58 @@ def test_the_newest_two_are_kept_and_restored_to_the_bit(tmp_path):
 def test_a_checkpoint_of_another_training_is_refused_in_one_line(tmp_path, other):
     with Checkpoints(tmp_path) as saved:
         saved.save(1, fresh())
-        with pytest.raises(UserError, match="does not fit this training .*delete the folder") as refused:
+        saved.save(2, fresh())
+        with pytest.raises(UserError, match="/2 does not fit this training .*delete the folder") as refused:
             saved.restore(first_state(other, OPTIMIZER, KEY))
+        assert saved.latest == 2
     assert "\n" not in str(refused.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2"]
+
+
+def cut(file):
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+DAMAGE = {
+    "structure cut": lambda step: cut(step / "default" / "_METADATA"),
+    "structure gone": lambda step: (step / "default" / "_METADATA").unlink(),
+    "index cut": lambda step: cut(step / "default" / "manifest.ocdbt"),
+    "index gone": lambda step: (step / "default" / "manifest.ocdbt").unlink(),
+    "numbers cut": lambda step: [cut(file) for file in (step / "default" / "d").iterdir()],
+    "numbers gone": lambda step: shutil.rmtree(step / "default" / "d"),
+    "nothing but the folder": lambda step: [shutil.rmtree(step), step.mkdir()],
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_checkpoint_is_deleted_for_the_one_before(tmp_path, damage):
+    quiet, seen, said = Progress(quiet=True), [], []
+    whole, _ = run_steps(fresh(), 30, noisy_step, tmp_path / "whole", label="", progress=quiet)
+    run_steps(fresh(), 20, noisy_step, tmp_path / "c", label="", progress=quiet, every=10)
+    DAMAGE[damage](tmp_path / "c" / "20")
+
+    def counted(state, step):
+        seen.append(step)
+        return noisy_step(state, step)
+
+    quiet.note = said.append
+    resumed, _ = run_steps(fresh(), 30, counted, tmp_path / "c", label="fit", progress=quiet, every=10)
+    equal(resumed, whole)
+    assert seen == list(range(10, 30))
+    assert said == ["fit: the checkpoint of step 20 is damaged, going on from 10"]
+    assert sorted(path.name for path in (tmp_path / "c").iterdir()) == ["20", "30"]
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_checkpoints_that_are_all_damaged_are_kept(tmp_path, damage):
+    with Checkpoints(tmp_path) as saved:
+        for step in (1, 2):
+            saved.save(step, fresh())
+            DAMAGE[damage](tmp_path / str(step))
+        with pytest.raises(UserError, match="/2 .*delete the folder to start afresh") as refused:
+            saved.restore(fresh())
+    assert "\n" not in str(refused.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2"]
 
 
 # --- loop ------------------------------------------------------------------------------------------
@@ -194,6 +244,38 @@ def test_a_step_that_took_the_buffers_and_failed_leaves_the_last_checkpoint(tmp_
     with pytest.raises(KeyboardInterrupt):
         run_steps(fresh(), 30, failing, tmp_path, label="", progress=Progress(quiet=True), every=2)
     assert sorted(int(path.name) for path in tmp_path.iterdir()) == [2, 4]
+
+
+def falling_apart(after):
+    """`noisy_step` whose loss is no number from step `after` on."""
+
+    def step_function(state, step):
+        state, metrics = noisy_step(state, step)
+        return state, metrics | {"loss": jnp.where(step >= after, jnp.nan, metrics["loss"])}
+
+    return step_function
+
+
+@pytest.mark.parametrize(("every", "at", "kept"), [(7, 14, [7]), (200, 20, []), (10, 20, [10])])
+def test_a_training_that_has_diverged_ends_and_its_state_is_not_kept(tmp_path, every, at, kept):
+    progress, said = Progress(quiet=True), f"^fit: loss is nan after {at} steps: .*smaller learning rate"
+    with pytest.raises(UserError, match=said) as error:
+        run_steps(fresh(), 30, falling_apart(12), tmp_path, label="fit", progress=progress, every=every)
+    assert "\n" not in str(error.value)
+    assert sorted(int(path.name) for path in tmp_path.iterdir()) == kept
+
+
+def test_ctrl_c_between_two_points_keeps_no_diverged_state(tmp_path):
+    step_function = falling_apart(12)
+
+    def interrupted(state, step):
+        if step == 15:
+            raise KeyboardInterrupt
+        return step_function(state, step)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_steps(fresh(), 30, interrupted, tmp_path, label="", progress=Progress(quiet=True), every=11)
+    assert [path.name for path in tmp_path.iterdir()] == ["11"]
 
 
 def test_curves_have_their_names_places_and_last_point(tmp_path):
