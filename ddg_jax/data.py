@@ -148,6 +148,11 @@ def _read(
     """
     if recording.skipped:
         progress.note(recording.skipped_summary())
+    if prior.needs_rgb and not recording.color_aligned:
+        raise UserError(
+            f"{recording.path}: colour is not aligned to depth, which ddg.prior.source {prior.name} needs: "
+            "align it when recording, or --ddg.prior.source inverse_depth."
+        )
     size = (config.depth.height_px, config.depth.width_px)
     count = min(limit, len(recording))
     frames = np.stack([crop_nearest(recording.depth_m(i), size) for i in range(count)])

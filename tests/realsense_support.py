@@ -26,6 +26,20 @@ def rgb(number: int) -> np.ndarray:
     return np.full((*SIZE, 3), (8 * number % 256, 40, 90), np.uint8)
 
 
+def full_after(write: Callable[..., None], files: int) -> Callable[..., None]:
+    """`write`(path, data, sync) of a recording on a disk that takes that many files, and a short one."""
+    taken = []
+
+    def writing(path: Path, data: bytes, sync: bool = False) -> None:
+        taken.append(path)
+        if len(taken) > files and path.suffix != ".json":
+            path.write_bytes(data[:10])
+            raise OSError(28, "No space left on device")
+        write(path, data, sync)
+
+    return writing
+
+
 class SoftwareCamera:
     """librealsense's software device with a depth and a colour stream of 64x48 at 30 Hz."""
 

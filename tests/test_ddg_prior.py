@@ -192,6 +192,20 @@ def test_what_cannot_be_used_is_named_and_counted(recordings):
     np.testing.assert_array_equal(few.depth_m, frames.depth_m[:3])
 
 
+def test_colour_of_another_view_is_refused_where_the_prior_comes_from_it(tmp_path):
+    class OfColour(prior.InverseDepthPrior):
+        needs_rgb = True
+
+    for name, said in (("apart", {"color_aligned_to_depth": False}), ("unsaid", {})):
+        _record(tmp_path / name, **said)
+    notes = Notes()
+    frames = data.load_frames(tmp_path, WIDE, OfColour(1.0), 0, notes)
+    assert len(frames) == 2 and any("apart: colour is not aligned to depth" in line for line in notes.said)
+    with pytest.raises(UserError, match="align it when recording, or --ddg.prior.source inverse_depth"):
+        data.load_frames(tmp_path / "apart", WIDE, OfColour(1.0), 0, notes)
+    assert len(load(tmp_path)[0]) == 4  # depth alone needs no colour
+
+
 def test_nothing_usable_is_refused_with_the_first_reason(tmp_path):
     for name in ("a", "b"):
         _record(tmp_path / name, depth_unit_m=0.00001)

@@ -193,6 +193,16 @@ def test_disparity_is_the_recorded_cameras_own(tmp_path):
         score_data.load_real(tmp_path / "room", 32, 2)
 
 
+def test_colour_of_another_view_is_no_monocular_network_s(tmp_path):
+    write_recording(tmp_path / "room", 8, (48, 64))
+    meta = tmp_path / "room" / "meta.json"
+    meta.write_text(json.dumps({**json.loads(meta.read_text()), "color_aligned_to_depth": False}))
+    frames = score_data.load_real(tmp_path / "room", 32, 8)
+    assert len(score_data.real_episodes(frames, with_rgb=False)) == 2
+    with pytest.raises(UserError, match="room: colour is not aligned to depth"):
+        score_data.real_episodes(frames, with_rgb=True)
+
+
 @pytest.mark.parametrize(
     "option", [("--ddg.training.steps", "3"), ("--fit-frames", "9"), ("--score-frames", "17")]
 )

@@ -1,15 +1,18 @@
 """The active-stereo camera: geometry of its depth, defects that follow from stereo, not from formulas."""
 
+import math
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import mujoco
 import numpy as np
 import pytest
 
 from ddgrasp.config import RecordConfig, StereoConfig, WorldConfig
+from ddgrasp.errors import UserError
 from mjx_envs.camera import Buffers, Camera, nominal_camera
 from rig.camera import RigCamera, jittered_pose
 from sensors.models.active_stereo import ActiveStereo
@@ -229,6 +232,32 @@ def test_jittered_pose_stays_near_the_nominal_one():
         assert np.abs(T[:3, 3] - nominal[:3, 3]).max() <= config.camera_position_jitter_m
         np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
         assert np.arccos(T[:3, 2] @ nominal[:3, 2]) < 0.25
+
+
+def test_lens_blur_is_as_wide_as_it_says_and_the_rig_s_as_it_was():
+    quiet = {"full_well_electrons": 1e9, "read_noise": 0.0}
+    point = np.zeros((61, 61), np.float32)
+    point[30, 30] = 1.0
+    for sigma_px in (1.0, 3.0, 7.0):
+        camera = ActiveStereo(StereoConfig(lens_blur_px=sigma_px, **quiet), PROFILE)
+        seen = camera._expose(point, 2 * math.pi * sigma_px**2, np.random.default_rng(0)).sum(0)
+        spread = np.sqrt(np.average((np.arange(61) - 30) ** 2, weights=seen))
+        assert spread == pytest.approx(sigma_px, rel=0.03)
+    default = StereoConfig()
+    picture = np.random.default_rng(1).random((40, 50), np.float32)
+    rng = np.random.default_rng(2)
+    signal = np.minimum(cv2.GaussianBlur(picture, (5, 5), default.lens_blur_px) * np.float32(0.9), 1.0)
+    sigma = np.sqrt(signal / np.float32(default.full_well_electrons) + np.float32(default.read_noise**2))
+    noise = rng.standard_normal(signal.shape, dtype=np.float32)
+    before = np.clip(255.0 * (signal + sigma * noise) + 0.5, 0, 255).astype(np.uint8)
+    camera = ActiveStereo(default, PROFILE)
+    np.testing.assert_array_equal(camera._expose(picture, 0.9, np.random.default_rng(2)), before)
+
+
+def test_windows_have_a_middle_pixel():
+    for name in ("block_px", "residual_window_px", "refine_window_px", "flat_window_px"):
+        with pytest.raises(UserError, match=f"{name} is 4; expected an odd number"):
+            StereoConfig(**{name: 4})
 
 
 def test_sensors_need_no_jax():

@@ -93,6 +93,15 @@ def test_standing_frames_are_found():
     assert curves.static_runs(depth.astype(np.uint16), FB_PX_M) == (slice(0, 7),)
 
 
+def test_a_blind_frame_leaves_the_standing_ones_before_and_after_it():
+    rng = np.random.default_rng(0)
+    still = 1000 * FB_PX_M / (16.0 + 0.05 * rng.standard_normal((13, *SIZE)))
+    still[6] = 0
+    runs = curves.static_runs(still.astype(np.uint16), FB_PX_M)
+    assert runs == (slice(0, 6), slice(7, 13))
+    assert curves.static_runs(np.zeros((13, *SIZE), np.uint16), FB_PX_M) == ()
+
+
 def test_grid_of_disparities_is_recognised_although_fb_is_a_little_wrong():
     steps = np.arange(100, 200)
     on_grid = np.rint(1000 * 32 * FB_PX_M / steps).astype(np.uint16)

@@ -1,5 +1,6 @@
 """Recordings from elsewhere: what is kept, what is named and left out, what is refused."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,8 +9,11 @@ import numpy as np
 import pytest
 
 from app.commands import parse
+from ddgrasp.contract import CONTRACT_VERSION
 from ddgrasp.errors import UserError
+from realsense_support import full_after
 from sensors.recordings import importers
+from sensors.recordings import recording as recording_files
 from sensors.recordings.recording import Recording
 
 SIZE = (24, 32)
@@ -115,6 +119,64 @@ def test_one_refused_recording_does_not_stop_the_others(tmp_path, capsys):
     assert "refused:" in shown and "none of its 1 frames can be used" in shown
     assert shown.splitlines()[-1].endswith("left out: 0 frames, 1 recordings")
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["a"]
+
+
+def test_a_source_that_cannot_be_opened_does_not_stop_the_others(tmp_path, capsys):
+    make_folder(tmp_path / "all" / "b")
+    make_folder(tmp_path / "all" / "a", frames=0)
+    run(tmp_path / "all", "--out", tmp_path / "out")
+    shown = capsys.readouterr().out
+    assert f"refused: {tmp_path / 'all' / 'a' / 'depth'}: no depth pictures" in shown
+    assert shown.splitlines()[-1] == "1 recordings with 4 frames imported; left out: 0 frames, 1 recordings"
+    with pytest.raises(UserError, match="a/depth: no depth pictures"):
+        run(tmp_path / "all" / "a", "--out", tmp_path / "out")
+
+
+def test_a_recording_imported_again_says_the_same_of_its_camera(tmp_path):
+    root = make_folder(tmp_path / "desk", color="color")
+    known = {"depth_unit_m": 0.0005, "sensor": "D435", "fx_px": 380.0, "hz": 15, "consecutive_frames": True}
+    (root / "meta.json").write_text(json.dumps({**known, "contract_version": -1, "frames": 99}))
+    run(root, "--out", tmp_path / "out")
+    again = Recording.open(tmp_path / "out" / "desk")
+    assert again.meta["contract_version"] == CONTRACT_VERSION and again.meta["frames"] == 4
+    assert {name: again.meta[name] for name in known} == {**known, "depth_unit_m": 0.001}
+    np.testing.assert_array_equal(again.depth_mm(2), np.rint(depth_mm(2) / 2))
+    run(root, "--out", tmp_path / "given", "--sensor", "D455", "--depth-unit-m", "0.001")
+    given = Recording.open(tmp_path / "given" / "desk")
+    assert (given.meta["sensor"], given.fx_px) == ("D455", 380.0)
+    np.testing.assert_array_equal(given.depth_mm(2), depth_mm(2))
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", '{"depth_unit_m": "mm"}', '{"depth_unit_m": 0}'])
+def test_a_broken_meta_json_is_named(tmp_path, text):
+    root = make_folder(tmp_path / "desk")
+    (root / "meta.json").write_text(text)
+    with pytest.raises(UserError, match="desk/meta.json: ") as refused:
+        run(root, "--out", tmp_path / "out")
+    assert "\n" not in str(refused.value) and not (tmp_path / "out").exists()
+
+
+def test_arrays_that_are_no_numbers_are_left_out(tmp_path, capsys):
+    root = make_folder(tmp_path / "desk", frames=5)
+    names = sorted((root / "depth").iterdir())
+    metres = depth_mm(4).astype(np.float32) / 1000
+    arrays = (np.full(SIZE, "far"), metres > 1, metres.astype(complex), np.zeros(SIZE, np.int8), metres)
+    for file, array in zip(names, arrays, strict=True):
+        np.save(file.with_suffix(".npy"), array)
+        file.unlink()
+    run(root, "--out", tmp_path / "out")
+    np.testing.assert_array_equal(Recording.open(tmp_path / "out" / "desk").depth_mm(0), depth_mm(4))
+    shown = capsys.readouterr().out
+    for kind in ("<U3", "bool", "complex128", "int8"):
+        assert f"depth is {kind}" in shown, kind
+
+
+def test_a_full_disk_leaves_nothing_of_what_can_be_imported_again(tmp_path, monkeypatch):
+    root = make_folder(tmp_path / "desk")
+    monkeypatch.setattr(recording_files, "_write", full_after(recording_files._write, files=4))
+    with pytest.raises(OSError, match="No space left"):
+        run(root, "--out", tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_numbers_in_names_count_as_numbers(tmp_path):

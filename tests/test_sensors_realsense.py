@@ -11,7 +11,17 @@ import pytest
 
 from app.commands import parse
 from ddgrasp.errors import UserError
-from realsense_support import FX_PX, NAME, SERIAL, SIZE, ScriptedLibrary, SoftwareCamera, depth_mm
+from realsense_support import (
+    FX_PX,
+    NAME,
+    SERIAL,
+    SIZE,
+    ScriptedLibrary,
+    SoftwareCamera,
+    depth_mm,
+    full_after,
+)
+from sensors.recordings import recording as recording_files
 from sensors.recordings.realsense_live import Pace, frame_count
 from sensors.recordings.recording import Recording
 
@@ -148,6 +158,33 @@ def test_a_camera_that_stops_keeps_what_it_gave(tmp_path, monkeypatch, capsys):
         record(tmp_path, "--frames", 100)
     assert numbers_in(tmp_path / "take") == [16, 19] and library.stopped
     assert capsys.readouterr().out.endswith("take: 2 frames, stopped before the 100 asked for\n")
+
+
+def test_a_full_disk_ends_the_take_and_keeps_it(tmp_path, monkeypatch, capsys):
+    library = scripted(monkeypatch, count(1))
+    monkeypatch.setattr(recording_files, "_write", full_after(recording_files._write, files=5))
+    with pytest.raises(UserError, match=r"could not be written \(No space left on device\).*kept") as error:
+        record(tmp_path, "--frames", 100)
+    assert "USB" not in str(error.value) and library.stopped
+    assert numbers_in(tmp_path / "take") == [16, 19]
+    assert sorted(p.name for p in (tmp_path / "take" / "color").iterdir()) == ["000000.jpg", "000001.jpg"]
+    assert capsys.readouterr().out.endswith("take: 2 frames, stopped before the 100 asked for\n")
+
+
+def test_a_disk_that_takes_no_frame_leaves_nothing(tmp_path, monkeypatch):
+    scripted(monkeypatch, count(1))
+    monkeypatch.setattr(recording_files, "_write", full_after(recording_files._write, files=0))
+    with pytest.raises(OSError, match="No space left"):
+        record(tmp_path, "--frames", 100)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_take_that_ends_far_away_is_kept(tmp_path, monkeypatch, capsys):
+    # 5 frames of 0.6 m, 7 of 6.6 m: the camera's own unit is certain.
+    scripted(monkeypatch, [*range(1, 29), *range(6000, 6030)])
+    record(tmp_path, "--frames", 12)
+    assert capsys.readouterr().out.endswith(f"{tmp_path / 'take'}: 12 frames\n")
+    assert len(list((tmp_path / "take" / "depth").iterdir())) == 12
 
 
 @pytest.mark.parametrize(

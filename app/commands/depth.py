@@ -37,9 +37,10 @@ class RecordImport:
     out: Path = Path("recordings")
     """Each source becomes a folder in it."""
     depth_unit_m: Share = 0.0
-    """Metres per unit of depth; 0 takes a RealSense file's own, 0.001 for integer pictures, 1 for floats."""
+    """Metres per unit of depth; 0 takes a RealSense file's or a meta.json's own, else 0.001 for integer
+    pictures, 1 for floats."""
     sensor: str = ""
-    """Camera model, for example D455; a RealSense file names its own."""
+    """Camera model, for example D455; a RealSense file, or a meta.json beside depth/, names its own."""
     fx_px: Annotated[float, Range(0, 100_000)] = 0.0
     """Focal length of the depth pictures in pixels; 0 if unknown."""
     baseline_m: Annotated[float, Range(0, 10)] = 0.0
@@ -55,8 +56,8 @@ class RecordImport:
         meta = {name: value for name, value in known.items() if value}
         if self.consecutive:
             meta["consecutive_frames"] = True
-        sources = importers.find_sources(self.source, self.depth_unit_m, meta)
-        print(importers.summary(*importers.import_all(sources, self.out)))
+        sources, refused = importers.find_sources(self.source, self.depth_unit_m, meta)
+        print(importers.summary(*importers.import_all(sources, self.out, refused)))
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class RecordRealsense:
     """Serial number of the camera; empty takes the first."""
 
     def run(self) -> None:
-        """Records, and says what was kept; UserError if the camera stopped by itself."""
+        """Records, and says what was kept; UserError if the camera stopped by itself, or the disk is full."""
         from ddgrasp.progress import Progress
         from sensors.recordings import realsense_live as live
 
@@ -91,9 +92,7 @@ class RecordRealsense:
         imported, take = live.record(options, path, Progress(name="record realsense"))
         print(live.summary(imported, take, frames))
         if take.trouble:
-            raise UserError(
-                f"the camera stopped ({take.trouble}): what it gave is kept; check the USB 3 cable."
-            )
+            raise UserError(take.trouble)
 
 
 @dataclass(frozen=True)

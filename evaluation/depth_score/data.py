@@ -175,6 +175,8 @@ class RealFrames:
     rgb: UInt8[np.ndarray, "N h w 3"]
     focal_px: float
     baseline_m: float
+    unaligned: tuple[Path, ...] = ()
+    """Recordings among them whose colour is not aligned to depth."""
 
 
 def real_size(root: Path, width_px: int) -> tuple[int, int]:
@@ -197,7 +199,9 @@ def load_real(root: Path, width_px: int, last: int) -> RealFrames:
     chosen = frames[-last:]
     depth_mm = np.stack([depth.crop_nearest(r.depth_mm(i), size) for r, i in chosen])
     rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
-    return RealFrames(len(frames), depth_mm, rgb, focal_px * width_px / recordings[0].width_px, baseline_m)
+    unaligned = tuple(r.path for r in recordings if not r.color_aligned)
+    focal_px *= width_px / recordings[0].width_px
+    return RealFrames(len(frames), depth_mm, rgb, focal_px, baseline_m, unaligned)
 
 
 def _of_one_size(root: Path) -> list[Recording]:
@@ -216,9 +220,16 @@ def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
     """The frames as episodes: even ones are the real side, odd ones give the geometry.
 
     Both sides see the same room, a frame apart: the distance between them is the sensor's alone.
+
+    Raises UserError if colour is wanted that is not aligned to depth.
     """
     from ddg_jax.data import PIECEWISE, surfaces
 
+    if with_rgb and frames.unaligned:
+        raise UserError(
+            f"{frames.unaligned[0]}: colour is not aligned to depth, as column monocular needs it: align it "
+            "when recording, or leave monocular out of --columns."
+        )
     depth_mm, rgb = frames.depth_mm, frames.rgb
     clean = depth.to_millimetres(surfaces(depth.to_metres(depth_mm), PIECEWISE))
     episodes = []

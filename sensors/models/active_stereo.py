@@ -246,11 +246,17 @@ class ActiveStereo:
         """(H, W) uint8: blur of the lens, shot and read noise, saturation, quantisation."""
         c = self.config
         if c.lens_blur_px > 0:
-            radiance = cv2.GaussianBlur(radiance, (5, 5), c.lens_blur_px)
+            side = blur_side_px(c.lens_blur_px)
+            radiance = cv2.GaussianBlur(radiance, (side, side), c.lens_blur_px)
         signal = np.minimum(radiance * np.float32(exposure), 1.0)
         sigma = np.sqrt(signal / np.float32(c.full_well_electrons) + np.float32(c.read_noise**2))
         noise = rng.standard_normal(signal.shape, dtype=np.float32)
         return np.clip(255.0 * (signal + sigma * noise) + 0.5, 0, 255).astype(np.uint8)
+
+
+def blur_side_px(sigma_px: float) -> int:
+    """Side of the kernel for a Gaussian of `sigma_px`: 5, or beyond 0.8 px three sigma to either side."""
+    return 5 if sigma_px <= 0.8 else 2 * math.ceil(3 * sigma_px) + 1
 
 
 def _beside(T_world_cam: np.ndarray, x_m: float) -> np.ndarray:

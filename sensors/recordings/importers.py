@@ -4,9 +4,10 @@ Only pictures and what the camera is are kept: no pose, no CAD, no pairing. A fr
 named and left out; a source none of whose frames can be used, or whose depth is in another unit, is refused.
 """
 
+import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ddgrasp.depth import from_counts
 from ddgrasp.errors import UserError
 from sensors.recordings.recording import (
     FARTHEST_MEDIAN_M,
+    META_FILE,
     NEAREST_MEDIAN_M,
     UNIT_CHECK_FRAMES,
     RecordingWriter,
@@ -29,6 +31,8 @@ COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 REALSENSE_SUFFIXES = (".bag", ".db3")
+KEPT_META = ("sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth")
+"""What is taken over of a folder's own meta.json."""
 _ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
 
 
@@ -46,7 +50,9 @@ def import_recording(source: Source, path: Path) -> Imported:
     """Writes the usable frames of `source` to a recording at `path`, which appears only when complete.
 
     Raises:
-        UserError: `path` exists, no usable frame, or depth whose median cannot be a D4xx's in that unit.
+        UserError: `path` exists, no usable frame, or depth whose median cannot be a D4xx's in that unit (of
+            the first frames alone, where the unit is certain).
+        OSError: a frame could not be written, and `source` keeps none then, or it was the first.
     """
     if path.exists():
         raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
@@ -59,12 +65,19 @@ def import_recording(source: Source, path: Path) -> Imported:
                 skipped.append(f"{frame.name}: {reason}")
                 continue
             size = depth_mm.shape
+            try:
+                writer.add(frame.rgb, depth_mm)
+            except OSError as error:
+                if source.cut_short is None or not frames:
+                    raise
+                source.cut_short(error)
+                break
             frames += 1
-            writer.add(frame.rgb, depth_mm)
             if frames == UNIT_CHECK_FRAMES:  # not after an hour
                 _check_unit(source, medians_m)
         writer.meta.update(source.closing_meta())
-        _check_unit(source, medians_m)
+        if not source.unit_is_certain or frames < UNIT_CHECK_FRAMES:
+            _check_unit(source, medians_m)
         if not frames:
             raise UserError(
                 f"{source.path}: none of its {len(skipped)} frames can be used "
@@ -73,13 +86,17 @@ def import_recording(source: Source, path: Path) -> Imported:
     return Imported(path, frames, tuple(skipped))
 
 
-def import_all(sources: list[Source], out: Path) -> tuple[list[Imported], list[str]]:
+def import_all(
+    sources: list[Source], out: Path, refused: Sequence[str] = ()
+) -> tuple[list[Imported], list[str]]:
     """Imports each source to `out`/<its name>; (what was imported, why others were refused).
+
+    `refused`: why some were before (`find_sources`).
 
     Raises:
         UserError: every one was refused.
     """
-    done, refused = [], []
+    done, refused = [], list(refused)
     for source in sources:
         try:
             done.append(import_recording(source, out / _name(source.path)))
@@ -116,7 +133,7 @@ def _usable(frame: RawFrame, unit_m: float, size: tuple[int, ...] | None) -> tup
     depth = frame.depth
     if depth is None:
         return None, "depth cannot be read"
-    if depth.ndim != 2 or depth.dtype == np.uint8:
+    if not _is_depth(depth):
         return None, f"depth is {depth.dtype} {depth.shape}, expected one channel of 16 bits or floats"
     if frame.rgb is None:
         return None, "colour is missing or cannot be read"
@@ -128,10 +145,15 @@ def _usable(frame: RawFrame, unit_m: float, size: tuple[int, ...] | None) -> tup
 
 def _median_m(frame: RawFrame, unit_m: float) -> list[float]:
     """The median of a frame's positive depths in metres; nothing if it has none."""
-    if frame.depth is None or frame.depth.dtype == np.uint8:
+    if frame.depth is None or not _is_depth(frame.depth):
         return []
     positive = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
     return [float(np.median(positive)) * unit_m] if positive.size else []
+
+
+def _is_depth(depth: np.ndarray) -> bool:
+    """Whether an array can be depth in some unit: one channel of floats, or integers of more than 8 bits."""
+    return depth.ndim == 2 and depth.dtype.kind in "iuf" and depth.dtype.itemsize > 1
 
 
 def _check_unit(source: Source, medians_m: list[float]) -> None:
@@ -152,11 +174,11 @@ def _check_unit(source: Source, medians_m: list[float]) -> None:
 # --- folders of pictures ---------------------------------------------------------------------------
 
 
-def folder_sources(root: Path, depth_unit_m: float, meta: dict[str, Any]) -> list[Source]:
-    """`root` if it has depth/ and a colour folder, else every folder in it that does.
+def folder_sources(root: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple[list[Source], list[str]]:
+    """`root` if it has depth/ and a colour folder, else every folder in it that does; why others are refused.
 
     Raises:
-        UserError: neither.
+        UserError: neither, or every one was refused.
     """
     folders = [root] if _is_pair(root) else sorted(p for p in root.iterdir() if _is_pair(p))
     if not folders:
@@ -164,20 +186,26 @@ def folder_sources(root: Path, depth_unit_m: float, meta: dict[str, Any]) -> lis
             f"{root}: no depth/ beside one of {', '.join(f'{n}/' for n in COLOR_FOLDERS)} in it or in its "
             "folders; put the pictures there, named alike."
         )
-    return [folder_source(folder, depth_unit_m, meta) for folder in folders]
+    return _each(folders, lambda folder: folder_source(folder, depth_unit_m, meta))
 
 
 def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> Source:
     """Pictures depth/*.png (16 bits), .npy or .tif, matched by name with those of the colour folder.
 
-    `depth_unit_m` 0 takes millimetres for integers, metres for floats.
+    `depth_unit_m` 0 takes that of the folder's own meta.json, if it is or was a recording; without one,
+    millimetres for integers, metres for floats. `meta` comes before that file's KEPT_META.
+
+    Raises:
+        UserError: no depth pictures, or a meta.json that is none.
     """
     pictures = (p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
     files = sorted(pictures, key=_in_time)
     if not files:
         raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
+    own = _own_meta(folder / META_FILE)
+    depth_unit_m = depth_unit_m or own.get("depth_unit_m", 0.0)
     if not depth_unit_m:
-        first = next((d for d in map(_read_depth, files) if d is not None), None)
+        first = next((d for d in map(_read_depth, files) if d is not None and _is_depth(d)), None)
         floats = first is not None and np.issubdtype(first.dtype, np.floating)
         depth_unit_m = 1.0 if floats else DEPTH_UNIT_M
     colors = {_key(p): p for p in _color_folder(folder).iterdir() if p.suffix.lower() in COLOR_SUFFIXES}
@@ -187,7 +215,24 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
             color = colors.get(_key(file))
             yield RawFrame(file.name, _read_depth(file), None if color is None else _read_rgb(color))
 
-    return Source(folder, frames, depth_unit_m, meta)
+    kept = {name: own[name] for name in KEPT_META if name in own}
+    return Source(folder, frames, depth_unit_m, {**kept, **meta})
+
+
+def _own_meta(file: Path) -> dict[str, Any]:
+    """What a folder's meta.json says, nothing if there is none. Raises UserError if it is none."""
+    if not file.exists():
+        return {}
+    try:
+        meta = json.loads(file.read_text())
+    except (ValueError, OSError) as error:
+        raise UserError(f"{file}: cannot be read ({error}); repair it, or take it away.") from None
+    if not isinstance(meta, dict):
+        raise UserError(f"{file}: is a {type(meta).__name__}; expected a recording's fields: take it away.")
+    unit = meta.get("depth_unit_m", DEPTH_UNIT_M)
+    if isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit <= 1:
+        raise UserError(f"{file}: depth_unit_m is {unit!r}; expected metres per unit of depth, up to 1.")
+    return meta
 
 
 def _in_time(file: Path) -> list[tuple[int, str]]:
@@ -227,8 +272,8 @@ def _read_rgb(file: Path) -> np.ndarray | None:
 # --- anything --------------------------------------------------------------------------------------
 
 
-def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> list[Source]:
-    """A RealSense file (`.bag`, `.db3`), a folder of them, or folders of pictures.
+def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple[list[Source], list[str]]:
+    """A RealSense file (`.bag`, `.db3`), a folder of them, or folders of pictures; why others are refused.
 
     Raises:
         UserError: nothing there that can be imported.
@@ -245,5 +290,22 @@ def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> list[
         return folder_sources(path, depth_unit_m, meta)
     from sensors.recordings.realsense import file_source
 
-    sources = [file_source(file) for file in files]
-    return [replace(s, depth_unit_m=depth_unit_m or s.depth_unit_m, meta={**s.meta, **meta}) for s in sources]
+    def given(file: Path) -> Source:
+        source = file_source(file)
+        unit_m = depth_unit_m or source.depth_unit_m
+        return replace(source, depth_unit_m=unit_m, meta={**source.meta, **meta})
+
+    return _each(files, given)
+
+
+def _each(paths: Iterable[Path], source_of: Callable[[Path], Source]) -> tuple[list[Source], list[str]]:
+    """(the sources of `paths`, why others are refused). Raises UserError if all are."""
+    sources, refused = [], []
+    for path in paths:
+        try:
+            sources.append(source_of(path))
+        except UserError as error:
+            refused.append(str(error))
+    if not sources:
+        raise UserError(refused[0])
+    return sources, refused

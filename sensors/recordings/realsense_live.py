@@ -77,11 +77,19 @@ class Take:
     lost: int = 0
     """Frames that were due but gone, because writing was too slow."""
     trouble: str = ""
-    """Why the camera stopped before its time; empty if it did not."""
+    """Why it ended before its time, and the remedy; empty if it did not."""
 
     def meta(self, hz: int) -> dict[str, Any]:
         """Fields of meta.json: the rate that came of `hz`."""
         return {"hz": round(hz * self.frames / (self.frames + self.lost), 1)} if self.lost else {"hz": hz}
+
+    def cut_short(self, error: OSError) -> None:
+        """The frame that was given last could not be written."""
+        self.frames -= 1
+        self.trouble = (
+            f"a frame could not be written ({error.strerror or error}): those before it are kept; make room "
+            "on the disk, or give another --out."
+        )
 
 
 def frame_count(frames: int, seconds: float, hz: int) -> int:
@@ -108,8 +116,8 @@ def new_path(out: Path, name: str) -> Path:
 def record(options: LiveOptions, path: Path, progress: Progress) -> tuple[Imported, Take]:
     """Records the camera to `path`, which appears only when complete.
 
-    Ctrl-C or SIGTERM end the recording and keep what it has; so does a camera that stops after its first
-    frame.
+    Ctrl-C or SIGTERM end the recording and keep what it has; so do a camera that stops after its first
+    frame, and a disk that is full then.
 
     Raises:
         UserError: pyrealsense2 or the camera is missing, has no such streams, or gives no usable frame.
@@ -128,6 +136,7 @@ def record(options: LiveOptions, path: Path, progress: Progress) -> tuple[Import
                 meta,
                 unit_is_certain=True,
                 closing_meta=lambda: take.meta(options.hz),
+                cut_short=take.cut_short,
             )
             return import_recording(source, path), take
 
@@ -155,7 +164,7 @@ def _kept(
                 raise UserError(
                     f"the camera has started but gives no frames ({error}): check the USB 3 cable and port."
                 ) from error
-            take.trouble = str(error)
+            take.trouble = f"the camera stopped ({error}): what it gave is kept; check the USB 3 cable."
             return
         if settling:
             settling -= 1

@@ -135,6 +135,11 @@ class Recording:
         """Whether the frames follow each other in time (temporal statistics make sense)."""
         return bool(self.meta.get("consecutive_frames", False))
 
+    @property
+    def color_aligned(self) -> bool:
+        """False if meta.json says that colour is the colour camera's own picture, not depth's."""
+        return self.meta.get("color_aligned_to_depth") is not False
+
     def depth_mm(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 planar depth in millimetres, 0 = invalid."""
         file = self.depth_files[index]

@@ -34,3 +34,6 @@ class Source:
     """Whether depths that cannot be a D4xx's are the scene's fault, not the unit's."""
     closing_meta: Callable[[], dict[str, Any]] = dict
     """Fields of meta.json that are known after the last frame alone."""
+    cut_short: Callable[[OSError], None] | None = None
+    """What is told that a frame could not be written, where the frames before are kept then, since they come
+    but once; None keeps none."""

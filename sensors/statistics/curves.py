@@ -250,17 +250,17 @@ def static_runs(depth_mm: Real[np.ndarray, "T H W"], fb_px_m: float) -> tuple[sl
     """Runs of at least STATIC_FRAMES consecutive frames of a (T, H, W) recording that stand still.
 
     The median change of disparity between two frames has a floor, the camera's noise; a pair near the
-    quietest tenth of the pairs is taken to stand still.
+    quietest tenth of the pairs is taken to stand still; one that shares no valid pixel is not.
     """
     change = np.array(
         [
-            np.nanmedian(np.abs(_disparity(a, fb_px_m) - _disparity(b, fb_px_m)))
+            _median_valid(np.abs(_disparity(a, fb_px_m) - _disparity(b, fb_px_m)))
             for a, b in zip(depth_mm[:-1], depth_mm[1:], strict=True)
         ]
     )
-    if not len(change):
+    if np.isnan(change).all():
         return ()
-    still = change <= STATIC_RATIO * np.quantile(change, 0.1)
+    still = change <= STATIC_RATIO * np.nanquantile(change, 0.1)
     runs, start = [], 0
     for t in range(len(still) + 1):
         if t == len(still) or not still[t]:
@@ -290,6 +290,12 @@ def _disparity(depth_mm: np.ndarray, fb_px_m: float) -> np.ndarray:
     """float32 pixels, nan where invalid."""
     depth = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float32)
     return np.float32(1000.0 * fb_px_m) / depth
+
+
+def _median_valid(values: np.ndarray) -> np.floating:
+    """The median of those that are no nan; nan if all are."""
+    valid = values[~np.isnan(values)]
+    return np.median(valid) if len(valid) else np.float32("nan")
 
 
 def _medians(edges: Sequence[float], where: np.ndarray, values: np.ndarray) -> Curve:
