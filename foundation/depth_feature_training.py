@@ -69,9 +69,10 @@ def train(config: DepthFeatureConfig, out: Path, *, quiet: bool = False) -> dict
     params = _optimise(config, training, scale, work, progress)
     result, tested = _frozen(params, training, config.seed), _test(params, test, scale, config.seed)
     save_params(out / depth_features.PARAMS_FILE, result)
+    digest = depth_features.file_digest(out / depth_features.PARAMS_FILE)
     manifest = {
-        "name": depth_features.NAME,
-        "sha256": depth_features.file_digest(out / depth_features.PARAMS_FILE),
+        "name": depth_features.name_of(digest),
+        "sha256": digest,
         "config": config,
         "trained_on": {"pictures": len(training), "treatments": list(TREATMENTS)},
         "tested_on_new_cameras": tested,

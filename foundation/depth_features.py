@@ -140,6 +140,11 @@ def read_manifest(directory: Path = DIRECTORY) -> dict[str, Any]:
     return manifest
 
 
+def name_of(digest: str) -> str:
+    """The name of an extractor with weights of this SHA-256; NAME is that of the frozen one alone."""
+    return f"depthfeat-{digest[:8]}"
+
+
 def file_digest(path: Path) -> str:
     """SHA-256 of a file; UserError if it is absent."""
     try:

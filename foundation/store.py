@@ -131,6 +131,11 @@ def installed(weights_dir: Path = WEIGHTS_DIR) -> dict[str, WeightsManifest]:
 def _check_metric(file: Path, network: str, max_depth_m: float) -> None:
     if max_depth_m and not network.startswith(catalog.IMAGE_DEPTH):
         raise UserError(f"max_depth_m is {max_depth_m:g}, but {network} has no metric variant of this kind.")
+    if "metric" in file.name and network.startswith(catalog.VIDEO_DEPTH):
+        raise UserError(
+            f"{file.name} looks like a metric video depth model, which are not supported: take "
+            f"{catalog.get_entry(network).file}."
+        )
     if "metric" in file.name and network.startswith(catalog.IMAGE_DEPTH) and not max_depth_m:
         raise UserError(
             f"{file.name} looks like a metric depth model, whose range is not in the file: give "

@@ -105,6 +105,7 @@ def test_training_freezes_an_extractor_that_loads(tmp_path):
     assert not (tmp_path / "made" / training.WORK).exists()
     assert 0 <= manifest["tested_on_new_cameras"]["treatment_accuracy"] <= 1
     extractor = depth_features.load(tmp_path / "made")
+    assert extractor.name == manifest["name"] == f"depthfeat-{manifest['sha256'][:8]}"
     assert extractor(scene()).shape == (1, depth_features.FEATURES)
     with pytest.raises(UserError, match="finished extractor"):
         training.train(TINY, tmp_path / "made", quiet=True)

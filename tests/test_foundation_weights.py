@@ -234,6 +234,15 @@ def test_metric_weights_lie_beside_the_relative_ones_and_state_their_range(tmp_p
     assert store.read_manifest(directory).licence == catalog.METRIC_NOTE
 
 
+def test_metric_weights_of_the_video_network_are_refused(tmp_path):
+    shapes = {key: target.shape for key, target in convert.targets("video_depth_anything_small").items()}
+    file = tmp_path / "metric_video_depth_anything_vits.safetensors"
+    files.write_safetensors(file, {key: np.zeros(shape, np.float32) for key, shape in shapes.items()})
+    with pytest.raises(UserError, match="not supported: take video_depth_anything_vits.pth"):
+        store.convert_file(file, tmp_path / "weights")
+    assert not (tmp_path / "weights").exists()
+
+
 def test_the_catalog_states_licences():
     assert len(catalog.ENTRIES) == 8
     for name, entry in catalog.ENTRIES.items():
