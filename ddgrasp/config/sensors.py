@@ -13,6 +13,9 @@ BY_COLOUR: tuple[Sensor, ...] = ("stereo",)
 _Window = Annotated[int, Range(1, 255)]
 """Side of a window in pixels."""
 
+WINDOWS = ("block_px", "residual_window_px", "refine_window_px", "flat_window_px")
+"""Fields of `StereoConfig` that are sides of a window."""
+
 
 def odd(side_px: float) -> int:
     """The odd number nearest to `side_px`: a window that has a middle pixel."""
@@ -57,7 +60,7 @@ class StereoConfig(Section, name="record.stereo"):
     """Scales the semi-global matcher's two penalties (8 and 32 per pixel of the window)."""
     uniqueness_percent: Annotated[int, Range(0, 100)] = 15
     """The best match must beat the second by this margin."""
-    left_right_px: Annotated[int, Range(-1, 100)] = 1
+    left_right_px: Annotated[int, Range(1, 100)] = 1
     """Largest disagreement of the left-right check, pixels."""
     speckle_px: Annotated[int, Range(0, 100_000)] = 48
     """Smaller islands of disparity are removed."""
@@ -82,16 +85,16 @@ class StereoConfig(Section, name="record.stereo"):
 
     def finer(self, factor: float) -> "StereoConfig":
         """For pictures of the same camera with `factor` times the pixels per side: larger windows."""
-        sides = ("block_px", "residual_window_px", "refine_window_px", "flat_window_px")
-        windows = {name: odd(getattr(self, name) * factor) for name in sides}
+        windows = {name: odd(getattr(self, name) * factor) for name in WINDOWS}
         return replace(self, **windows, speckle_px=round(self.speckle_px * factor**2))
 
     def check(self) -> None:
         """See `Section.check`."""
         if self.min_range_m >= self.max_range_m:
             raise self.error("min_range_m", f"less than max_range_m, {self.max_range_m}")
-        if self.block_px % 2 == 0:
-            raise self.error("block_px", "an odd number: the window has a middle pixel")
+        for name in WINDOWS:
+            if getattr(self, name) % 2 == 0:
+                raise self.error(name, "an odd number: the window has a middle pixel")
 
 
 @dataclass(frozen=True)
