@@ -25,8 +25,8 @@ def write_encoder(
         for block in range(student.encoder.stage_blocks[index]):
             x = layers.write_block(g, x, params[f"stage{index}_block{block}"], stride if block == 0 else 1)
     if student.encoder.pooling == "mean":
-        pooled = g.op("Flatten", g.op("GlobalAveragePool", x))
-        return g.relu(g.dense(pooled, params["features"]))
+        means = g.op("Flatten", g.op("GlobalAveragePool", x))
+        return _dense_with_centre(g, means, params["features"], profile)
     kernel, bias = params["cells"]["kernel"], params["cells"]["bias"]
     cells = g.conv(x, np.asarray(kernel)[None, None], bias)
     cells = g.reshape(cells, [0, student.encoder.keypoints, -1])  # (B, K, P)
@@ -37,12 +37,17 @@ def write_encoder(
 
 
 def _write_tokens(g: GraphBuilder, cells: str, params: Params, profile: CameraProfile) -> str:
-    """Every cell's channels, flattened; the centred crop's coordinates are a constant: part of the bias."""
+    """Every cell's channels, flattened."""
     tokens = g.op("Flatten", g.relu(g.op("Transpose", cells, perm=[0, 2, 1])))
+    return g.relu(_dense_with_centre(g, tokens, params, profile))
+
+
+def _dense_with_centre(g: GraphBuilder, x: str, params: Params, profile: CameraProfile) -> str:
+    """Dense of `x` and the centred crop's coordinates, which are a constant: part of the bias."""
     kernel = np.asarray(params["kernel"])
     centre = encoder.static_crop_centre(profile)
     bias = np.asarray(params["bias"]) + centre @ kernel[-len(centre) :]
-    return g.relu(g.affine(tokens, kernel[: -len(centre)], bias))
+    return g.affine(x, kernel[: -len(centre)], bias)
 
 
 def _write_keypoints(

@@ -249,13 +249,14 @@ class DepthEncoder(nn.Module):
     def _pool(self, x: AnyArray, picture: AnyArray, origin_rc: AnyArray) -> jax.Array:
         config = self.config
         cells = x.reshape(x.shape[0], -1, x.shape[-1])
+        centre = crop_centre(origin_rc, self.profile)
         if config.encoder.pooling == "mean":
-            pooled = cells.mean(1)
-        else:
-            cells = nn.Dense(config.encoder.keypoints, name="cells")(cells)
-            pooled = cells.reshape(cells.shape[0], -1)
+            # Linear, as ResNet's last layer: means differ little from picture to picture, and a relu dies.
+            known = jnp.concatenate([cells.mean(1), centre], axis=-1)
+            return nn.Dense(config.encoder.features, name="features")(known)
+        cells = nn.Dense(config.encoder.keypoints, name="cells")(cells)
+        pooled = cells.reshape(cells.shape[0], -1)
         if config.encoder.pooling == "tokens":
-            centre = crop_centre(origin_rc, self.profile)
             pooled = jnp.concatenate([nn.relu(pooled), centre], axis=-1)
         if config.encoder.pooling == "spatial_softmax":
             maps = cell_maps(origin_rc, self.profile, config)

@@ -81,7 +81,7 @@ class EncoderConfig(Section, name="student.encoder"):
     norm: Norm = "group"
     """group (GroupNorm) or none."""
     pooling: Pooling = "spatial_softmax"
-    """spatial_softmax (keypoints in the robot's frame), tokens (every cell, projected) or mean."""
+    """spatial_softmax (keypoints in the robot's frame), tokens (every cell, projected) or mean (ResNet's)."""
     keypoints: Width = 32
     """Keypoints of spatial_softmax, or channels per cell of tokens."""
     features: Width = 128
