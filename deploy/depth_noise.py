@@ -222,12 +222,12 @@ class EpisodeNoise:
             self._shared[chosen] = self._normals.draw(self._shape(len(chosen)))
 
     def _numbers(self, cameras: Sequence[int] | Sequence[bool]) -> list[int]:
-        given = np.asarray(cameras)
-        if given.dtype != bool:
-            return [int(number) for number in cameras]
-        if given.shape != (self._count,):
+        given = getattr(cameras, "tolist", lambda: list(cameras))()  # tensors of any device, too
+        if not any(isinstance(number, bool | np.bool_) for number in given):
+            return [int(number) for number in given]
+        if len(given) != self._count or not all(isinstance(number, bool | np.bool_) for number in given):
             raise ValueError
-        return np.flatnonzero(given).tolist()
+        return [number for number, done in enumerate(given) if done]
 
     def _shape(self, count: int) -> tuple[int, ...]:
         return (count, self._info.planes(self._steps), self._info.height_px, self._info.width_px)

@@ -45,6 +45,7 @@ class DeploymentRecord:
         self._meta = {
             "sensor": sensor, "fx_px": profile.fx_px, "baseline_m": profile.baseline_m,
             "hz": contract.CONTROL_HZ / apart, "consecutive_frames": apart == 1,
+            "color_aligned_to_depth": isinstance(camera, Filmed),  # a camera's own is of another lens
         }  # fmt: skip
         self._rows: list[dict[str, Any]] = []
         self._queue: queue.Queue[tuple[np.ndarray, np.ndarray] | None] = queue.Queue()

@@ -184,7 +184,7 @@ class SafetyFilter:
         if self._outside_m(q_rad + step) <= allowed:
             return step
         causes.append("workspace")
-        slid = self._slide(q_rad, step)
+        slid = self._gently_down(q_rad, self._slide(q_rad, step))
         if self._outside_m(q_rad + slid) <= max(allowed, _SLIDE_TOLERANCE_M):
             return slid
         return _shorten(step, lambda part: self._outside_m(q_rad + part) <= allowed)

@@ -11,7 +11,7 @@ from ddgrasp.errors import UserError
 
 KEPT = 2
 """Checkpoints in a folder: should the newest be lost with the disk's last write, there is one before."""
-UNREADABLE = (ValueError, KeyError, TypeError, OSError)
+UNREADABLE = (ValueError, KeyError, TypeError, FileNotFoundError)
 """What Orbax raises of a checkpoint that is damaged or of another structure."""
 
 State = TypeVar("State")

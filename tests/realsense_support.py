@@ -127,7 +127,7 @@ class ScriptedLibrary:
     camera_info = SimpleNamespace(name="name", serial_number="serial_number")
     stream = SimpleNamespace(depth="depth", color="color")
     format = SimpleNamespace(z16="z16", rgb8="rgb8")
-    option = SimpleNamespace(stereo_baseline="baseline")
+    option = SimpleNamespace(stereo_baseline="baseline", emitter_enabled="emitter")
 
     def __init__(self, numbers, *, start_error: str = "", serials: tuple[str, ...] = (SERIAL,)):
         self._numbers, self._start_error, self._serials = iter(numbers), start_error, serials
@@ -151,8 +151,9 @@ class ScriptedLibrary:
         if self._start_error:
             raise RuntimeError(self._start_error)
         sensor = SimpleNamespace(
-            supports=lambda what: True, get_option=lambda what: -BASELINE_MM, get_depth_scale=lambda: 0.0001
-        )
+            supports=lambda what: True, get_option=lambda what: -BASELINE_MM, get_depth_scale=lambda: 0.0001,
+            set_option=lambda what, value: self.asked.append((what, value)),
+        )  # fmt: skip
         device = SimpleNamespace(get_info=lambda what: NAME, first_depth_sensor=lambda: sensor)
         stream = SimpleNamespace(fps=lambda: 30, get_intrinsics=lambda: SimpleNamespace(fx=FX_PX))
         video = SimpleNamespace(as_video_stream_profile=lambda: stream)

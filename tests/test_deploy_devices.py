@@ -224,7 +224,7 @@ def test_a_stop_that_never_ends_is_the_hand_s_error(monkeypatch):
 def test_an_arm_without_its_hand_is_told_from_no_arm(monkeypatch, answers):
     """One that another program has takes the connection and stays silent: franky would wait for ever."""
     monkeypatch.setattr(franka_probe, "ANSWER_S", 0.3)
-    robot = FrankaRobot(FrankaConfig(host="127.0.0.9"), SimClock(), None)
+    robot = FrankaRobot(FrankaConfig(host="127.0.0.1"), SimClock(), None)
     robot._errors = (RuntimeError,)
 
     def refused(host: str):
@@ -233,7 +233,8 @@ def test_an_arm_without_its_hand_is_told_from_no_arm(monkeypatch, answers):
 
     robot._franky = SimpleNamespace(Gripper=refused)
     said = "refused" if answers else "timed out"
-    with socket.create_server(("127.0.0.9", franka_probe.GRIPPER_PORT)) as server:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        monkeypatch.setattr(franka_probe, "GRIPPER_PORT", server.getsockname()[1])
         if answers:
             threading.Thread(target=lambda: server.accept()[0].sendall(bytes(14)), daemon=True).start()
         with pytest.raises(UserError, match=rf"answers, its gripper does not \(.*{said}.*in Desk"):
@@ -268,7 +269,7 @@ def test_a_hand_that_does_not_home_ends_the_start(monkeypatch):
     with pytest.raises(HandError, match="homing failed: take away what is between its fingers"):
         robot._home(Homing(False))
     never = Homing(None)
-    with pytest.raises(HandError, match="homing did not end within 0.05 s"):
+    with pytest.raises(HandError, match="homing did not end in 0.05 s"):
         robot._home(never)
     assert never.stopped
 

@@ -67,6 +67,7 @@ def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
     report, folder = run()
     recording = Recording.open(folder)
     assert len(recording) == report.steps == 5 and recording.consecutive and not recording.skipped
+    assert not recording.color_aligned, "a camera's own colour is of another lens"
     np.testing.assert_array_equal(recording.depth_mm(2)[:, 0], (DEPTH_MM + np.uint16(3))[:, 0])
     assert recording.optics() == pytest.approx((168.6, 0.095), abs=0.1)
     rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
@@ -197,10 +198,16 @@ def test_a_camera_that_fails_as_it_stops_costs_nothing_of_what_was_recorded(run,
     assert kept["steps"] == 5 and kept["fault"] == "RuntimeError: no device connected"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_second_signal_does_not_cut_the_stopping_short(run, number):
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as where nothing was said about it
+@pytest.fixture
+def hang_ups_count():
+    """Not as under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_second_signal_does_not_cut_the_stopping_short(run, number, hang_ups_count):
     class Stopping(ColourCamera):
         def stop(self):
             os.kill(os.getpid(), signal.SIGINT)

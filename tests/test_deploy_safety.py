@@ -220,7 +220,7 @@ def test_from_any_pose_a_step_keeps_the_curve_of_braking_and_the_slow_way_down()
         assert (np.abs(step) <= filter_._braked(room) + 1e-9).all()
         assert (np.abs(step) <= change + 1e-9).all()
         here_m, there_m = (kinematics.grip_position(x)[2] for x in (q, target))
-        if "workspace" not in changed and there_m < limits.approach_below_m:
+        if there_m < limits.approach_below_m:
             low += 1
             assert here_m - there_m <= limits.approach_m_s * limits.period_s + 1e-9
         causes.update(changed)

@@ -258,11 +258,25 @@ def falling_apart(after):
 
 @pytest.mark.parametrize(("every", "at", "kept"), [(7, 14, [7]), (200, 20, []), (10, 20, [10])])
 def test_a_training_that_has_diverged_ends_and_its_state_is_not_kept(tmp_path, every, at, kept):
-    progress, said = Progress(quiet=True), f"^fit: loss is nan after {at} steps: .*smaller learning rate"
+    progress, said = (
+        Progress(quiet=True),
+        f"^fit: loss is not finite after {at} steps: .*smaller learning rate",
+    )
     with pytest.raises(UserError, match=said) as error:
         run_steps(fresh(), 30, falling_apart(12), tmp_path, label="fit", progress=progress, every=every)
     assert "\n" not in str(error.value)
     assert sorted(int(path.name) for path in tmp_path.iterdir()) == kept
+
+
+def test_parameters_that_are_no_numbers_are_not_kept_though_the_loss_before_was_one(tmp_path):
+    def step_function(state, step):
+        state, metrics = noisy_step(state, step)
+        spoilt = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state.params)
+        return (state.replace(params=spoilt) if step == 9 else state), metrics
+
+    with pytest.raises(UserError, match="a parameter is not finite after 10 steps"):
+        run_steps(fresh(), 30, step_function, tmp_path, label="", progress=Progress(quiet=True), every=5)
+    assert [path.name for path in tmp_path.iterdir()] == ["5"]
 
 
 def test_ctrl_c_between_two_points_keeps_no_diverged_state(tmp_path):

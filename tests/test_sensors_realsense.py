@@ -115,7 +115,8 @@ def test_every_third_frame_is_kept_once_the_exposure_has_settled(tmp_path, monke
     library = scripted(monkeypatch, count(1))
     record(tmp_path, "--frames", 4, "--serial", SERIAL)
     assert numbers_in(tmp_path / "take") == [16, 19, 22, 25]
-    assert library.asked == [(SERIAL,), ("depth", 64, 48, "z16", 30), ("color", 64, 48, "rgb8", 30)]
+    streams = [("depth", 64, 48, "z16", 30), ("color", 64, 48, "rgb8", 30)]
+    assert library.asked == [(SERIAL,), *streams, ("emitter", 1.0)]
     assert library.stopped
     shown = capfd.readouterr()
     assert shown.out == f"{tmp_path / 'take'}: 4 frames\n"

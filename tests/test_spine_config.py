@@ -205,7 +205,6 @@ def test_choices_are_those_that_the_code_knows():
         "demos collect --demos.parallel 1000000 => demos.parallel is 1000000; expected at most 65536",
         "record --record.stereo.block-px 4 => record.stereo.block_px is 4; expected an odd number",
         "record --record.stereo.flat-window-px 8 => flat_window_px is 8; expected an odd number",
-        "record --record.stereo.left-right-px 0 => left_right_px is 0; expected 1 to 100",
         "record --record.frames -1 => record.frames is -1; expected at least 1",
         "record import x --depth-unit-m 5 => --depth-unit-m is 5.0; expected 0 to 1",
         "ddg fit --ddg.unet.widths 8 8 => expected one number per level in each",

@@ -278,7 +278,7 @@ class DDGConfig(Section, name="ddg"):
             raise UserError(
                 f"ddg.sampling.spacing is {self.sampling.spacing}; sampler progressive makes one step of "
                 f"two, as {' and '.join(HALVED_SPACINGS)} ones alone allow: give --ddg.sampling.spacing "
-                "quadratic."
+                "quadratic, and distil again what was distilled with others."
             )
         halvings, rest = divmod(self.training.distil_from, steps)
         if rest or halvings < 2 or halvings & (halvings - 1):

@@ -60,8 +60,8 @@ class StereoConfig(Section, name="record.stereo"):
     """Scales the semi-global matcher's two penalties (8 and 32 per pixel of the window)."""
     uniqueness_percent: Annotated[int, Range(0, 100)] = 15
     """The best match must beat the second by this margin."""
-    left_right_px: Annotated[int, Range(1, 100)] = 1
-    """Largest disagreement of the left-right check, pixels."""
+    left_right_px: Annotated[int, Range(-1, 100)] = 1
+    """Largest disagreement of the left-right check, pixels; 1 is the least, whatever is below it."""
     speckle_px: Annotated[int, Range(0, 100_000)] = 48
     """Smaller islands of disparity are removed."""
     residual_limit: Annotated[float, Range(0, 100, above=True)] = 1.15

@@ -26,17 +26,16 @@ class Driver:
         self._step_rad = speed_rad_s * contract.CONTROL_DT_S
         self._close = False
 
-    def go(self, q_target_rad: Float[np.ndarray, "7"]) -> bool:
-        """All joints at once to (7,) `q_target_rad`; whether the arm got there, and met nothing on the way.
-
-        Raises RobotError.
+    def go(self, q_target_rad: Float[np.ndarray, "7"], heed: bool = True) -> bool:
+        """All joints at once to (7,) `q_target_rad`; whether the arm got there, and met nothing on the way
+        (with `heed`; a way back begins at what it met). Raises RobotError.
         """
         best_rad, best_s = np.inf, self._clock.now()
         due_s = best_s
         while True:
             state = self._robot.read_state()
             q = state.q_rad
-            if state.met:
+            if state.met and heed:
                 return False
             left_rad = float(np.abs(q_target_rad - q).max())
             if left_rad < ARRIVED_RAD:

@@ -179,7 +179,7 @@ def _take(
 def _back(driver: Driver, stood_rad: np.ndarray) -> str:
     """From something in the way to (7,) where the arm stood before, which is known to be free. RobotError."""
     driver.rest()
-    if not driver.go(stood_rad):
+    if not driver.go(stood_rad, heed=False):
         raise RobotError("something is in its way, and on the way back: look at what it met")
     driver.rest()
     return "not reached, left out: something is in the way"

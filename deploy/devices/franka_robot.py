@@ -221,10 +221,13 @@ class FrankaRobot:
         """Raises HandError."""
         try:
             homing, end_s = gripper.homing_async(), time.monotonic() + HOMING_S
-            while not homing.wait(_POLL_S):  # in parts, so that Ctrl-C is heard
-                if time.monotonic() > end_s:
-                    gripper.stop()
-                    raise HandError(f"homing did not end within {HOMING_S:g} s: see what holds its fingers")
+            try:
+                while not homing.wait(_POLL_S):  # in parts, so that Ctrl-C is heard
+                    if time.monotonic() > end_s:
+                        raise HandError(f"homing did not end in {HOMING_S:g} s: see what holds its fingers")
+            except (HandError, KeyboardInterrupt):
+                gripper.stop()
+                raise
             homed = homing.get()
         except self._errors as error:
             raise HandError(str(error)) from error

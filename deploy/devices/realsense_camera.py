@@ -14,7 +14,7 @@ from ddgrasp import contract, depth
 from ddgrasp.errors import UserError
 from deploy.devices.options import Setup
 from deploy.interfaces import CameraError, Clock, Frame, Robot
-from sensors.recordings.realsense import load_pyrealsense2
+from sensors.recordings.realsense import load_pyrealsense2, project
 
 INTRINSICS_TOLERANCE = 0.1
 """A focal length or a principal point further than this share of the focal length from the stream's nominal
@@ -80,10 +80,8 @@ class RealSenseCamera:
                 f"({error}); check the USB 3 cable and deploy.realsense.serial {self._serial!r}."
             ) from error
         self._pipeline = pipeline
-        sensor = active.get_device().first_depth_sensor()
-        if sensor.supports(rs.option.emitter_enabled):  # a calibration that was killed leaves it off
-            sensor.set_option(rs.option.emitter_enabled, 1.0)
-        self._unit_m = sensor.get_depth_scale()
+        project(rs, active)
+        self._unit_m = active.get_device().first_depth_sensor().get_depth_scale()
         intrinsics = active.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
         self._stream = self._checked(intrinsics)
 

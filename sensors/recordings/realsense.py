@@ -49,6 +49,13 @@ def describe(rs: Any, profile: Any) -> tuple[dict[str, Any], float]:
     return meta, sensor.get_depth_scale()
 
 
+def project(rs: Any, profile: Any) -> None:
+    """Switches the projector on: a calibration that was killed leaves it off."""
+    sensor = profile.get_device().first_depth_sensor()
+    if sensor.supports(rs.option.emitter_enabled):
+        sensor.set_option(rs.option.emitter_enabled, 1.0)
+
+
 def raw_frame(frames: Any) -> RawFrame:
     """Depth and colour of a set of frames, copied: librealsense reuses its buffers."""
     depth, color = frames.get_depth_frame(), frames.get_color_frame()

@@ -16,7 +16,7 @@ from ddgrasp import contract
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.progress import Progress, Task
 from sensors.recordings.importers import Imported, RawFrame, Source, import_recording
-from sensors.recordings.realsense import describe, load_pyrealsense2, raw_frame
+from sensors.recordings.realsense import describe, load_pyrealsense2, project, raw_frame
 
 STREAM_HZ = 30
 """The camera's own rate; a recording keeps every frame or every n-th."""
@@ -194,6 +194,7 @@ def _started(rs: Any, options: LiveOptions) -> Iterator[tuple[Any, Any]]:
     except RuntimeError as error:
         raise _not_started(rs, options, error) from error
     try:
+        project(rs, profile)
         yield pipeline, profile
     finally:
         pipeline.stop()
