@@ -210,9 +210,9 @@ STUDENT_PAPER = replace(
 """`laptop` with the paper's student (III-C): ResNet-18 on depth alone, end to end, behaviour cloning on
 1,200 demos, one action from Gaussian noise; no privileged losses, hand view, DAgger or noise by hand. A
 sample takes 42 ms forward and backward on two Intel Xeon cores, so that its training is about 67 minutes;
-after 1,300 steps of 32 it does not look yet (docs/table2.md). Not the paper's: group norm for batch norm, random
-first weights (--student.encoder.weights weights/resnet18), three frames at 112 x 144, 1,500 steps of 64 (the
-paper gives none of these sizes)."""
+after 1,300 steps of 32 it does not look yet (docs/table2.md). Not the paper's: group norm for batch norm,
+random first weights (--student.encoder.weights weights/resnet18), three frames at 112 x 144, 1,500 steps
+of 64 (the paper gives none of these sizes)."""
 
 PAPER = Config(
     preset="paper",
