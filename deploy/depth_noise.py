@@ -223,9 +223,10 @@ class EpisodeNoise:
 
     def _numbers(self, cameras: Sequence[int] | Sequence[bool]) -> list[int]:
         given = getattr(cameras, "tolist", lambda: list(cameras))()  # tensors of any device, too
-        if not any(isinstance(number, bool | np.bool_) for number in given):
+        kinds = {isinstance(number, bool | np.bool_) for number in given}
+        if True not in kinds:
             return [int(number) for number in given]
-        if len(given) != self._count or not all(isinstance(number, bool | np.bool_) for number in given):
+        if False in kinds or len(given) != self._count:
             raise ValueError
         return [number for number, done in enumerate(given) if done]
 

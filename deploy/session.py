@@ -1,7 +1,6 @@
 """`ddgrasp deploy`: an exported policy on a robot and a camera chosen by name."""
 
 import contextlib
-import itertools
 import math
 import signal
 import sys
@@ -168,13 +167,15 @@ def keep_time_of(robot: Robot, clock: Clock, options: SessionOptions) -> None:
 
 def _new_folder(out: Path) -> Path:
     """A new one, named after the time of day: two deployments that begin in the same second have two."""
-    stamp = _stamp()
-    for again in itertools.count():
+    stamp, again = _stamp(), 0
+    while True:
         folder = out / (f"{stamp}-{again}" if again else stamp)
-        with contextlib.suppress(FileExistsError):
+        try:
             folder.mkdir()
+        except FileExistsError:
+            again += 1
+        else:
             return folder
-    raise AssertionError
 
 
 def _stamp() -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
@@ -53,8 +53,8 @@ def run_steps(
       The state, and the scalars of the last step; none if there was nothing left to do.
 
     Raises:
-      UserError: a scalar of `shown` or a parameter is not finite at a point or where a checkpoint is due;
-        none is written of that step.
+      UserError: a scalar of `shown` is not finite at a point, or it or a parameter where a checkpoint is due
+        or at the end; none is written of that step.
     """
     metrics: Metrics = {}
     with contextlib.ExitStack() as stack:
@@ -71,7 +71,10 @@ def run_steps(
                 state, metrics = step_function(state, step)
                 logged = (step + 1) % log_every == 0 or step + 1 == steps
                 due = saved is not None and (step + 1) % every == 0
-                if (logged or due) and (what := _diverged(state, metrics, shown)):
+                what = _diverged(metrics, shown) if logged or due else ""
+                if not what and (due or step + 1 == steps) and not _finite(state):
+                    what = "a parameter"
+                if what:
                     raise UserError(
                         f"{label}: {what} is not finite after {step + 1} steps: the training has diverged; "
                         "begin anew with a smaller learning rate."
@@ -83,17 +86,19 @@ def run_steps(
                 if saved is not None and due:
                     saved.save(step + 1, state)
         finally:
-            if saved is not None and intact(state) and not _diverged(state, metrics, shown):
+            if saved is not None and intact(state) and not _diverged(metrics, shown) and _finite(state):
                 saved.save(int(state.step), state)
     return state, _floats(metrics)
 
 
-def _diverged(state: TrainState, metrics: Metrics, shown: Sequence[str]) -> str:
-    """The first of the scalars `shown` that is not finite, or that a parameter is not; empty if all are."""
-    if name := next((name for name in shown if not math.isfinite(metrics.get(name, 0.0))), ""):
-        return name
-    finite = all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(state.params))
-    return "" if finite else "a parameter"
+def _diverged(metrics: Metrics, shown: Sequence[str]) -> str:
+    """The first of the scalars `shown` that is not finite; empty if all are."""
+    return next((name for name in shown if not math.isfinite(metrics.get(name, 0.0))), "")
+
+
+def _finite(state: TrainState) -> bool:
+    """Whether all parameters are; looked at on the host, where they are to be kept: nothing to compile."""
+    return all(bool(np.isfinite(np.asarray(leaf)).all()) for leaf in jax.tree.leaves(state.params))
 
 
 def _report(

@@ -13,7 +13,7 @@ from ddgrasp import contract
 from ddgrasp.errors import UserError
 from deploy.devices.options import Setup
 from deploy.interfaces import CameraError, Lens
-from sensors.recordings.realsense import load_pyrealsense2
+from sensors.recordings.realsense import load_pyrealsense2, project
 
 LEFT = 1
 """librealsense's number of the left infrared stream."""
@@ -37,7 +37,7 @@ class RealSenseImager:
         self._serial = serial
         self._rs: Any = None
         self._pipeline: Any = None
-        self._sensor: Any = None
+        self._active: Any = None
         self._lens: Lens | None = None
 
     def start(self) -> None:
@@ -55,9 +55,8 @@ class RealSenseImager:
                 f"no RealSense infrared stream {size[0]}x{size[1]} at {STREAM_HZ} Hz ({error}); check the "
                 f"USB 3 cable and deploy.realsense.serial {self._serial!r}."
             ) from error
-        self._pipeline = pipeline
-        self._sensor = active.get_device().first_depth_sensor()
-        self._project(False)
+        self._pipeline, self._active = pipeline, active
+        project(rs, active, on=False)  # its dots would lie on the board
         stream = active.get_stream(rs.stream.infrared, LEFT).as_video_stream_profile()
         self._lens = lens_of(stream.get_intrinsics())
 
@@ -81,15 +80,9 @@ class RealSenseImager:
         pipeline, self._pipeline = self._pipeline, None
         if pipeline is not None:
             with contextlib.suppress(RuntimeError):  # a camera that has been unplugged
-                self._project(True)
+                project(self._rs, self._active)
             with contextlib.suppress(RuntimeError):
                 pipeline.stop()
-
-    def _project(self, on: bool) -> None:
-        """Its dots would lie on the board."""
-        option = self._rs.option.emitter_enabled
-        if self._sensor is not None and self._sensor.supports(option):
-            self._sensor.set_option(option, float(on))
 
 
 def lens_of(intrinsics: Any) -> Lens:

@@ -49,11 +49,11 @@ def describe(rs: Any, profile: Any) -> tuple[dict[str, Any], float]:
     return meta, sensor.get_depth_scale()
 
 
-def project(rs: Any, profile: Any) -> None:
-    """Switches the projector on: a calibration that was killed leaves it off."""
+def project(rs: Any, profile: Any, on: bool = True) -> None:
+    """Switches the projector of a pipeline that runs; a calibration that was killed leaves it off."""
     sensor = profile.get_device().first_depth_sensor()
     if sensor.supports(rs.option.emitter_enabled):
-        sensor.set_option(rs.option.emitter_enabled, 1.0)
+        sensor.set_option(rs.option.emitter_enabled, float(on))
 
 
 def raw_frame(frames: Any) -> RawFrame:
