@@ -1,14 +1,15 @@
 """What this project does on an NVIDIA GPU, in at most nine minutes: one JSON of checks and throughputs.
 
-    python -m benchmarks.gpu_check [--out runs/gpu_check.json] [--sections NAME ...] [--device cpu]
+    python -m benchmarks.gpu_check [--out runs/gpu_check.json] [--sections NAME ...] [--backends jax]
 
 Conformance of the physics backends, pictures against MuJoCo's OpenGL renderer, frames/s, environment
 steps/s, training steps/s and frames/s of generator and student at the sizes of preset paper, and the time a
 teacher takes to 95 % success: PPO from the guide (cloned first), and PPO from nothing. Each section is a
 process of its own with a deadline; what it has measured so far is on disk after every figure, so that a
 section cut off, or the whole command, leaves its results. A section that fails, is cut off, or finds a limit
-exceeded is recorded under "errors", and the command ends with status 1. `--device cpu` runs the same
-sections at sizes that mean nothing, to test the command where there is no GPU.
+exceeded is recorded under "errors", and the command ends with status 1. `--backends jax` is for a machine
+without Warp; the teachers train on the first backend named. `--device cpu` runs the same sections at sizes
+that mean nothing, to test the command where there is no GPU.
 """
 
 import argparse
@@ -31,6 +32,7 @@ TOTAL_S = 530.0
 NO_GPU = 3
 """Exit status of section `machine` without a GPU."""
 SUCCESS_AIM = 0.95
+BACKENDS = ("warp", "jax")
 
 Save = Callable[..., None]
 """save(name=value, ...) adds measurements to the section's file."""
@@ -40,10 +42,11 @@ Save = Callable[..., None]
 class Sizes:
     """How much to run."""
 
-    physics: Backend
-    conformance: tuple[str, ...]
+    physics: tuple[Backend, ...]
+    """The teachers train on the first."""
     renderers: tuple[str, ...]
-    env_counts: tuple[int, ...]
+    env_counts: dict[str, tuple[int, ...]]
+    """Of each of `physics`, the one that matters most first."""
     control_steps: int
     frame_sizes_px: tuple[int, ...]
     frame_pixels: int
@@ -61,10 +64,9 @@ class Sizes:
 
 
 GPU = Sizes(
-    physics="warp",
-    conformance=("warp", "jax"),
+    physics=("warp", "jax"),
     renderers=("warp", "jax"),
-    env_counts=(256, 1024, 4096, 16384),
+    env_counts={"warp": (8192, 1024, 256, 16384), "jax": (8192, 1024)},
     control_steps=20,
     frame_sizes_px=(64, 128, 256),
     frame_pixels=2**26,
@@ -75,10 +77,9 @@ GPU = Sizes(
     slack=1.0,
 )
 CPU = Sizes(
-    physics="cpu",
-    conformance=("cpu",),
+    physics=("cpu",),
     renderers=("jax",),
-    env_counts=(4, 16),
+    env_counts={"cpu": (4, 16)},
     control_steps=2,
     frame_sizes_px=(16,),
     frame_pixels=2**11,
@@ -92,6 +93,16 @@ CPU = Sizes(
     slack=5.0,
 )  # fmt: skip
 SIZES = {"gpu": GPU, "cpu": CPU}
+
+
+def only(sizes: Sizes, backends: Sequence[str]) -> Sizes:
+    """`sizes` with these of its backends, in this order; none stands for all."""
+    if not backends:
+        return sizes
+    kept = {
+        kind: tuple(b for b in backends if b in getattr(sizes, kind)) for kind in ("physics", "renderers")
+    }
+    return replace(sizes, **kept)
 
 
 # --- sections -------------------------------------------------------------------------------------
@@ -120,7 +131,7 @@ def conformance(sizes: Sizes, save: Save) -> Iterator[str]:
     from mjx_envs.physics import backends
     from mjx_envs.physics import conformance as experiments
 
-    for name in sizes.conformance:
+    for name in sizes.physics:
         start = time.monotonic()
         step = experiments.make_step(backends.make_physics(name, experiments.SIM_DT_S))
         measures = experiments.measure(step)
@@ -182,25 +193,24 @@ def env_steps(sizes: Sizes, save: Save) -> Iterator[str]:
     from ddgrasp.config import WorldConfig
     from mjx_envs.grasp_env import AutoReset, GraspEnv
 
-    config = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics)
-    env = AutoReset(GraspEnv(config))
+    for name in sizes.physics:
+        config = WorldConfig(objects=contract.SEEN_OBJECTS, backend=name)
+        env = AutoReset(GraspEnv(config))
 
-    def roll(state, key):
-        def step(state, key):
-            action = jax.random.uniform(key, (state.reward.shape[0], contract.ACTION_SIZE), minval=-1.0)
-            return env.step(state, action), None
+        def roll(state, key, env=env):
+            def step(state, key):
+                action = jax.random.uniform(key, (state.reward.shape[0], contract.ACTION_SIZE), minval=-1.0)
+                return env.step(state, action), None
 
-        return jax.lax.scan(step, state, jax.random.split(key, sizes.control_steps))[0]
+            return jax.lax.scan(step, state, jax.random.split(key, sizes.control_steps))[0]
 
-    substeps = round(contract.CONTROL_DT_S / config.sim_dt_s)
-    for count in sizes.env_counts:
-        state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), count))
-        advance = jax.jit(roll)
-        seconds = _seconds(lambda advance=advance, state=state: advance(state, jax.random.PRNGKey(1)))
-        rate = count * sizes.control_steps / seconds
-        save(
-            **{f"{sizes.physics}_{count}": {"env_steps_per_s": rate, "physics_steps_per_s": rate * substeps}}
-        )
+        substeps = round(contract.CONTROL_DT_S / config.sim_dt_s)
+        for count in sizes.env_counts[name]:
+            state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), count))
+            advance = jax.jit(roll)
+            seconds = _seconds(lambda advance=advance, state=state: advance(state, jax.random.PRNGKey(1)))
+            rate = count * sizes.control_steps / seconds
+            save(**{f"{name}_{count}": {"env_steps_per_s": rate, "physics_steps_per_s": rate * substeps}})
     yield from ()
 
 
@@ -245,7 +255,7 @@ def _teacher(sizes: Sizes, save: Save, teacher: TeacherConfig) -> Iterator[str]:
     from ddgrasp.presets import LAPTOP
     from ppo.train import train
 
-    world = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics)
+    world = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics[0])
     config = replace(LAPTOP, world=world, teacher=teacher)
     save(start=teacher.start, num_envs=teacher.num_envs)
     evaluations: list[dict[str, float]] = []
@@ -300,11 +310,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/gpu_check.json"))
     parser.add_argument("--device", choices=sorted(SIZES), default="gpu")
     parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=list(SECTIONS))
+    parser.add_argument("--backends", nargs="+", choices=BACKENDS, default=[], help="of physics and pictures")
     parser.add_argument("--here", action="store_true", help="one section, in this process")
     args = parser.parse_args()
+    sizes = only(SIZES[args.device], args.backends)
+    if not sizes.physics or not sizes.renderers:
+        parser.error(f"--device {args.device} has nothing to measure on {' '.join(args.backends)}")
     if args.here:
-        sys.exit(run_section(args.sections[0], SIZES[args.device], args.out))
-    sys.exit(run_all(args.sections, args.device, args.out))
+        sys.exit(run_section(args.sections[0], sizes, args.out))
+    sys.exit(run_all(args.sections, args.device, args.out, args.backends))
 
 
 def run_section(name: str, sizes: Sizes, out: Path) -> int:
@@ -321,14 +335,14 @@ def run_section(name: str, sizes: Sizes, out: Path) -> int:
     return 1 if result["errors"] else 0
 
 
-def run_all(sections: Sequence[str], device: str, out: Path) -> int:
+def run_all(sections: Sequence[str], device: str, out: Path, backends: Sequence[str] = ()) -> int:
     """Each section in a process of its own; writes `out` after each. Returns the exit status."""
     start, slack = time.monotonic(), SIZES[device].slack
     report: dict[str, Any] = {"device": device, "complete": False}
     for name in sections:
         left = slack * TOTAL_S - (time.monotonic() - start)
         allowed = min(slack * SECTIONS[name][1], max(left, 1.0))
-        report[name], status = _in_process(name, device, allowed)
+        report[name], status = _in_process(name, device, allowed, backends)
         if status == NO_GPU:
             return 2
         report |= {"seconds": time.monotonic() - start, "complete": name == sections[-1]}
@@ -339,13 +353,16 @@ def run_all(sections: Sequence[str], device: str, out: Path) -> int:
     return 1 if errors else 0
 
 
-def _in_process(name: str, device: str, allowed_s: float) -> tuple[dict[str, Any], int]:
+def _in_process(
+    name: str, device: str, allowed_s: float, backends: Sequence[str]
+) -> tuple[dict[str, Any], int]:
     """({measurements..., "errors", "seconds"}, exit status) of a section; cut off after `allowed_s`."""
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as directory:
         out, log = Path(directory) / "section.json", Path(directory) / "log"
         command = [sys.executable, "-m", "benchmarks.gpu_check", "--here", "--sections", name]
         command += ["--device", device, "--out", str(out)]
+        command += ["--backends", *backends] if backends else []
         with open(log, "w") as stderr:
             try:
                 status = subprocess.run(command, env=_environment(device), stderr=stderr, timeout=allowed_s)

@@ -15,9 +15,24 @@ def test_sections_run_in_processes_of_their_own_and_fill_one_file(tmp_path):
     report = json.loads(out.read_text())
     assert report["complete"] and report["machine"]["cores"] >= 1
     assert report["env_steps"]["errors"] == []
-    rates = [report["env_steps"][f"cpu_{count}"] for count in gpu_check.CPU.env_counts]
+    rates = [report["env_steps"][f"cpu_{count}"] for count in gpu_check.CPU.env_counts["cpu"]]
     assert all(rate["physics_steps_per_s"] == pytest.approx(20 * rate["env_steps_per_s"]) for rate in rates)
     assert min(rate["env_steps_per_s"] for rate in rates) > 1
+
+
+def test_backends_are_those_named_in_that_order_and_all_without():
+    assert gpu_check.only(gpu_check.GPU, []) is gpu_check.GPU
+    chosen = gpu_check.only(gpu_check.GPU, ["jax"])
+    assert chosen.physics == ("jax",) and chosen.renderers == ("jax",)
+    assert gpu_check.only(gpu_check.GPU, ["jax", "warp"]).physics == ("jax", "warp")
+
+
+def test_backends_that_leave_nothing_are_refused_in_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["gpu_check", "--device", "cpu", "--backends", "warp"])
+    with pytest.raises(SystemExit) as stop:
+        gpu_check.main()
+    assert stop.value.code == 2
+    assert "--device cpu has nothing to measure on warp" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_section_cut_off_is_an_error_and_the_next_one_runs(tmp_path, monkeypatch, capsys):
