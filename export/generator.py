@@ -23,6 +23,7 @@ from export.generator_graph import build_model
 from export.parity import open_session
 from export.sampler_tables import MOST_STEPS, is_stochastic
 from learning import diffusion
+from mjx_envs.precision import exact
 from sensors.recordings.recording import find_recordings
 
 PARITY_SCENES = 4
@@ -160,6 +161,7 @@ def _joined(metas: list[dict[str, Any]], key: str) -> str:
 # --- parity ----------------------------------------------------------------------------------------
 
 
+@exact
 def parity(generator: Generator, session: ort.InferenceSession, *, steps: int = 0, seed: int = 0) -> Parity:
     """The file against `ddg_jax.sample.generate`, every scene an episode of its own, the same noise in both.
 

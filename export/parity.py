@@ -117,9 +117,11 @@ def jax_policy(
     """The reference: `sample_actions`, compiled."""
     import jax
 
+    from mjx_envs.precision import exact
     from student_jax.policy import sample_actions
 
     @jax.jit
+    @exact  # the file is computed in float32
     def act(depth_m, state, noise):
         return sample_actions(params, depth_m, state, noise, student, profile, steps)
 

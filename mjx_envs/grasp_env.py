@@ -23,6 +23,7 @@ from ddgrasp.layout import ACTION, QPOS, QVEL, closes
 from mjx_envs import devices, grasp_math, kinematics, randomize, rewards, scene
 from mjx_envs.physics import interface as physics
 from mjx_envs.physics.backends import make_physics
+from mjx_envs.precision import exact
 
 TOUCH_N = 0.3
 """Pad force from which a pad counts as touching the object."""
@@ -78,6 +79,7 @@ class GraspEnv(MjxEnv):
         self.physics = make_physics(config.backend, config.sim_dt_s, self.table.layout)
         self._mj_model = scene.build_model(config.sim_dt_s, self.table.layout)
 
+    @exact
     def reset(self, rng: randomize.Key, exploring: randomize.Share = 1.0) -> State:
         """A new episode: object, pose, dynamics and joints drawn from `rng`.
 
@@ -126,6 +128,7 @@ class GraspEnv(MjxEnv):
         """() index of the object that `reset(rng)` takes."""
         return jax.random.randint(jax.random.split(rng, 6)[0], (), 0, len(self.table.names))
 
+    @exact
     def step(self, state: State, action: Float[jax.Array, "8"]) -> State:
         """One control step with `action` (8,)."""
         old: physics.PhysicsState = state.data

@@ -14,6 +14,7 @@ from mjx_envs import draws, inverse_kinematics, kinematics, scene
 from mjx_envs.object_spec import ObjectModel, slot_layout
 from mjx_envs.objects import get_object
 from mjx_envs.physics.interface import ModelParams
+from mjx_envs.precision import exact
 
 PREGRASP_HEIGHT_M = 0.15
 
@@ -129,6 +130,7 @@ def maybe_held(
     return jnp.where(jax.random.uniform(k_choice) < share, held, qpos)
 
 
+@exact
 def sample_camera(key: Key, config: RandomConfig, T_world_cam: Float[AnyArray, "4 4"]) -> Float[Array, "4 4"]:
     """(4, 4) the nominal camera pose, moved and turned within the configured range."""
     k_pos, k_rot = jax.random.split(key)

@@ -18,6 +18,7 @@ from ddgrasp.config import GROUP_CHANNELS, STEM_STRIDE, StudentConfig
 from ddgrasp.contract import CameraProfile
 from learning.layers import resnet_max_pool, space_to_depth
 from mjx_envs.camera import nominal_camera
+from mjx_envs.precision import exact
 from student_jax import preprocess
 
 EPSILON = 1e-5
@@ -203,6 +204,7 @@ def newest_channel_index(config: StudentConfig, name: str) -> int:
     return (contract.DEPTH_FRAMES - 1) * len(config.picture.channels) + config.picture.channels.index(name)
 
 
+@exact
 def spatial_softmax(
     logits: Float[AnyArray, "B cells K"],
     relief: Float[AnyArray, "B cells"],

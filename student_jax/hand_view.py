@@ -19,6 +19,7 @@ from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import nominal_camera
+from mjx_envs.precision import exact
 from student_jax import preprocess
 from student_jax.encoder import BasicBlock, Stem
 
@@ -75,6 +76,7 @@ def grip_tip() -> Float64[np.ndarray, "3"]:
     )
 
 
+@exact
 def place(
     grip_m: Float[AnyArray, "B 3"],
     origin_rc: Int[AnyArray, "B 2"],
@@ -112,6 +114,7 @@ def sampling_matrix(
     return jnp.maximum(0.0, 1.0 - jnp.abs(place_px[:, :, None] - pixels) / support) / support
 
 
+@exact
 def cut(
     picture: Float[AnyArray, "B h w C"],
     centre: Float[AnyArray, "B 2"],

@@ -18,6 +18,7 @@ from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
 from mjx_envs.camera import nominal_camera
+from mjx_envs.precision import exact
 
 RELIEF_SCALE_M = 0.1
 """One unit of the relief channel: how much nearer than the empty table, along the optical axis."""
@@ -123,6 +124,7 @@ def pixel_coordinates(
     return centres(window.rows), centres(window.columns)
 
 
+@exact
 def prepare_depth(
     depth_m: AnyArray, crop_rc: Int[AnyArray, "B 2"] | None, profile: CameraProfile, config: StudentConfig
 ) -> Float32[jax.Array, "B h w C"]:

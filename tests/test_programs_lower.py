@@ -12,6 +12,13 @@ from ddgrasp.config import Config
 from ddgrasp.presets import PRESETS
 
 PLATFORMS = ("cuda", "tpu")
+PLACES = (
+    "PPO: new episodes", "control step", "demo rollout: begin", "demo rollout: advance",
+    "rendering: geometry", "rendering: depth", "rendering: colour",
+)  # fmt: skip
+"""Programs of physics and geometry alone."""
+ROUNDED = re.compile(r"dot_general.*DEFAULT")
+"""A product in TF32 or bfloat16."""
 HOST_CALL = re.compile(r"custom_call.*(callback|xla_python|xla_ffi_python)")
 
 
@@ -32,6 +39,12 @@ def test_it_lowers_for_every_accelerator_without_calling_the_host(name):
     for module in text.values():
         assert "func.func public @main" in module
         assert not HOST_CALL.search(module)
+        assert name not in PLACES or not ROUNDED.search(module)
+
+
+def test_a_network_s_products_are_rounded():
+    """What the test above looks for can be found."""
+    assert ROUNDED.search(lower(program("demo rollout: look"), "cuda").as_text())
 
 
 def test_the_c_engine_is_a_call_of_the_host():

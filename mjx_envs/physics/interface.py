@@ -21,6 +21,7 @@ from mujoco import mjx
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from mjx_envs import scene
+from mjx_envs.precision import exact
 
 
 @struct.dataclass
@@ -156,6 +157,7 @@ class ModelIndex:
             "actuator_biasprm": put(bias, (arm, slice(1, 3)), bias[..., arm, 1:3] * gain[..., None]),
         }
 
+    @exact
     def derived(self, model: mjx.Model, fields: dict[str, AnyArray]) -> dict[str, jax.Array]:
         """Fields of one environment that MuJoCo precomputes from `fields` and MJX takes as they are (JAX).
 

@@ -14,6 +14,7 @@ from mjx_envs.physics import mjx_solver
 from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState
 from mjx_envs.physics.mjx_collision import collide
 from mjx_envs.physics.mjx_kinematics import kinematics
+from mjx_envs.precision import exact
 
 ITERATIONS = 20
 LINE_STEPS = 30
@@ -44,6 +45,7 @@ class JaxPhysics:
         self._pads = np.array([model.geom(f"{side}_finger_pad").id for side in ("left", "right")])
         self._slots = np.array([model.geom(name).id for name in layout.colliding_names])
 
+    @exact
     def step(self, params: ModelParams, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         """See `Physics.step`."""
         fields = self._index.fields(self.model, params, jnp)
