@@ -48,7 +48,7 @@ bench-networks: setup  ## frames/s of the foundation networks, against onnxrunti
 bench-world: setup  ## physics, PPO rollout and rendering, against Playground, bare MuJoCo and OpenGL
 	$(BIN)/python -m benchmarks.world $(ARGS)
 
-gpu-check: setup  ## on a machine with an NVIDIA GPU: physics, pictures, speeds, a teacher; one JSON in at most 9 minutes
+gpu-check: setup  ## on a machine with an NVIDIA GPU: physics, pictures, speeds, a teacher; one JSON in at most 20 minutes
 	$(BIN)/python -m benchmarks.gpu_check $(ARGS)
 
 bench-ddg: setup  ## frames/s of the generator with every sampler

@@ -6,7 +6,8 @@ from typing import ParamSpec, TypeVar
 
 import jax
 
-_P, _T = ParamSpec("_P"), TypeVar("_T")
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
 def exact(function: Callable[_P, _T]) -> Callable[_P, _T]:

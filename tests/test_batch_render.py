@@ -1,4 +1,4 @@
-"""The renderers of batches against MuJoCo's OpenGL, with all twelve objects."""
+"""The renderers of batches against MuJoCo's OpenGL and the ray caster in NumPy, with all twelve objects."""
 
 import jax
 import numpy as np
@@ -32,6 +32,13 @@ def test_pictures_agree_with_open_gl(name, scenes, open_gl):
     assert render_check.violations(measures) == []
     slots = scene.slot_ids(scene.build_model(layout=scenes.table.layout))
     assert np.isin(expected.segmentation, slots).any(axis=(1, 2)).mean() > 0.8  # objects are in view
+
+
+@pytest.mark.parametrize("name", batch_render.RENDERERS)
+def test_pictures_agree_with_numpy(name, scenes):
+    expected = render_check.draw_with_numpy(scenes)
+    seen = jax.jit(make_renderer(name, scenes))(scenes.geoms, scenes.T_world_cam)
+    assert render_check.violations(render_check.compare(seen, expected)) == []
 
 
 @pytest.mark.parametrize("name", batch_render.RENDERERS)

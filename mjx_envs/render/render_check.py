@@ -1,7 +1,7 @@
-"""Random scenes with all twelve objects, drawn by MuJoCo's OpenGL renderer, and how close ours come."""
+"""Random scenes with all objects, drawn by MuJoCo's OpenGL renderer or in NumPy, and how close ours come."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -16,6 +16,7 @@ from ddgrasp.layout import QPOS
 from mjx_envs import randomize, scene
 from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.objects import OBJECTS
+from mjx_envs.render import raycast_numpy
 from mjx_envs.render.batch_render import Pictures
 from mjx_envs.render.raycast import Geoms
 from mjx_envs.render.visible_geoms import AMBIENT, LIGHT_DIRECTION_W
@@ -84,11 +85,17 @@ def draw_with_open_gl(scenes: Scenes, make_renderer: Any = mujoco.Renderer) -> P
     data = mujoco.MjData(model)
     pictures = []
     with make_renderer(model, scenes.camera.height_px, scenes.camera.width_px) as renderer:
-        for i in range(len(scenes.index)):
-            _pose(model, data, scenes, i)
-            camera = dataclasses.replace(scenes.camera, T_world_cam=scenes.T_world_cam[i])
+        for camera in _posed(model, data, scenes):
             pictures.append(_draw(renderer, data, camera))
     return Pictures(*(np.stack(buffer) for buffer in zip(*pictures, strict=True)))
+
+
+def draw_with_numpy(scenes: Scenes) -> Pictures:
+    """The scenes as the rigs draw them, on any machine; depth is not limited by distance."""
+    model = _lit_model(scenes)
+    data = mujoco.MjData(model)
+    seen = [raycast_numpy.render(model, data, camera, np.inf) for camera in _posed(model, data, scenes)]
+    return Pictures(*(np.stack(buffer) for buffer in zip(*(one[:3] for one in seen), strict=True)))
 
 
 def compare(ours: Pictures, expected: Pictures) -> dict[str, float]:
@@ -155,6 +162,13 @@ def _pose(model: mujoco.MjModel, data: mujoco.MjData, scenes: Scenes, i: int) ->
     model.geom_rgba[slots, :3] = scenes.table.rgb[scenes.index[i]]
     data.qpos[:] = scenes.qpos[i]
     mujoco.mj_forward(model, data)
+
+
+def _posed(model: mujoco.MjModel, data: mujoco.MjData, scenes: Scenes) -> Iterator[Camera]:
+    """Sets up scene after scene; yields the camera of each."""
+    for i in range(len(scenes.index)):
+        _pose(model, data, scenes, i)
+        yield dataclasses.replace(scenes.camera, T_world_cam=scenes.T_world_cam[i])
 
 
 def _draw(renderer: mujoco.Renderer, data: mujoco.MjData, camera: Camera) -> tuple[np.ndarray, ...]:
