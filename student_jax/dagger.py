@@ -24,9 +24,9 @@ from learning.params import load_params, save_params
 from learning.prefetch import Prefetched
 from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
-from student_jax import frames_io, head, pretrained_encoder, start, train
+from student_jax import device_frames, frames_io, head, pretrained_encoder, start, train
 from student_jax.act import SourceCamera, StudentActor
-from student_jax.data import Window
+from student_jax.data import Frames, Window
 from student_jax.depth_source import DepthSource, check_demos
 from student_jax.policy import PARAMS_FILE, init_params
 
@@ -79,6 +79,11 @@ class Trainer:
         """Pictures trained on."""
         return int(self._store.ends[-1]) if len(self._store) else 0
 
+    def _frames(self) -> Frames:
+        """All so far, on an accelerator that has room for them beside a training step."""
+        room = device_frames.room_bytes(self._config)
+        return frames_io.load(self._directory / frames_io.CACHE, self._window, room)
+
     # --- phases ---
 
     def _phase(self, name: str, work: Callable[[], dict[str, float]]) -> None:
@@ -116,7 +121,7 @@ class Trainer:
     def _fit_on_perception(self) -> dict[str, float]:
         if self._student.head.train_steps == 0:
             return {}
-        frames = frames_io.load(self._directory / frames_io.CACHE, self._window)
+        frames = self._frames()
         self.params, measured = head.fit_on_perception(
             self._config, self.params, frames, self._directory, self._progress
         )
@@ -158,7 +163,7 @@ class Trainer:
         if steps == 0:
             return {}
         student, profile = self._student, self._profile
-        frames = frames_io.load(self._directory / frames_io.CACHE, self._window)
+        frames = self._frames()
         trained, frozen = train.split(student, self.params)
         number = _phase_number(phase)
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt16
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.layout import ACTION, OBSERVATION, STATE, closes
 from student_jax.policy import Aux, position_from_world
 
@@ -19,7 +20,7 @@ YAW_MULTIPLE = 2
 class DepthRows(Protocol):
     """N depth pictures, wherever they lie."""
 
-    def read(self, index: Int[np.ndarray, " n"]) -> UInt16[np.ndarray, "n H W"]:
+    def read(self, index: Int[np.ndarray, " n"]) -> UInt16[AnyArray, "n H W"]:
         """Pictures `index`, in that order."""
         ...
 
@@ -58,6 +59,15 @@ class Window:
     def shape(self) -> tuple[int, int]:
         """Its rows and columns."""
         return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+    @property
+    def margins(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Pixels of the whole picture above and below it, left and right of it."""
+        rows, columns = self.rows, self.columns
+        return (
+            (rows.start, self.height_px - rows.stop),
+            (columns.start, self.width_px - columns.stop),
+        )
 
     def cut(self, depth_mm: UInt16[np.ndarray, "*n H W"]) -> UInt16[np.ndarray, "*n h w"]:
         """The window of whole pictures."""
@@ -114,8 +124,11 @@ class Frames:
         total = self._cumulative[1]
         return np.searchsorted(total, rng.random(count) * total[-1], side="right")
 
-    def depth_stack(self, index: Int[np.ndarray, " B"]) -> UInt16[np.ndarray, "B 3 H W"]:
-        """(B, 3, H, W) uint16: the last three frames at each index, the first repeated at the start."""
+    def depth_stack(self, index: Int[np.ndarray, " B"]) -> UInt16[AnyArray, "B 3 H W"]:
+        """(B, 3, H, W) uint16: the last three frames at each index, the first repeated at the start.
+
+        Where the frames lie: NumPy's, or on the device.
+        """
         assert self.depth_mm is not None
         back = np.arange(contract.DEPTH_FRAMES)[::-1]
         rows = index[:, None] - np.minimum(self.step[index][:, None], back)

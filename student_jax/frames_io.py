@@ -1,5 +1,6 @@
 """Demos and DAgger episodes as the student sees them, on disk, so that a resumed stage finds them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from demos.store import EpisodeStore
 from mjx_envs.views import Views, observed
 from student_jax.data import DepthInWindow, Frames, Window, make_frames
 from student_jax.depth_source import VIEWED, DepthSource
+from student_jax.device_frames import DepthOnDevice
 
 CACHE = "frames.zarr"
 _COLUMNS = ("state", "action", "observation", "held")
@@ -110,13 +112,19 @@ def add_rollouts(frames: EpisodeStore, episodes: Episodes, seen: Spool, window: 
         )
 
 
-def load(path: Path, window: Window | None = None) -> Frames:
-    """All episodes of a frame store; depth stays on disk. `window`: the one that was kept, if any was."""
+def load(path: Path, window: Window | None = None, room_bytes: int = 0) -> Frames:
+    """All episodes of a frame store; depth stays on disk, unless `room_bytes` of the device can take it.
+
+    `window`: the one that was kept, if any was.
+    """
     store = EpisodeStore(path)
     bounds = store.ends[:-1]
     columns = (np.split(store.steps(name), bounds) for name in _COLUMNS)
-    depth = store.reader("depth_mm")
-    if window is not None and depth.shape[1:] == window.shape:
-        depth = DepthInWindow(depth, window)
+    depth, count = store.reader("depth_mm"), int(store.ends[-1])
+    kept = window if window is not None and depth.shape[1:] == window.shape else None
+    if 2 * count * math.prod(depth.shape[1:]) <= room_bytes:
+        depth = DepthOnDevice(depth, count, kept)
+    elif kept is not None:
+        depth = DepthInWindow(depth, kept)
     frames = replace(make_frames([], *columns), depth_mm=depth)
     return replace(frames, drawn=store.steps(_DRAWN)) if _DRAWN in store.fields else frames

@@ -21,10 +21,11 @@ from ddgrasp.config import (
     StudentTrainingConfig,
 )
 from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
 from demos.spool import Spool
 from demos.store import EpisodeStore
 from learning.prefetch import AHEAD, Prefetched
-from student_jax import frames_io, train
+from student_jax import device_frames, frames_io, memory, train
 from student_jax.data import Window, make_frames
 from student_jax.policy import init_params
 
@@ -160,6 +161,37 @@ def test_memory_does_not_grow_with_the_frames_on_disk(tmp_path):
         [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=True
     )
     assert float(done.stdout) < 80
+
+
+@pytest.mark.parametrize("kept", ["whole", "window"])
+@pytest.mark.parametrize("rows", [7, 1000], ids=["parts", "one"])
+def test_frames_on_the_device_are_those_on_disk(tmp_path, monkeypatch, kept, rows):
+    window = Window.seen(PROFILE, 3) if kept == "window" else None
+    store = EpisodeStore(tmp_path / "frames.zarr", create=True, compressed=False)
+    for seed, length in enumerate(LENGTHS):
+        steps = columns(length, seed)
+        cut = steps["depth_mm"] if window is None else window.cut(steps["depth_mm"])
+        store.append(steps | {"depth_mm": cut}, {"from_demo": np.bool_(True)})
+    height, width = store.reader("depth_mm").shape[1:]
+    monkeypatch.setattr(device_frames, "PART_ELEMENTS", rows * height * width)
+    monkeypatch.setattr(device_frames, "_BLOCK", 5)
+    size = 2 * sum(LENGTHS) * height * width
+    disk, device = (frames_io.load(store.path, window, room) for room in (size - 1, size))
+    assert not isinstance(disk.depth_mm, device_frames.DepthOnDevice)
+    assert isinstance(device.depth_mm, device_frames.DepthOnDevice)
+    index = np.random.default_rng(0).permutation(sum(LENGTHS))
+    seen = device.depth_stack(index)
+    assert isinstance(seen, jax.Array) and seen.dtype == jnp.uint16
+    np.testing.assert_array_equal(np.asarray(seen), disk.depth_stack(index))
+
+
+def test_there_is_room_beside_a_training_step_on_an_accelerator_alone(monkeypatch):
+    config = PRESETS["debug"]
+    assert device_frames.room_bytes(config) == 0
+    step = memory.training_bytes(config)
+    for limit, room in ((step + 1000, 1000), (step - 1, 0)):
+        monkeypatch.setattr(device_frames, "device_limit", lambda device, limit=limit: limit)
+        assert device_frames.room_bytes(config) == room
 
 
 def test_what_the_student_cannot_see_is_not_kept_and_changes_nothing(tmp_path):

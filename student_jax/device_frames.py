@@ -1,0 +1,84 @@
+"""Training frames in an accelerator's memory, where a batch of them is gathered without the host."""
+
+from functools import partial
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Int, UInt16
+
+from ddgrasp.config import Config
+from learning.memory import device_limit
+from student_jax import memory
+from student_jax.data import Window
+
+PART_ELEMENTS = 2**31 - 1
+"""Of one array on the device, so that 32 bits count them."""
+_BLOCK = 256
+"""Frames that go there at a time."""
+
+
+class StoredDepth(Protocol):
+    """N depth pictures on disk."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(N, h, w)."""
+        ...
+
+    def read(self, index: Int[np.ndarray, " n"]) -> UInt16[np.ndarray, "n h w"]:
+        """Pictures `index`, in that order."""
+        ...
+
+
+class DepthOnDevice:
+    """A copy of the first `count` of `stored` on the default device; a `DepthRows`.
+
+    With `window`, of which `stored` has the pictures, they are read whole, invalid around it.
+    """
+
+    def __init__(self, stored: StoredDepth, count: int, window: Window | None = None):
+        _, height, width = stored.shape
+        self._rows = max(1, min(count, PART_ELEMENTS // (height * width)))
+        self._parts = tuple(
+            _copied(stored, first, min(first + self._rows, count)) for first in range(0, count, self._rows)
+        )
+        self._margins = ((0, 0), (0, 0)) if window is None else window.margins
+
+    def read(self, index: Int[np.ndarray, " n"]) -> UInt16[Array, "n H W"]:
+        """See `DepthRows`."""
+        return _gathered(self._rows, self._margins, self._parts, jnp.asarray(index, jnp.int32))
+
+
+def room_bytes(config: Config) -> int:
+    """What an accelerator has left beside a training step; 0 where its memory is the host's."""
+    limit = device_limit(jax.local_devices()[0])
+    return 0 if limit is None else max(0, limit - memory.training_bytes(config))
+
+
+def _copied(stored: StoredDepth, first: int, last: int) -> Array:
+    """Pictures first..last, a block at a time: neither host nor device holds them twice."""
+    part = jnp.zeros((last - first, *stored.shape[1:]), jnp.uint16)
+    size = min(_BLOCK, last - first)
+    for start in range(0, last - first, size):
+        start = min(start, last - first - size)  # one size, compiled once
+        part = _put(part, stored.read(first + start + np.arange(size)), start)
+    return part
+
+
+@partial(jax.jit, donate_argnums=0)
+def _put(part: Array, block: Array, start: int) -> Array:
+    return jax.lax.dynamic_update_slice(part, block, (start, 0, 0))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _gathered(
+    rows: int, margins: tuple[tuple[int, int], tuple[int, int]], parts: tuple[Array, ...], index: Array
+) -> Array:
+    made = parts[0][jnp.clip(index, 0, len(parts[0]) - 1)]
+    for number, part in enumerate(parts[1:], 1):
+        within = jnp.clip(index - number * rows, 0, len(part) - 1)
+        made = jnp.where((index >= number * rows)[:, None, None], part[within], made)
+    return jnp.pad(made, ((0, 0), *margins))
