@@ -15,7 +15,7 @@ from student_jax import memory
 from student_jax.data import Window
 
 PART_ELEMENTS = 2**31 - 1
-"""Of one array on the device, so that 32 bits count them."""
+"""The most that one array on the device holds, so that 32 bits count them."""
 _BLOCK = 256
 """Frames that go there at a time."""
 

@@ -11,7 +11,7 @@ from jax.extend.core.primitives import conv_general_dilated_p, dot_general_p
 from jax.interpreters import mlir
 
 _DROPPED_BITS = 13
-"""Of float32's mantissa of 23 (NVIDIA, A100 white paper)."""
+"""float32 has a mantissa of 23 (NVIDIA, A100 white paper)."""
 _HIGHEST = jax.lax.Precision.HIGHEST
 
 
