@@ -8,8 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from app import pipeline
+from app.commands.ddg import DDGFit
 from ddgrasp.errors import UserError
-from sensors.recordings.recording import Recording, RecordingWriter, find_recordings
+from ddgrasp.presets import PRESETS
+from sensors.recordings.recording import Recording, RecordingWriter, contents, find_recordings
 
 REAL = Path(__file__).parents[2] / "shared" / "real_depth"
 
@@ -46,6 +49,31 @@ def test_round_trip_is_exact_in_depth(tmp_path):
         assert depth_mm.dtype == np.uint16 and np.abs(rgb.astype(int) - 40 * seed).max() <= 2
     assert recording.meta["invalid_fraction_mean"] == 0.125
     np.testing.assert_allclose(recording.depth_m(0), _frame(0)[1] / 1000.0, atol=1e-6)
+
+
+def test_contents_change_with_what_is_there_and_not_with_where_it_is(tmp_path):
+    for name in ("a", "b"):
+        _write(tmp_path / "all" / name)
+    first = contents(tmp_path / "all")
+    assert first.startswith("2 recordings of 8 pictures, ")
+    shutil.copytree(tmp_path / "all", tmp_path / "elsewhere")
+    shutil.copytree(tmp_path / "all/a", tmp_path / "elsewhere/.unfinished")
+    assert contents(tmp_path / "elsewhere") == first
+    assert contents(tmp_path / "all/a") == contents(tmp_path / "elsewhere/a")
+    _write(tmp_path / "elsewhere" / "c", frames=1)
+    assert contents(tmp_path / "elsewhere").startswith("3 recordings of 9 pictures, ")
+    _set_meta(tmp_path / "all" / "a", fx_px=21.0)
+    assert contents(tmp_path / "all") != first
+
+
+def test_a_generator_s_recordings_are_part_of_what_it_is_made_from(tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr(pipeline, "make", lambda *_, inputs, **__: given.append(inputs))
+    for name in ("a", "b"):
+        _write(tmp_path / "all" / name)
+        DDGFit(config=PRESETS["debug"], out=tmp_path / "run", data=tmp_path / "all").run()
+    assert given[0]["data"] == given[1]["data"]
+    assert given[0]["recordings"] != given[1]["recordings"]
 
 
 def test_interrupted_writer_keeps_the_previous_recording(tmp_path):

@@ -83,6 +83,14 @@ def check_data(option: str, path: Path) -> None:
         raise UserError(f"{option} is {path}, which does not exist: give a recording or a folder of them.")
 
 
+def recordings_in(option: str, path: Path) -> dict[str, Any]:
+    """The input of a stage that reads recordings at `path`, and which they are; errors of `check_data`."""
+    from sensors.recordings.recording import contents
+
+    check_data(option, path)
+    return {"data": path} | ({"recordings": contents(path)} if path.is_dir() else {})
+
+
 def stage_folder(option: str, path: Path, stage: str) -> Path:
     """The finished `stage` that `path` is, or that lies in the run `path`; UserError if there is none."""
     if found := holding(path, artifacts.MANIFEST, stage):

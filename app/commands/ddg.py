@@ -5,7 +5,7 @@ from pathlib import Path
 
 from app import pipeline
 from app.commands.base import OneStage
-from app.commands.checks import check_config_values, check_data, stage_folder
+from app.commands.checks import check_config_values, check_data, recordings_in, stage_folder
 from ddgrasp import artifacts
 from ddgrasp.config.checks import Count, Seed, Steps, Text
 from ddgrasp.config.ddg import HALVED_SPACINGS, PROGRESSIVE, Sampler
@@ -26,8 +26,8 @@ class DDGFit(OneStage):
         if self.data is None:
             super().run()
             return
-        check_data("--data", self.data)
-        config, inputs = check_config_values(self.config), {"data": self.data}
+        inputs = recordings_in("--data", self.data)
+        config = check_config_values(self.config)
         pipeline.make(get_stage(self.stage), config, self.out, resume=self.resume, parents={}, inputs=inputs)
 
 
@@ -77,7 +77,7 @@ class DDGDistil:
         """Distils the model into the run's folder ddg."""
         from ddgrasp.progress import Progress
 
-        check_data("--data", self.data)
+        inputs = recordings_in("--data", self.data)
         fitted = artifacts.read_artifact(_fitted(self.model))
         config = artifacts.config_from_json(fitted.manifest.config)
         training, spacing = config.ddg.training, config.ddg.sampling.spacing
@@ -95,7 +95,7 @@ class DDGDistil:
             training=training if self.steps is None else replace(training, distil_steps=self.steps),
         )
         config = replace(config, ddg=ddg)
-        inputs = {"data": self.data, "model": fitted.hash}
+        inputs["model"] = fitted.hash
         pipeline.make(get_stage("ddg"), config, self.out, resume=self.resume, parents={}, inputs=inputs)
 
 

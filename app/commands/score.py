@@ -9,7 +9,7 @@ import tyro
 
 from app import pipeline
 from app.commands.base import load_config
-from app.commands.checks import check_config_values, check_data, check_score
+from app.commands.checks import check_config_values, check_score, recordings_in
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig, DepthFeatureConfig, ScoreConfig
 from ddgrasp.config.checks import Count, Seed
@@ -75,12 +75,12 @@ class DDGScore(Scoring):
                 f"--run-dir {self.run_dir} with --real: the generator is fitted on the first frames, none is "
                 "taken from a run; leave one of them out."
             )
-        check_data("--real", self.real)
+        recordings = recordings_in("--real", self.real)
         check_score(self.score)
         preset = replace(get_preset(self.preset), ddg=self.ddg, score=self.score, seed=self.seed)
         config = real_config(check_config_values(preset), self.real)
         stage = get_stage("score_real")
-        inputs = {"data": self.real, "fit_frames": self.fit_frames, "score_frames": self.score_frames}
+        inputs = recordings | {"fit_frames": self.fit_frames, "score_frames": self.score_frames}
         pipeline.make(stage, config, self.out, resume=self.resume, inputs=inputs)
         print_result(self.out / stage.name)
 

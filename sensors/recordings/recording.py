@@ -5,6 +5,7 @@ read frame by frame; a damaged frame is left out and named, the others stay read
 whose depth cannot be what it claims (unit, type, size) is refused. NumPy and OpenCV alone.
 """
 
+import hashlib
 import json
 import os
 import shutil
@@ -201,6 +202,23 @@ def find_recordings(root: str | os.PathLike) -> list[Recording]:
             "make some with `ddgrasp record`."
         )
     return [Recording.open(folder) for folder in folders]
+
+
+def contents(root: str | os.PathLike) -> str:
+    """Tells one set of finished recordings at or directly below `root` from another.
+
+    Their number, that of their pictures, and a hash of names (not of a single one), numbers and meta.json.
+    """
+    root = Path(root)
+    single = (root / "depth").is_dir()
+    folders = [root] if single else sorted(p for p in root.iterdir() if is_recording(p) and p.name[0] != ".")
+    digest, pictures = hashlib.sha256(), 0
+    for folder in folders:
+        count = sum(1 for _ in (folder / "depth").iterdir())
+        name, meta = "" if single else folder.name, folder / META_FILE
+        digest.update(f"{name}\0{count}\0".encode() + (meta.read_bytes() if meta.is_file() else b""))
+        pictures += count
+    return f"{len(folders)} recordings of {pictures} pictures, {digest.hexdigest()[:8]}"
 
 
 class RecordingWriter:
