@@ -18,13 +18,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ddgrasp import artifacts, contract
-from ddgrasp.config import Backend, TeacherConfig
+from ddgrasp.config import Backend, TeacherConfig, WorldConfig
 from ddgrasp.files import atomic_write_json, read_json
 from ddgrasp.progress import Progress
 
@@ -32,7 +32,7 @@ TOTAL_S = 1190.0
 NO_GPU = 3
 """Exit status of section `machine` without a GPU."""
 SUCCESS_AIM = 0.95
-BACKENDS = ("warp", "jax")
+BACKENDS = ("warp", "jax", "cpu")
 
 Save = Callable[..., None]
 """save(name=value, ...) adds measurements to the section's file."""
@@ -45,7 +45,7 @@ class Sizes:
     physics: tuple[Backend, ...]
     """The teachers train on the first."""
     renderers: tuple[str, ...]
-    env_counts: dict[str, tuple[int, ...]]
+    env_counts: dict[Backend, tuple[int, ...]]
     """Of each of `physics`, the one that matters most first."""
     control_steps: int
     frame_sizes_px: tuple[int, ...]
@@ -133,8 +133,12 @@ def conformance(sizes: Sizes, save: Save) -> Iterator[str]:
 
     for name in sizes.physics:
         start = time.monotonic()
-        step = experiments.make_step(backends.make_physics(name, experiments.SIM_DT_S))
-        measures = experiments.measure(step)
+        try:
+            step = experiments.make_step(backends.make_physics(name, experiments.SIM_DT_S))
+            measures = experiments.measure(step)
+        except Exception as error:  # the next one may run
+            yield _failed(name, error)
+            continue
         save(**{name: measures | {"seconds": time.monotonic() - start}})
         yield from experiments.violations(name, measures)
 
@@ -155,7 +159,7 @@ def pictures(sizes: Sizes, save: Save) -> Iterator[str]:
         try:
             expected = draw(scenes)
         except Exception as error:  # the back ends of OpenGL raise whatever their loaders do
-            yield f"{against} draws nothing here: {type(error).__name__}: {error}"
+            yield _failed(against, error)
             continue
         for name, seen in drawn.items():
             measures = render_check.compare(seen, expected)
@@ -190,30 +194,41 @@ def frames(sizes: Sizes, save: Save) -> Iterator[str]:
 
 def env_steps(sizes: Sizes, save: Save) -> Iterator[str]:
     """Control steps/s of the whole environment, episodes restarting, random actions."""
+    substeps = round(contract.CONTROL_DT_S / WorldConfig().sim_dt_s)
+    for name, count in _in_turn({name: sizes.env_counts[name] for name in sizes.physics}):
+        try:
+            rate = _control_steps_per_s(name, count, sizes.control_steps)
+        except Exception as error:  # the next one may run
+            yield _failed(f"{name}, {count} environments", error)
+            continue
+        save(**{f"{name}_{count}": {"env_steps_per_s": rate, "physics_steps_per_s": rate * substeps}})
+
+
+def _in_turn(counts: Mapping[Backend, Sequence[int]]) -> Iterator[tuple[Backend, int]]:
+    """The first count of every backend, then the second, and so on."""
+    for i in range(max(map(len, counts.values()))):
+        for name, values in counts.items():
+            if i < len(values):
+                yield name, values[i]
+
+
+def _control_steps_per_s(backend: Backend, count: int, steps: int) -> float:
     import jax
 
-    from ddgrasp.config import WorldConfig
     from mjx_envs.grasp_env import AutoReset, GraspEnv
 
-    for name in sizes.physics:
-        config = WorldConfig(objects=contract.SEEN_OBJECTS, backend=name)
-        env = AutoReset(GraspEnv(config))
+    env = AutoReset(GraspEnv(WorldConfig(objects=contract.SEEN_OBJECTS, backend=backend)))
 
-        def roll(state, key, env=env):
-            def step(state, key):
-                action = jax.random.uniform(key, (state.reward.shape[0], contract.ACTION_SIZE), minval=-1.0)
-                return env.step(state, action), None
+    @jax.jit
+    def roll(state, key):
+        def step(state, key):
+            action = jax.random.uniform(key, (count, contract.ACTION_SIZE), minval=-1.0)
+            return env.step(state, action), None
 
-            return jax.lax.scan(step, state, jax.random.split(key, sizes.control_steps))[0]
+        return jax.lax.scan(step, state, jax.random.split(key, steps))[0]
 
-        substeps = round(contract.CONTROL_DT_S / config.sim_dt_s)
-        for count in sizes.env_counts[name]:
-            state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), count))
-            advance = jax.jit(roll)
-            seconds = _seconds(lambda advance=advance, state=state: advance(state, jax.random.PRNGKey(1)))
-            rate = count * sizes.control_steps / seconds
-            save(**{f"{name}_{count}": {"env_steps_per_s": rate, "physics_steps_per_s": rate * substeps}})
-    yield from ()
+    state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), count))
+    return count * steps / _seconds(lambda: roll(state, jax.random.PRNGKey(1)))
 
 
 def training(sizes: Sizes, save: Save) -> Iterator[str]:
@@ -253,7 +268,6 @@ def unguided(sizes: Sizes) -> TeacherConfig:
 
 def _teacher(sizes: Sizes, save: Save, teacher: TeacherConfig) -> Iterator[str]:
     """Trains until an evaluation reaches SUCCESS_AIM; wall time, cloning and compilation too."""
-    from ddgrasp.config import WorldConfig
     from ddgrasp.presets import LAPTOP
     from ppo.train import train
 
@@ -299,8 +313,8 @@ SECTIONS: dict[str, tuple[Callable[[Sizes, Save], Iterator[str]], float]] = {
     "ppo_from_guide": (ppo_from_guide, 180.0),
     "ppo_from_nothing": (ppo_from_nothing, 360.0),
 }
-"""Name -> (function, seconds it may take). What a section leaves is the next one's; the sum is cut at
-TOTAL_S. Most of it is compilation: on an H200, MJX-JAX with 8,192 environments was not compiled in 80 s."""
+"""Name -> (function, seconds it may take). All together may take TOTAL_S: where all before used theirs, the
+last one has less. Most of it is compilation: MJX-JAX with 8,192 environments took over 80 s on an H200."""
 
 
 # --- the command ----------------------------------------------------------------------------------
@@ -386,6 +400,11 @@ def _environment(device: str) -> dict[str, str]:
     """Warp allocates beside JAX, so JAX takes memory as it needs it."""
     chosen = {"JAX_PLATFORMS": "cpu"} if device == "cpu" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     return {"MUJOCO_GL": "egl"} | dict(os.environ) | chosen
+
+
+def _failed(what: str, error: Exception) -> str:
+    """One line."""
+    return f"{what}: {type(error).__name__}: {' '.join(str(error).split())[:500]}"
 
 
 def _seconds(function: Callable[[], Any], repeats: int = 5) -> float:

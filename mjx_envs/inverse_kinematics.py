@@ -6,11 +6,13 @@ from jaxtyping import Float
 
 from ddgrasp import contract
 from mjx_envs import kinematics, scene
+from mjx_envs.precision import exact
 
 ITERATIONS = 10
 DAMPING = 1e-4
 
 
+@exact
 def solve(
     q_start: Float[jax.Array, "7"], position_m: Float[jax.Array, "3"], quat: Float[jax.Array, "4"]
 ) -> Float[jax.Array, "7"]:

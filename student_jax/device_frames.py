@@ -11,11 +11,14 @@ from jaxtyping import Int, UInt16
 
 from ddgrasp.config import Config
 from learning.memory import device_limit
+from learning.prefetch import AHEAD
 from student_jax import memory
 from student_jax.data import Window
 
 PART_ELEMENTS = 2**31 - 1
 """The most that one array on the device holds, so that 32 bits count them."""
+ROOM_SHARE = 0.8
+"""The rest is for what the estimate of a training step misses (docs/accelerators.md)."""
 _BLOCK = 256
 """Frames that go there at a time."""
 
@@ -53,9 +56,17 @@ class DepthOnDevice:
 
 
 def room_bytes(config: Config) -> int:
-    """What an accelerator has left beside a training step; 0 where its memory is the host's."""
-    limit = device_limit(jax.local_devices()[0])
-    return 0 if limit is None else max(0, limit - memory.training_bytes(config))
+    """What frames may take of an accelerator: ROOM_SHARE of what is left beside training.
+
+    0 where its memory is the host's.
+    """
+    device = jax.local_devices()[0]
+    limit = device_limit(device)
+    if limit is None:
+        return 0
+    taken = device.memory_stats().get("bytes_in_use", 0)
+    training = memory.training_bytes(config) + (AHEAD + 1) * memory.batch_bytes(config)
+    return max(0, int(ROOM_SHARE * (limit - taken - training)))
 
 
 def _copied(stored: StoredDepth, first: int, last: int) -> Array:

@@ -134,6 +134,7 @@ def cell_geometry(profile: CameraProfile, config: StudentConfig) -> CellGeometry
     return CellGeometry(*preprocess.pixel_coordinates(window, map_stride(config)))
 
 
+@exact
 def cell_maps(
     origin_rc: Int[AnyArray, "B 2"], profile: CameraProfile, config: StudentConfig
 ) -> Float32[jax.Array, "B cells 8"]:

@@ -19,18 +19,28 @@ _ROW_BYTES = 4 * (8 + 8 + 40 + 1) + 16
 
 
 def need(config: Config) -> Need:
-    """What stage `student` takes. Depth of its training frames lies on disk while it works."""
+    """What stage `student` takes. Depth of its training frames lies on disk while it works, and a copy on an
+    accelerator if it has room for it besides."""
     student, profile = config.student, config.world.profile
     picture = 2 * profile.height_px * profile.width_px
     episodes = config.demos.episodes + student.dagger.rounds * student.dagger.episodes
     frames = episodes * config.world.episode_steps
-    batch = student.training.batch_size * contract.DEPTH_FRAMES * picture
     acting = max(student.dagger.episodes, config.evaluation.student_trials)
-    host = (AHEAD + 2) * batch + frames * _ROW_BYTES + acting * (contract.DEPTH_FRAMES + 3) * picture
+    host = (
+        (AHEAD + 2) * batch_bytes(config)
+        + frames * _ROW_BYTES
+        + acting * (contract.DEPTH_FRAMES + 3) * picture
+    )
     height, width = Window.seen(profile, student.training.crop_shift_px).shape
     disk = frames * 2 * height * width + acting * config.world.episode_steps * picture
     remedy = "student.training.batch_size, student.dagger.episodes or world.camera_scale"
     return Need("student", training_bytes(config), host, disk, remedy)
+
+
+def batch_bytes(config: Config) -> int:
+    """Depth of the samples of one step, whole pictures."""
+    profile, count = config.world.profile, config.student.training.batch_size
+    return 2 * count * contract.DEPTH_FRAMES * profile.height_px * profile.width_px
 
 
 def training_bytes(config: Config) -> int:

@@ -1,17 +1,22 @@
 """What a place depends on is float32 where products are by default in TF32, as on NVIDIA GPUs."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+from ddgrasp import contract
 from ddgrasp.config import RandomConfig
 from ddgrasp.presets import PRESETS
 from export import parity, stage
-from mjx_envs import randomize
+from mjx_envs import inverse_kinematics, randomize
 from mjx_envs.camera import nominal_camera
+from mjx_envs.physics import backends, interface
 from mjx_envs.precision import exact
+from student_jax import encoder, hand_view, preprocess
 from student_jax.policy import init_params, sample_actions
 from tests import tf32
 from tests.test_export_parity import jittered
@@ -30,6 +35,48 @@ def test_products_are_rounded_unless_they_ask_not_to_be():
         assert 1e-3 < error(lambda x: x @ x) < 0.1
         assert error(exact(lambda x: x @ x)) < 2e-5
     assert error(lambda x: x @ x) < 2e-5
+
+
+def _shapes(*sizes: tuple[int, ...]) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(size, jnp.float32) for size in sizes]
+
+
+def _physics() -> tuple[Any, Any]:
+    backend = backends.make_physics("jax", 0.005)
+    table = randomize.ObjectTable(("cube",))
+    key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+    params, _ = jax.eval_shape(lambda k: randomize.sample_params(k, RandomConfig(), table, 0), key)
+    state = jax.eval_shape(interface.initial_state, *_shapes((16,)))
+    return backend.step, (params, state, *_shapes((9,)))
+
+
+def _places() -> dict[str, tuple[Any, Any]]:
+    """Functions that say where something is, with the shapes of their arguments."""
+    student, profile = DEBUG.student, DEBUG.world.profile
+    size, frame = student.picture, (profile.height_px, profile.width_px)
+    crops = jax.ShapeDtypeStruct((2, 2), jnp.int32)
+    channels = len(size.channels) * contract.DEPTH_FRAMES
+    seen = {"profile": profile, "config": student}
+    return {
+        "picture": (partial(preprocess.prepare_depth, **seen), (*_shapes((2, 3, *frame)), crops)),
+        "hand": (partial(hand_view.place, **seen), (*_shapes((2, 3)), crops)),
+        "hand view": (
+            partial(hand_view.cut, config=student),
+            _shapes((2, size.height_px, size.width_px, channels), (2, 2), (2, 2)),
+        ),
+        "keypoints": (encoder.spatial_softmax, _shapes((2, 12, 4), (2, 12), (2, 12, 8))),
+        "cells": (partial(encoder.cell_maps, **seen), (crops,)),
+        "joints": (inverse_kinematics.solve, _shapes((7,), (3,), (4,))),
+        "physics": _physics(),
+    }
+
+
+@pytest.mark.parametrize("name", ["picture", "hand", "hand view", "keypoints", "cells", "joints", "physics"])
+def test_a_place_is_no_product_in_less_than_float32(name):
+    function, shapes = _places()[name]
+    text = jax.jit(function).trace(*shapes).lower(lowering_platforms=("cuda",)).as_text()
+    assert "dot_general" in text
+    assert not [line for line in text.splitlines() if "dot_general" in line and "DEFAULT" in line]
 
 
 def test_cameras_are_turned_and_not_bent():

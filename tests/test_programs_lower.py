@@ -43,7 +43,8 @@ def test_it_lowers_for_every_accelerator_without_calling_the_host(name):
 
 
 def test_a_network_s_products_are_rounded():
-    """What the test above looks for can be found."""
+    """What the test above looks for can be found, and is looked for."""
+    assert set(PLACES) <= set(PROGRAMS)
     assert ROUNDED.search(lower(program("demo rollout: look"), "cuda").as_text())
 
 

@@ -6,6 +6,7 @@ import sys
 import textwrap
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -188,9 +189,11 @@ def test_frames_on_the_device_are_those_on_disk(tmp_path, monkeypatch, kept, row
 def test_there_is_room_beside_a_training_step_on_an_accelerator_alone(monkeypatch):
     config = PRESETS["debug"]
     assert device_frames.room_bytes(config) == 0
-    step = memory.training_bytes(config)
-    for limit, room in ((step + 1000, 1000), (step - 1, 0)):
-        monkeypatch.setattr(device_frames, "device_limit", lambda device, limit=limit: limit)
+    taken = memory.training_bytes(config) + (AHEAD + 1) * memory.batch_bytes(config) + 7
+    device = SimpleNamespace(platform="gpu")
+    monkeypatch.setattr(jax, "local_devices", lambda: [device])
+    for limit, room in ((taken + 1000, 800), (taken - 1, 0)):
+        device.memory_stats = lambda limit=limit: {"bytes_limit": limit, "bytes_in_use": 7}
         assert device_frames.room_bytes(config) == room
 
 
