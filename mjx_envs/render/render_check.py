@@ -144,8 +144,9 @@ def aim(renderer: mujoco.Renderer, data: mujoco.MjData, camera: Camera) -> None:
 
 
 def _lit_model(scenes: Scenes) -> mujoco.MjModel:
-    """Fine facets; one directional light as the ray caster has it."""
+    """Fine facets; one directional light as the ray caster has it; one sample a pixel, at its centre."""
     model = scene.build_model(layout=scenes.table.layout)
+    model.vis.quality.offsamples = 0
     model.vis.quality.numslices = model.vis.quality.numstacks = 128
     model.vis.headlight.active = 0
     model.light_ambient[:], model.light_diffuse[:], model.light_specular[:] = AMBIENT, 1 - AMBIENT, 0
