@@ -1,7 +1,6 @@
 """Training frames in an accelerator's memory, where a batch of them is gathered without the host."""
 
 from functools import partial
-from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +9,7 @@ from jax import Array
 from jaxtyping import Int, UInt16
 
 from ddgrasp.config import Config
+from demos.row_reader import RowReader
 from learning.memory import device_limit
 from learning.prefetch import AHEAD
 from student_jax import memory
@@ -23,26 +23,13 @@ _BLOCK = 256
 """Frames that go there at a time."""
 
 
-class StoredDepth(Protocol):
-    """N depth pictures on disk."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(N, h, w)."""
-        ...
-
-    def read(self, index: Int[np.ndarray, " n"]) -> UInt16[np.ndarray, "n h w"]:
-        """Pictures `index`, in that order."""
-        ...
-
-
 class DepthOnDevice:
     """A copy of the first `count` of `stored` on the default device; a `DepthRows`.
 
     With `window`, of which `stored` has the pictures, they are read whole, invalid around it.
     """
 
-    def __init__(self, stored: StoredDepth, count: int, window: Window | None = None):
+    def __init__(self, stored: RowReader, count: int, window: Window | None = None):
         _, height, width = stored.shape
         self._rows = max(1, min(count, PART_ELEMENTS // (height * width)))
         self._parts = tuple(
@@ -69,7 +56,7 @@ def room_bytes(config: Config) -> int:
     return max(0, int(ROOM_SHARE * (limit - taken - training)))
 
 
-def _copied(stored: StoredDepth, first: int, last: int) -> Array:
+def _copied(stored: RowReader, first: int, last: int) -> Array:
     """Pictures first..last, a block at a time: neither host nor device holds them twice."""
     part = jnp.zeros((last - first, *stored.shape[1:]), jnp.uint16)
     size = min(_BLOCK, last - first)

@@ -1,6 +1,6 @@
 """What a place depends on is float32 where products are by default in TF32, as on NVIDIA GPUs."""
 
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -50,6 +50,7 @@ def _physics() -> tuple[Any, Any]:
     return backend.step, (params, state, *_shapes((9,)))
 
 
+@cache
 def _places() -> dict[str, tuple[Any, Any]]:
     """Functions that say where something is, with the shapes of their arguments."""
     student, profile = DEBUG.student, DEBUG.world.profile

@@ -193,9 +193,7 @@ def find_recordings(root: str | os.PathLike) -> list[Recording]:
     root = Path(root)
     if not root.is_dir():
         raise UserError(f"{root}: no such folder; expected a recording or a folder of recordings.")
-    if (root / "depth").is_dir():
-        return [Recording.open(root)]
-    folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and is_recording(p))
+    folders = _folders(root)
     if not folders:
         raise UserError(
             f"{root}: no recording in it (a recording has color/, depth/ and {META_FILE}); "
@@ -210,15 +208,20 @@ def contents(root: str | os.PathLike) -> str:
     Their number, that of their pictures, and a hash of names (not of a single one), numbers and meta.json.
     """
     root = Path(root)
-    single = (root / "depth").is_dir()
-    folders = [root] if single else sorted(p for p in root.iterdir() if is_recording(p) and p.name[0] != ".")
-    digest, pictures = hashlib.sha256(), 0
+    folders, digest, pictures = _folders(root), hashlib.sha256(), 0
     for folder in folders:
         count = sum(1 for _ in (folder / "depth").iterdir())
-        name, meta = "" if single else folder.name, folder / META_FILE
+        name, meta = folder.relative_to(root), folder / META_FILE
         digest.update(f"{name}\0{count}\0".encode() + (meta.read_bytes() if meta.is_file() else b""))
         pictures += count
     return f"{len(folders)} recordings of {pictures} pictures, {digest.hexdigest()[:8]}"
+
+
+def _folders(root: Path) -> list[Path]:
+    """`root` itself if it has pictures, else the finished recordings directly below it, by name."""
+    if (root / "depth").is_dir():
+        return [root]
+    return sorted(p for p in root.iterdir() if not p.name.startswith(".") and is_recording(p))
 
 
 class RecordingWriter:
