@@ -1,8 +1,9 @@
 """What a person sees while a stage works, and the curves it leaves behind.
 
 A stage gets one `Progress`. In a terminal it draws a bar with an estimate; elsewhere it prints a plain line
-now and then. Scalars go to TensorBoard events (`<run>/<stage>/tb`) and to `<run>/<stage>/curves.jsonl`, which
-the report reads. `Progress.seconds` is the stage's wall time, attempts before a `--resume` included.
+now and then. Scalars go to TensorBoard events (`<run>/<stage>/tb`, each step once when an attempt ends) and
+to `<run>/<stage>/curves.jsonl`, which the report reads. `Progress.seconds` is the stage's wall time, attempts
+before a `--resume` included.
 """
 
 import contextlib
@@ -16,6 +17,7 @@ from typing import Any, TypeVar
 from ddgrasp.files import atomic_path, atomic_write_json, to_json
 
 CURVES = "curves.jsonl"
+EVENTS = "tb"
 PICTURES = "pictures"
 _CLOCK = ".elapsed.json"
 _PLAIN_PERIOD_S = 15.0
@@ -73,7 +75,7 @@ class Progress:
         self._start = time.monotonic()
         self._before_s = self._read_clock()
         self._clock_saved = time.monotonic()
-        self._writer = None
+        self._writer, self._again = None, False
         self._live = None
         self._plain_last = -_PLAIN_PERIOD_S
         self._tty = sys.stderr.isatty()
@@ -123,7 +125,8 @@ class Progress:
             from tensorboardX import SummaryWriter
 
             _end_line(self.directory / CURVES)
-            self._writer = SummaryWriter(str(self.directory / "tb"))
+            self._again = (self.directory / EVENTS).exists()
+            self._writer = SummaryWriter(str(self.directory / EVENTS))
         with open(self.directory / CURVES, "a") as file:
             file.write(json.dumps(to_json({"step": int(step), **plain})) + "\n")
         for name, value in plain.items():
@@ -152,6 +155,23 @@ class Progress:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+            if self._again:
+                self._rewrite_events()
+
+    def _rewrite_events(self) -> None:
+        """TensorBoard's events of all attempts, a step that was done twice once, as `read_curves` has it; all
+        have the time of now. What is left if it fails is `curves.jsonl`, and events that repeat steps."""
+        from tensorboardX import SummaryWriter
+
+        assert self.directory is not None
+        with contextlib.suppress(OSError):
+            before = list((self.directory / EVENTS).iterdir())
+            with SummaryWriter(str(self.directory / EVENTS), filename_suffix=f".{time.time_ns()}") as writer:
+                for name, points in read_curves(self.directory).items():
+                    for step, value in points:
+                        writer.add_scalar(name, value, step)
+            for path in before:
+                path.unlink()
 
     # --- drawing ---
 

@@ -85,7 +85,7 @@ class GraspEnv(MjxEnv):
 
         `exploring` () is a factor on the shares of episodes that start above the object or with it in hand.
         """
-        _, k_variant, k_params, k_qpos, k_start, k_next = jax.random.split(rng, 6)
+        _, k_variant, k_params, k_qpos, k_start, k_next, k_held, k_late = _keys(rng)
         index = self.object_drawn(rng)
         variant = randomize.sample_variant(k_variant, self.config.random, self.table, index)
         params, size = randomize.sample_params(k_params, self.config.random, self.table, variant)
@@ -100,7 +100,7 @@ class GraspEnv(MjxEnv):
         if self.config.random.held_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
             half_width = jnp.asarray(self.table.half_width, jnp.float32)[variant] * size
-            k_held, share = jax.random.fold_in(k_start, 1), exploring * self.config.random.held_share
+            share = exploring * self.config.random.held_share
             qpos = randomize.maybe_held(k_held, share, qpos, *grasp, half_width)
         state = physics.initial_state(qpos)
         episode = Episode(
@@ -115,7 +115,7 @@ class GraspEnv(MjxEnv):
             hold_count=jnp.zeros((), jnp.int32),
             grasped=jnp.zeros((), bool),
             total_reward=jnp.zeros(()),
-            latency=self._latency(rng, qpos, rest),
+            latency=self._latency(k_late, qpos, rest),
         )
         obs = self._get_obs(state, episode)
         metrics = {f"reward/{name}": jnp.zeros(()) for name in rewards.TERMS}
@@ -126,7 +126,7 @@ class GraspEnv(MjxEnv):
 
     def object_drawn(self, rng: randomize.Key) -> Int[jax.Array, ""]:
         """() index of the object that `reset(rng)` takes."""
-        return jax.random.randint(jax.random.split(rng, 6)[0], (), 0, len(self.table.names))
+        return jax.random.randint(_keys(rng)[0], (), 0, len(self.table.names))
 
     @exact
     def step(self, state: State, action: Float[jax.Array, "8"]) -> State:
@@ -194,12 +194,12 @@ class GraspEnv(MjxEnv):
         grip_pose = kinematics.grip_pose(qpos[QPOS.arm], jnp)
         return rewards.distances(self.config.reward, qpos, grasp_pos, grasp_quat, grip_pose)
 
-    def _latency(self, rng, qpos, rest_height) -> Latency | None:
+    def _latency(self, k_late, qpos, rest_height) -> Latency | None:
         """At the start: the robot holds its pose, gripper open, or closed on what it starts with in hand."""
         share = self.config.random.latency_share
         if share == 0:
             return None
-        late = jax.random.uniform(jax.random.fold_in(rng, 1)) < share
+        late = jax.random.uniform(k_late) < share
         in_hand = jnp.where(qpos[QPOS.object_pos][2] > rest_height, 1.0, -1.0)
         still = jnp.zeros(contract.ACTION_SIZE).at[ACTION.gripper].set(in_hand)
         return Latency(late, grasp_math.controls(qpos[QPOS.arm], still, jnp))
@@ -241,6 +241,11 @@ class GraspEnv(MjxEnv):
     def mjx_model(self) -> mjx.Model:
         """The scene on the JAX device."""
         return mjx.put_model(self._mj_model)
+
+
+def _keys(rng: randomize.Key) -> jax.Array:
+    """(8, ...) the keys of an episode's parts: none is drawn from twice."""
+    return jax.random.split(rng, 8)
 
 
 class AutoReset:

@@ -101,11 +101,11 @@ def maybe_pregrasp(
 ) -> Float[Array, "16"]:  # fmt: skip
     """qpos (16,) with the hand, in `share` of the episodes, up to PREGRASP_HEIGHT_M above the grasp pose and
     turned from it by up to `turn_rad` about the vertical."""
-    k_choice, k_offset = jax.random.split(key)
+    k_choice, k_offset, k_turn = jax.random.split(key, 3)
     offset = _unit(k_offset, (3,))
     height = PREGRASP_HEIGHT_M * (0.5 + 0.5 * offset[2])
     target = grasp_pos + jnp.stack([0.005 * offset[0], 0.005 * offset[1], height])
-    turn = kinematics.quat_about_z(turn_rad * _unit(jax.random.fold_in(key, 1)), jnp)
+    turn = kinematics.quat_about_z(turn_rad * _unit(k_turn), jnp)
     quat = kinematics.quat_mul(turn, grasp_quat, jnp)
     joints = inverse_kinematics.solve(qpos[QPOS.arm], target, quat)
     chosen = jax.random.uniform(k_choice) < share

@@ -131,18 +131,20 @@ def iterations(config: TeacherConfig) -> int:
 def make_optimizer(config: TeacherConfig) -> optax.GradientTransformation:
     """Adam with clipped gradients, for actor and critic apart; step sizes decay linearly, or the actor's is a
     part of the state that `steered` sets."""
-    updates = iterations(config) * config.epochs * config.minibatches
+    total, per_iteration = iterations(config), config.epochs * config.minibatches
 
     def clipped(adam: optax.GradientTransformation) -> optax.GradientTransformation:
         return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
 
-    def decaying(rate: float) -> optax.GradientTransformation:
-        return clipped(optax.adam(optax.linear_schedule(rate, 0.1 * rate, updates)))
+    def decaying(rate: float, of_iterations: int) -> optax.GradientTransformation:
+        return clipped(optax.adam(optax.linear_schedule(rate, 0.1 * rate, of_iterations * per_iteration)))
 
     steered = clipped(optax.inject_hyperparams(optax.adam)(learning_rate=config.learning_rate))
     parts: dict[Hashable, optax.GradientTransformation] = {
-        "policy": steered if config.target_kl else decaying(config.learning_rate),
-        "value": decaying(config.critic_learning_rate),
+        "policy": steered
+        if config.target_kl
+        else decaying(config.learning_rate, max(1, total - config.critic_warmup)),
+        "value": decaying(config.critic_learning_rate, total),
     }
     return optax.multi_transform(parts, network_params("policy", "value"))
 
@@ -295,6 +297,13 @@ def steered(
     )
 
 
+def _held_back(learns, waiting, opt_state):
+    """`opt_state`, the actor's part as it was (`waiting`) unless it `learns`: an Adam that has counted steps
+    without gradients takes the first ones with them several times too large."""
+    actor = jax.tree.map(partial(jnp.where, learns), opt_state.inner_states["policy"], waiting)
+    return opt_state._replace(inner_states=opt_state.inner_states | {"policy": actor})
+
+
 def _improve(config, networks, normalizer, data, key, state, mesh):
     """`epochs` passes of minibatch gradient steps; new (params, opt_state), mean loss terms and gradients."""
     optimizer = make_optimizer(config)
@@ -317,10 +326,11 @@ def _improve(config, networks, normalizer, data, key, state, mesh):
         learns = state.iteration >= config.critic_warmup
         policy_grads = jax.tree.map(lambda g: jnp.where(learns, g, 0.0), grads.policy)
         grads = network_params(policy_grads, grads.value)
+        waiting = opt_state.inner_states["policy"]
         updates, opt_state = optimizer.update(grads, opt_state, params)
         if config.target_kl:
-            kl = jnp.where(learns, terms["kl_mean"], 0.0)  # 0 leaves the step size: nothing has moved yet
-            opt_state = steered(opt_state, kl, calm * config.target_kl, calm * STEERED_RATE_MIN)
+            opt_state = steered(opt_state, terms["kl_mean"], calm * config.target_kl, calm * STEERED_RATE_MIN)
+        opt_state = _held_back(learns, waiting, opt_state)
         params = cast(ppo_losses.PPONetworkParams, optax.apply_updates(params, updates))
         return (params, opt_state), terms
 

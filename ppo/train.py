@@ -30,9 +30,11 @@ _EVAL_SEED = 10_000
 def train(config: Config, directory: Path, progress: Progress) -> learner.LearnerState:
     """Trains in `directory` on all devices of all processes, from its newest checkpoint if there is one.
 
-    Leaves the policy that did best in an evaluation in `ppo.policy.PARAMS_FILE`, or the last one if there
-    was no evaluation. Every process of `ppo.hosts` calls this, with the same directory. Raises UserError if
-    the batch cannot be shared out over the devices, does not fit in memory, or training diverges.
+    Leaves the policy that did best in an evaluation, of which the last is after the last iteration, in
+    `ppo.policy.PARAMS_FILE`. Every process of `ppo.hosts` calls this, with the same directory.
+
+    Raises UserError if the batch cannot be shared out over the devices or does not fit in memory, or if
+    training diverges.
     """
     mesh = devices.make_mesh()
     learner.check_divisible(config.teacher, mesh.size)
@@ -60,7 +62,7 @@ def _train(
             if i % LOG_EVERY == 0 or i == total:
                 _log(i, metrics | clock.rate(i), teacher.num_envs * teacher.unroll_steps, progress, task)
             task.advance()
-            if i % teacher.eval_every == 0:
+            if i % teacher.eval_every == 0 or i == total:
                 rate = _evaluate(test_env, state, config, i, progress)
                 best.offer(rate, state)
                 state = learner.with_evaluation(state, rate >= teacher.stop_at)
@@ -69,7 +71,6 @@ def _train(
             if int(state.good_evaluations) >= 2:
                 progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
                 break
-    best.offer(0.0, state)
     return state
 
 

@@ -44,7 +44,7 @@ def disparity_noise(
     profile: CameraProfile,
     config: StudentConfig,
 ) -> Float[jax.Array, "B F H W"]:
-    """Depth with correlated disparity noise, more of it at edges, and a few wrong matches on valid pixels.
+    """Depth with correlated disparity noise, with it a few wrong matches, and more of it at edges.
 
     disparity = f b / depth, so that depth errors grow with the square of depth (Nguyen et al. 2012). Each
     sample draws its own strengths, uniform up to `disparity_noise_px` and `edge_noise_px`; half of the
@@ -61,7 +61,8 @@ def disparity_noise(
     coarse = (batch, frames, -(-height // CORRELATION_PX), -(-width // CORRELATION_PX))
     field = _half_shared(k_shared, k_own, coarse)
     strength = config.training.disparity_noise_px * jax.random.uniform(k_strength, (batch, 1, 1, 1))
-    wrong = jax.random.bernoulli(k_where, SPURIOUS_SHARE, coarse)
+    share = SPURIOUS_SHARE if config.training.disparity_noise_px else 0.0
+    wrong = jax.random.bernoulli(k_where, share, coarse)
     field = strength * field + wrong * jax.random.uniform(k_wrong, coarse, minval=-1.0) * SPURIOUS_PX
     field = _enlarged(field, CORRELATION_PX, height, width)
     fb = profile.fx_px * profile.baseline_m

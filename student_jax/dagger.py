@@ -2,7 +2,8 @@
 
 Phases in order: `poses`, `demos`, `dagger-1` ... `dagger-n` (Ross et al. 2011), `head`. `plan.json` names
 the finished ones; a fit on pictures goes on from its own checkpoints (`learning.loop`). All draws are
-keyed by seed, phase and step, so a resumed plan goes the way an uninterrupted one would.
+keyed by seed, phase and step, so a resumed plan goes the way an uninterrupted one would, unless it was
+stopped while it put away the episodes of a round of DAgger: those that are missing are acted anew.
 """
 
 import json
@@ -142,7 +143,7 @@ class Trainer:
             )  # fmt: skip
             roller = Roller(self._config, self._teacher, wanted - first, self._source.needs_rgb)
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
-                key = jax.random.PRNGKey(_DAGGER_SEED + 100 * self._config.seed + number)
+                key = jax.random.fold_in(jax.random.PRNGKey(_DAGGER_SEED + self._config.seed), number)
                 if there := first - (wanted - student.dagger.episodes):  # resumed: other scenes than those
                     key = jax.random.fold_in(key, there)
                 episodes = roller.run(key, actor, lambda _: task.advance())
@@ -178,7 +179,7 @@ class Trainer:
                 return train.train_step(student, profile, steps, state, frozen, batches(step))
 
             state, terms = run_steps(
-                train.init_state(student, steps, self._config.seed, trained),
+                train.init_state(student, steps, self._config.seed, trained, number),
                 steps,
                 step_once,
                 self._directory / CHECKPOINTS / phase,

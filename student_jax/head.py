@@ -1,5 +1,6 @@
 """Training the action head: on true poses with noise first, on what perception reports last."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ddgrasp.config import Config
+from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from demos.rollout import Roller
 from learning.loop import Metrics, run_steps
@@ -24,6 +26,8 @@ POSES = "poses.msgpack"
 """The pictureless episodes in the stage's directory; `fit_on_perception` goes on using them."""
 LOG_EVERY = 100
 _SEED = 45_000
+_POSES_PHASE, _PERCEPTION_PHASE = _SEED, _SEED + 1
+"""Rounds of DAgger, which count from 1, have the numbers below."""
 _ENCODE_BATCH = 64
 _COLUMNS = ("state", "action", "observation", "held")
 
@@ -41,7 +45,7 @@ def fit_on_poses(
     """
     student, rounds = config.student, config.student.poses.rounds
     steps = rounds * student.poses.steps
-    state = train.init_state(student, steps, config.seed, train.head_of(params))
+    state = train.init_state(student, steps, config.seed, train.head_of(params), _POSES_PHASE)
     roller = Roller(config, teacher, student.poses.episodes, with_depth=False)
     rng = np.random.default_rng([config.seed, _SEED])
     columns: dict[str, list[np.ndarray]] = {name: [] for name in _COLUMNS}
@@ -51,7 +55,8 @@ def fit_on_poses(
             head = jax.tree.map(np.asarray, state.ema) if i else None
             share = 0.5**i if i < rounds - 1 else 0.0
             actor = PoseActor(head, student, config.world.profile, rng, student.poses.episodes, share)
-            episodes = roller.run(jax.random.PRNGKey(_SEED + 100 * config.seed + i), actor)
+            key = jax.random.fold_in(jax.random.PRNGKey(_SEED + config.seed), i)
+            episodes = roller.run(key, actor)
             for name in _COLUMNS:
                 whole = getattr(episodes, name)
                 columns[name] += [whole[j, :n].astype(np.float32) for j, n in enumerate(episodes.length)]
@@ -62,6 +67,11 @@ def fit_on_poses(
                 state, metrics = _step(config, steps, state, samples)
                 task.advance()
             loss = float(metrics["loss"])
+            if not math.isfinite(loss):
+                raise UserError(
+                    f"head, on poses: loss is not finite after {(i + 1) * student.poses.steps} steps: the "
+                    "training has diverged; begin anew with a smaller student.training.learning_rate."
+                )
             task.advance(0, loss=loss, success=rate)
             progress.scalars(i, pose_loss=loss, pose_success=rate)
     lengths = np.array([len(x) for x in columns["held"]])
@@ -80,7 +90,7 @@ def fit_on_perception(
     seen = _encode_all(config, params, frames, rng, progress)
     chunks = sharpen_gripper(frames.action_chunks(np.arange(len(frames)), student.head.chunk))
     poses = _load_poses(directory / POSES)
-    state = train.init_state(student, steps, config.seed, train.head_of(params))
+    state = train.init_state(student, steps, config.seed, train.head_of(params), _PERCEPTION_PHASE)
     count = student.head.batch_size if poses is None else student.head.batch_size // 2
 
     def step_once(state: TrainState, _: int) -> tuple[TrainState, Metrics]:

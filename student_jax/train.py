@@ -96,9 +96,9 @@ def head_of(params: dict) -> dict:
     return {name: params[name] for name in HEAD_PARAMS}
 
 
-def init_state(config: StudentConfig, steps: int, seed: int, params: dict) -> TrainState:
-    """State before the first of `steps` steps on `params`."""
-    key = jax.random.key_data(jax.random.key(seed))
+def init_state(config: StudentConfig, steps: int, seed: int, params: dict, phase: int = 0) -> TrainState:
+    """State before the first of `steps` steps on `params`; each `phase` of a plan draws its own numbers."""
+    key = jax.random.key_data(jax.random.fold_in(jax.random.key(seed), phase))
     return first_state(params, make_optimizer(config, steps), key)
 
 

@@ -282,6 +282,16 @@ def test_a_start_of_another_network_is_refused_before_any_stage(tmp_path):
             check_networks(_changed(demo, section.split("."), values), tmp_path)
 
 
+def test_a_stage_by_itself_is_refused_what_a_run_is(tmp_path):
+    demo = PRESETS["demo"]
+    for name in ("teacher", "demos", "ddg"):
+        artifacts.finish(tmp_path / name, name, demo, seconds=1.0, metrics={})
+    options = ["--preset", "demo", "--out", str(tmp_path), "--student.hand-view.pitch-m", "0.008"]
+    with pytest.raises(UserError, match=r"hand_view.pitch_m 0.004, this configuration 0.008"):
+        parse("student train", options).run()
+    assert not (tmp_path / "student").exists()
+
+
 def test_a_fitted_generator_is_found_in_a_run_and_in_its_folder(tmp_path):
     ddg = artifacts.finish(tmp_path / "ddg", "ddg", PRESETS["debug"], seconds=1.0, metrics={}).directory
     assert stage_folder("--model", tmp_path, "ddg") == stage_folder("--model", ddg, "ddg") == ddg

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from app import pipeline
 from ddgrasp import artifacts
@@ -248,7 +249,9 @@ def test_curves_count_a_repeated_step_once_and_skip_a_torn_line(tmp_path):
     third.scalars(3, loss=1.0)
     third.close()
     assert read_curves(tmp_path)["loss"] == [(1, 3.0), (2, 1.5), (3, 1.0)]
-    assert list((tmp_path / "tb").glob("events*"))
+    (events,) = (tmp_path / "tb").glob("events*")
+    seen = EventAccumulator(str(events)).Reload().Scalars("loss")
+    assert [(point.step, point.value) for point in seen] == [(1, 3.0), (2, 1.5), (3, 1.0)]
 
 
 def test_progress_prints_plain_lines_with_an_estimate_outside_a_terminal(capsys):

@@ -311,7 +311,7 @@ def test_noise_at_edges_is_where_things_stand_out_of_the_table_and_nowhere_else(
     changed = np.mean(np.abs(made - depth) > 1e-4, axis=(0, 1))
     beside = np.zeros(depth.shape, bool)
     beside[row - 4 : row + 8, column - 4 : column + 8] = True
-    assert changed[beside].min() > 0.9 and changed[~beside].max() < 0.1  # a few wrong matches
+    assert changed[beside].min() > 0.9 and changed[~beside].max() == 0.0  # without wrong matches
     error = made[:, :, row, column] - depth[row, column]
     assert 0.3 < np.corrcoef(error[:, 0], error[:, 2])[0, 1] < 0.9
     without = dataclasses.replace(config, training=dataclasses.replace(noise, edge_noise_px=0.0))

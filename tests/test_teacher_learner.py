@@ -11,12 +11,13 @@ import pytest
 from brax.training import types
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
+from optax.tree_utils import tree_get_all_with_path
 
 from app.commands import parse
 from ddgrasp.config import Config, EvalConfig, TeacherConfig, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
-from ddgrasp.progress import Progress
+from ddgrasp.progress import Progress, read_curves
 from mjx_envs import devices
 from ppo import learner
 from ppo import policy as teacher_policy
@@ -32,9 +33,13 @@ CONFIG = Config(
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("whole")
-    return ppo_train.train(CONFIG, directory, Progress(quiet=True))
+def directory(tmp_path_factory):
+    return tmp_path_factory.mktemp("whole")
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(directory):
+    return ppo_train.train(CONFIG, directory, Progress(directory, quiet=True))
 
 
 class _StopsAfter(Progress):
@@ -68,6 +73,11 @@ def test_resume_equals_an_uninterrupted_run_to_the_bit(uninterrupted, tmp_path):
     pairs = zip(jax.tree.leaves(uninterrupted.params), jax.tree.leaves(resumed.params), strict=True)
     for whole, again in pairs:
         np.testing.assert_array_equal(np.asarray(whole), np.asarray(again))
+
+
+def test_what_the_last_iteration_left_is_evaluated(uninterrupted, directory):
+    """Or it could never be the best."""
+    assert [step for step, _ in read_curves(directory)["eval_success"]] == [0, 4]
 
 
 def test_saved_policy_acts_as_braxs_deterministic_policy(uninterrupted, tmp_path):
@@ -117,8 +127,9 @@ def test_missing_teacher_and_indivisible_batch_are_named(tmp_path):
         dataclasses.replace(TEACHER, minibatches=3)
 
 
-def test_kl_does_not_steer_a_policy_that_does_not_learn_yet():
-    """While the critic warms up the policy stands still, and its KL says nothing of its step size."""
+def test_an_actor_that_does_not_learn_yet_keeps_its_optimiser():
+    """While the critic warms up the policy stands still: its KL says nothing of its step size, and an Adam
+    that counts the steps without gradients would take the first ones with them several times too large."""
     config = dataclasses.replace(TEACHER, target_kl=0.02, learning_rate=2e-5, critic_warmup=2)
     key, mesh = jax.random.key(0), devices.make_mesh()
     networks = learner.make_networks(config)
@@ -142,3 +153,6 @@ def test_kl_does_not_steer_a_policy_that_does_not_learn_yet():
         state, metrics = improve(state)
         rates.append(float(metrics["policy/learning_rate"]))
     assert rates[:2] == pytest.approx([2e-5, 2e-5]) and rates[2] <= 1.01e-4
+    actor, critic = (state.opt_state.inner_states[name] for name in ("policy", "value"))
+    steps = [{int(count) for _, count in tree_get_all_with_path(part, "count")} for part in (actor, critic)]
+    assert steps == [{2}, {6}]

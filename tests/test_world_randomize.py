@@ -245,6 +245,22 @@ def test_latency_delays_commands_by_one_step_in_its_share_of_the_episodes():
     np.testing.assert_allclose(delayed[1], np.broadcast_to(prompt[0, :1], delayed[1].shape), atol=1e-3)
 
 
+def test_what_an_episode_draws_does_not_hang_together():
+    """Lateness and rest pose, and the hand's turn and place above the object, once were the same number."""
+    random = replace(
+        NOTHING, latency_share=0.3, other_pose_share=0.5, pregrasp_share=1, pregrasp_turn_rad=1.0
+    )
+    env = GraspEnv(WorldConfig(objects=("block",), random=random))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 600))
+    late, variant = np.asarray(state.info["episode"].latency.late), state.info["episode"].variant
+    other = np.asarray(variant) != np.bincount(variant).argmax()
+    assert late[other].mean() == pytest.approx(0.3, abs=0.1)
+    place, hand = kinematics.grip_pose(state.data.qpos[:, QPOS.arm], jnp)
+    turn = kinematics.quat_mul(hand, kinematics.quat_conj(state.obs[:, OBSERVATION.grasp_quat], jnp), jnp)
+    aside = place[:, 0] - state.obs[:, OBSERVATION.grasp_pos][:, 0]
+    assert abs(np.corrcoef(np.asarray(aside), np.asarray(turn[:, 3] * jnp.sign(turn[:, 0])))[0, 1]) < 0.2
+
+
 def test_a_late_command_does_not_drop_what_an_episode_starts_with_in_the_hand():
     random = replace(NOTHING, held_share=1.0, latency_share=1.0)
     env = GraspEnv(WorldConfig(objects=("cube",), random=random))

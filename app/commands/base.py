@@ -1,5 +1,6 @@
 """What commands have in common, and how their defaults are found."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Protocol
@@ -7,7 +8,7 @@ from typing import Annotated, Protocol
 import tyro
 
 from app import pipeline
-from app.commands.checks import check_config_values
+from app.commands.checks import ON_PICTURES, check_config_values, check_networks
 from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.stages import get_stage
@@ -54,8 +55,14 @@ class OneStage(FromPreset):
     stage: str
 
     def run(self) -> None:
-        """Makes the stage from its finished parents in the run."""
-        pipeline.make(get_stage(self.stage), check_config_values(self.config), self.out, resume=self.resume)
+        """Says what memory the stage will take and makes it from its finished parents in the run."""
+        stage, config = get_stage(self.stage), check_config_values(self.config)
+        pipeline.check_place(self.out, resume=self.resume, stages=[stage])
+        for name in stage.parents:
+            artifacts.require(self.out, name, config)
+        for need in check_networks(config, self.out, {stage.name}.intersection(ON_PICTURES)):
+            print(need, file=sys.stderr, flush=True)
+        pipeline.make(stage, config, self.out, resume=self.resume)
 
 
 def load_config(run_dir: Path, stage: str) -> Config:

@@ -6,6 +6,7 @@ files, devices or packages above it.
 
 import types
 import typing
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -111,13 +112,17 @@ def check_devices(config: Config, run_dir: Path) -> None:
         check(config)
 
 
-def check_networks(config: Config, run_dir: Path) -> list[str]:
-    """What each unfinished stage that works on pictures will take, a line for each; UserError if it is too
-    much, or if the student would start from another network.
+ON_PICTURES = ("demos", "ddg", "student")
+"""Stages that work on pictures."""
+
+
+def check_networks(config: Config, run_dir: Path, stages: Collection[str] = ON_PICTURES) -> list[str]:
+    """What each unfinished of the `stages` will take, a line for each; UserError if it is too much, or if the
+    student would start from another network.
 
     Traces a step of each, which the stages do as well.
     """
-    left = [name for name in ("demos", "ddg", "student") if not artifacts.is_finished(run_dir / name)]
+    left = [name for name in stages if not artifacts.is_finished(run_dir / name)]
     if not left:
         return []
     from ddg_jax import memory as ddg_memory

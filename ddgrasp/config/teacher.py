@@ -86,7 +86,7 @@ class TeacherConfig(Section, name="teacher"):
     critic_warmup: CountOrNone = 10
     """Iterations in which the critic alone learns, so that it does not mislead a cloned policy."""
     eval_every: Count = 20
-    """Updates between deterministic evaluations."""
+    """Updates between deterministic evaluations; there is one after the last too."""
     checkpoint_every: Count = 20
     """Updates between whole-state checkpoints."""
     stop_at: Share = 1.0
