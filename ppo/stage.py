@@ -18,9 +18,13 @@ _TEST_SEED = 20_000
 
 
 def check(config: Config) -> None:
-    """UserError if the teacher cannot be trained on these devices; takes a second and changes nothing."""
+    """UserError if the teacher cannot be trained so, or not on these devices; takes a second and changes
+    nothing."""
     if _loads(config):
         return
+    episode = config.world.episode_steps
+    if config.teacher.unroll_steps > episode:  # an environment has one episode ready (`AutoReset`)
+        raise config.teacher.error("unroll_steps", f"1 to {episode} (world.episode_steps)")
     if config.teacher.starts_from_file:
         learner.check_start(config.teacher, teacher_policy.load_state(config.teacher.start))
     mesh = devices.make_mesh()

@@ -113,6 +113,12 @@ def test_a_start_with_other_layers_is_refused_before_any_work(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_an_unroll_that_ends_more_than_one_episode_is_refused(tmp_path):
+    options = ["--preset", "debug", "--teacher.unroll-steps", "300", "--out", str(tmp_path / "run")]
+    with pytest.raises(UserError, match=r"unroll_steps is 300; expected 1 to \d+ \(world.episode_steps\)"):
+        parse("teacher train", [*options, "--teacher.start", "nothing"]).run()
+
+
 def test_presets_that_go_on_from_a_policy_have_its_layers():
     going_on = [preset.teacher for preset in PRESETS.values() if preset.teacher.starts_from_file]
     assert going_on

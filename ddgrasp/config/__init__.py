@@ -125,9 +125,6 @@ class Config(Section):
         """See `Section.check`."""
         self._check_picture()
         self._check_exploring_starts()
-        episode = self.world.episode_steps
-        if self.teacher.unroll_steps > episode:  # an environment has one episode ready
-            raise self.teacher.error("unroll_steps", f"1 to {episode} (world.episode_steps)")
         head = self.student.head
         if self.export.ddim_steps > head.diffusion_steps:
             raise self.export.error(
