@@ -85,7 +85,7 @@ class GraspEnv(MjxEnv):
 
         `exploring` () is a factor on the shares of episodes that start above the object or with it in hand.
         """
-        _, k_variant, k_params, k_qpos, k_start, k_next, k_held, k_late = _keys(rng)
+        _, k_variant, k_params, k_qpos, k_start, k_next, k_late = _keys(rng)
         index = self.object_drawn(rng)
         variant = randomize.sample_variant(k_variant, self.config.random, self.table, index)
         params, size = randomize.sample_params(k_params, self.config.random, self.table, variant)
@@ -100,7 +100,7 @@ class GraspEnv(MjxEnv):
         if self.config.random.held_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
             half_width = jnp.asarray(self.table.half_width, jnp.float32)[variant] * size
-            share = exploring * self.config.random.held_share
+            k_held, share = jax.random.fold_in(k_start, 1), exploring * self.config.random.held_share
             qpos = randomize.maybe_held(k_held, share, qpos, *grasp, half_width)
         state = physics.initial_state(qpos)
         episode = Episode(
@@ -244,8 +244,8 @@ class GraspEnv(MjxEnv):
 
 
 def _keys(rng: randomize.Key) -> jax.Array:
-    """(8, ...) the keys of an episode's parts: none is drawn from twice."""
-    return jax.random.split(rng, 8)
+    """(7, ...) the keys of an episode's parts."""
+    return jax.random.split(rng, 7)
 
 
 class AutoReset:
