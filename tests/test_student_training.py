@@ -129,12 +129,12 @@ def test_auxiliary_losses_by_hand():
 def test_a_training_step_is_pure_and_learns(action_weight):
     config = dataclasses.replace(
         CONFIG,
-        training=dataclasses.replace(CONFIG.training, action_weight=action_weight, learning_rate=5e-3),
+        training=dataclasses.replace(CONFIG.training, action_weight=action_weight, learning_rate=1e-2),
     )
     frames = frames_of((6, 6))
     rng = np.random.default_rng(0)
     batch = train.make_batch(frames, np.arange(8), rng, config, PROFILE)
-    steps = 60
+    steps = 24
     params = init_params(jax.random.key(0), config, PROFILE)
     trained, frozen = train.split(config, params)
     assert ("denoiser" in trained) == bool(action_weight)
