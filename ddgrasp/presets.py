@@ -110,12 +110,12 @@ DEMO = Config(
     student=StudentConfig(
         init_from="pretrained/student",
         picture=PictureConfig(fill_holes=True),
-        training=StudentTrainingConfig(learning_rate=3e-4, steps=200),
+        training=StudentTrainingConfig(learning_rate=3e-4, steps=200, demo_stretch_steps=12),
         poses=PosesConfig(rounds=2, steps=500),
         dagger=DaggerConfig(rounds=1, episodes=48, steps=200),
         head=HeadConfig(train_steps=1500),
     ),
-    evaluation=EvalConfig(student_trials=60),
+    evaluation=EvalConfig(student_trials=30),
     score=ScoreConfig(trajectories=24, kid_subset_size=150, tsne_maps=3000),
 )
 """For two cores; the student starts from the pretrained one. 48 minutes on two Intel Xeon cores on 2026-11-27
