@@ -202,15 +202,7 @@ def begin(
     if write:
         for litter in Path(directory).glob(f"{TEMPORARY}*"):  # of an attempt that was killed mid-write
             litter.unlink(missing_ok=True)
-    path = Path(directory) / STARTED
-    if path.exists() and has_work(directory):
-        started = read_json(path)
-        if started.get("contract_version") != contract.CONTRACT_VERSION:
-            raise UserError(
-                f"{directory} was begun with contract version {started.get('contract_version')}, this code "
-                f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
-            )
-        _check_same_config(Path(directory), stage, _config_of(started, path), config, "begun")
+    if (started := _check_begun(Path(directory), stage, config)) is not None:
         before = started.get("inputs", {})
         _check_same_inputs(directory, before, {name: inputs.get(name) for name in before}, "begun")
     elif write:
@@ -220,7 +212,32 @@ def begin(
             "inputs": inputs,
             "config": config,
         }
-        atomic_write_json(path, value)
+        atomic_write_json(Path(directory) / STARTED, value)
+
+
+def check_place(directory: Path | str, stage: str, config: Config) -> None:
+    """UserError if `stage` is finished or begun in `directory` with another configuration than `config`, or
+    another contract version. Writes nothing."""
+    if is_finished(directory):
+        check_config(read_artifact(directory), config)
+    else:
+        _check_begun(Path(directory), stage, config)
+
+
+def _check_begun(directory: Path, stage: str, config: Config) -> Mapping[str, Any] | None:
+    """What an unfinished attempt noted as it began, None without one; UserError if it used another
+    configuration or contract version."""
+    path = directory / STARTED
+    if not (path.exists() and has_work(directory)):
+        return None
+    started = read_json(path)
+    if started.get("contract_version") != contract.CONTRACT_VERSION:
+        raise UserError(
+            f"{directory} was begun with contract version {started.get('contract_version')}, this code "
+            f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
+        )
+    _check_same_config(directory, stage, _config_of(started, path), config, "begun")
+    return started
 
 
 def check_inputs(directory: Path | str, inputs: Mapping[str, str]) -> None:

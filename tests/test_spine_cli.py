@@ -143,6 +143,17 @@ print({{"jax", "mujoco.mjx"}} & set(sys.modules) or "NOTHING HEAVY")
     assert done.stdout.splitlines() == [str([2] * len(given)), "NOTHING HEAVY"], done.stderr
 
 
+def test_a_later_stage_of_another_configuration_is_told_before_jax_is_imported(tmp_path):
+    artifacts.finish(tmp_path / "deploy", "deploy", PRESETS["debug"], seconds=1.0, metrics={})
+    args = ["run", "--preset", "debug", "--out", str(tmp_path), "--resume", "--evaluation.rig-trials", "7"]
+    code = f"import sys; from app.cli import main; print(main({args}), 'jax' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.stdout == "2 False\n", done.stderr
+    assert "deploy was made with another configuration" in done.stderr and done.stderr.count("\n") == 1
+    assert "evaluation.rig_trials is" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["deploy"]
+
+
 def test_an_out_that_is_a_file_gets_one_line_from_other_commands(tmp_path):
     (tmp_path / "file").touch()
     result = ddgrasp("objects", "sheet", "--objects", "cube", "--out", str(tmp_path / "file" / "a.png"))

@@ -59,7 +59,7 @@ class StudyTable2(FromPreset):
         from app import table2
         from evaluation.table2 import page, results
 
-        pipeline.check_place(self.out / results.SHARED, resume=self.resume)
+        pipeline.check_place(self.config, self.out / results.SHARED, resume=self.resume)
         study = self.planned()
         table2.check_place(study, self.resume)
         if not results.has_students(self.out, study.rows):
