@@ -17,6 +17,7 @@ from ddgrasp.progress import Progress
 from deploy.changes import Change
 from deploy.fr3_lab import Shapes, stopping_at
 from deploy.fr3_trials import Fr3Bench, Sight
+from deploy.policy import OnnxPolicy
 from deploy.recorded import RecordedBench, episode_folder
 from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
@@ -87,9 +88,8 @@ class Series:
 
     def configured(self, config: Config, policy: Path) -> Config:
         """`config` with the trials' length, seed, objects and the arm's limits. UserError if `policy` is no
-        file, or a limit not one that an arm has."""
-        if not policy.is_file():
-            raise UserError(f"{policy}: no such file; make one with `ddgrasp export`.")
+        policy that can be run, or a limit not one that an arm has."""
+        OnnxPolicy(policy, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None)
         world = replace(config.world, objects=_trained())
         deploy = replace(config.deploy, retry=self.retry)
         if self.contact is not None:
