@@ -158,6 +158,15 @@ def finish(
     )
 
 
+def check_stage(option: str, directory: Path, stage: str) -> None:
+    """UserError if the finished stage in `directory`, which `option` names, is another than `stage`."""
+    if (there := read_manifest(directory).stage) != stage:
+        raise UserError(
+            f"{option} is {directory}, which is of stage {there!r}: give a run that has made {stage}, or its "
+            "folder."
+        )
+
+
 def require(run_dir: Path | str, stage: str, config: Config) -> Artifact:
     """The finished `stage` of the run in `run_dir`, made with this configuration; UserError otherwise."""
     directory = Path(run_dir) / stage

@@ -310,6 +310,31 @@ def test_a_fitted_generator_is_found_in_a_run_and_in_its_folder(tmp_path):
         stage_folder("--model", Path("nowhere"), "ddg")
     with pytest.raises(UserError, match="holds no finished stage: give a run that has made demos"):
         stage_folder("--demos", tmp_path, "demos")
+    with pytest.raises(UserError, match=r"--demos is \S+ddg, which is of stage 'ddg': give a run that has"):
+        stage_folder("--demos", ddg, "demos")
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ("ddg fit --data {}", "--data is {}, which holds no recording (color/, depth/, meta.json): give one"),
+        ("ddg fit --data {}/a.bag", "--data is {}/a.bag, a file: give a recording or a folder of them"),
+        ("ddg fit --data {}/a.bag", "`ddgrasp record import {}/a.bag` makes one"),
+        ("ddg distil --model pretrained/ddg --data {}", "--data is {}, which holds no recording"),
+        ("ddg score --real {}", "--real is {}, which holds no recording"),
+        ("ddg generate --model pretrained/ddg --demos pretrained/student", "is of stage 'student': give a"),
+        ("ddg generate --model pretrained/ddg --demos {}", "{}/demos/episodes.zarr is no episode store"),
+    ],
+)
+def test_material_that_is_none_is_refused_before_a_stage_is_begun(command, expected, tmp_path):
+    (material := tmp_path / "material").mkdir()
+    (material / "a.bag").touch()
+    artifacts.finish(material / "demos", "demos", PRESETS["debug"], seconds=1.0, metrics={})
+    group, name, *options = command.format(material).split()
+    with pytest.raises(UserError) as error:
+        parse(f"{group} {name}", [*options, "--out", str(tmp_path / "out")]).run()
+    assert expected.format(material) in str(error.value)
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_is_absent_is_brought_to_the_python_that_runs(monkeypatch, tmp_path):

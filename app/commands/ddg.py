@@ -116,7 +116,10 @@ class DDGGenerate:
 
     def run(self) -> None:
         """Writes depth.zarr episode by episode and prints how much of it is invalid."""
+        from demos.store import STORE, EpisodeStore
+
         demos = stage_folder("--demos", self.demos, "demos")
+        EpisodeStore(demos / STORE)
         parents = {
             "ddg": artifacts.read_artifact(_fitted(self.model)),
             "demos": artifacts.read_artifact(demos),
