@@ -88,7 +88,8 @@ def read_manifest(directory: Path | str) -> Manifest:
         )
     value = read_json(path)
     names = {field.name for field in dataclasses.fields(Manifest)}
-    if not isinstance(value, dict) or names - value.keys() - {"created", upgrades.VERSION_FIELD}:
+    absent = names - value.keys() - {"created", upgrades.VERSION_FIELD} if isinstance(value, dict) else names
+    if absent or not _has_mappings(value, "config", "parents", "metrics"):
         raise UserError(f"{path} is no manifest of this project: delete {directory} and run the stage again.")
     if value["contract_version"] != contract.CONTRACT_VERSION:
         raise UserError(
@@ -99,6 +100,11 @@ def read_manifest(directory: Path | str) -> Manifest:
     return Manifest(**known | {"config": _config_of(value, path), upgrades.VERSION_FIELD: upgrades.VERSION})
 
 
+def _has_mappings(value: Any, *names: str) -> bool:
+    """Whether `value`, as it was read from a file, is a mapping with mappings under these `names`."""
+    return isinstance(value, dict) and all(isinstance(value.get(name), dict) for name in names)
+
+
 def _config_of(value: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """The configuration in a manifest or started.json, with the fields that this code has."""
     version = value.get(upgrades.VERSION_FIELD, 1)
@@ -107,7 +113,7 @@ def _config_of(value: Mapping[str, Any], path: Path) -> dict[str, Any]:
             f"{path} is of version {version}, this code reads up to {upgrades.VERSION}: use the release that "
             "made it, or make it again."
         )
-    return upgrades.upgraded(value.get("config", {}), version)
+    return upgrades.upgraded(value["config"], version)
 
 
 def read_artifact(directory: Path | str) -> Artifact:
@@ -212,7 +218,7 @@ def begin(
         for litter in Path(directory).glob(f"{TEMPORARY}*"):  # of an attempt that was killed mid-write
             litter.unlink(missing_ok=True)
     if (started := _check_begun(Path(directory), stage, config)) is not None:
-        before = started.get("inputs", {})
+        before = started["inputs"]
         _check_same_inputs(directory, before, {name: inputs.get(name) for name in before}, "begun")
     elif write:
         value = {
@@ -239,7 +245,7 @@ def _check_begun(directory: Path, stage: str, config: Config) -> Mapping[str, An
     path = directory / STARTED
     if not (path.exists() and has_work(directory)):
         return None
-    started = read_json(path)
+    started = _read_started(path)
     if started.get("contract_version") != contract.CONTRACT_VERSION:
         raise UserError(
             f"{directory} was begun with contract version {started.get('contract_version')}, this code "
@@ -249,11 +255,19 @@ def _check_begun(directory: Path, stage: str, config: Config) -> Mapping[str, An
     return started
 
 
+def _read_started(path: Path) -> dict[str, Any]:
+    """What started.json holds; UserError if it is damaged or no such note."""
+    started = read_json(path)
+    if not _has_mappings(started, "config", "inputs"):
+        raise UserError(f"{path} does not say how a stage was begun: delete {path.parent}, run it again.")
+    return started
+
+
 def check_inputs(directory: Path | str, inputs: Mapping[str, str]) -> None:
     """UserError if the finished stage in `directory` noted other `inputs` than these; a path that is there no
     more is let pass, since what is finished does not need it."""
     path = Path(directory) / STARTED
-    noted = read_json(path).get("inputs", {}) if path.exists() else {}
+    noted = _read_started(path)["inputs"] if path.exists() else {}
     there = {
         name: value
         for name, value in noted.items()

@@ -59,10 +59,19 @@ class TrialLog:
 
 
 def read_log(path: Path) -> tuple[dict[str, Any], list[TrialResult]]:
-    """(what the trials in a log belong to, the finished ones, each once); empty both if there is no log."""
+    """(what the trials in a log belong to, the finished ones, each once); empty both if there is no log.
+
+    Raises UserError if the file holds something else.
+    """
     lines = _complete_lines(path)
-    header, results = next(lines, {}), (TrialResult(**line) for line in lines)
-    return header, list({result.key: result for result in results}.values())
+    try:
+        header, results = dict(next(lines, {})), [TrialResult(**line) for line in lines]
+        return header, list({result.key: result for result in results}.values())
+    except (TypeError, ValueError):  # no mapping, or one with other fields
+        raise UserError(
+            f"{path} is no log of trials (other fields than `ddgrasp deploy trials` writes): name another "
+            "folder, or move the file away."
+        ) from None
 
 
 def _line(value: dict[str, Any]) -> str:
