@@ -64,13 +64,15 @@ class Series:
     """Whether a hand that stands still, or has closed on nothing, tries again (`deploy.retry`)."""
 
     def names(self) -> tuple[str, ...]:
-        """The objects. UserError for an unknown one, or a choice that the rig does not have."""
+        """The objects. UserError for none or an unknown one, or a choice that the rig does not have."""
         if self.rig == "development" and (self.camera == "coarse" or self.shapes != "mesh"):
             raise UserError("--camera coarse and --shapes are rig fr3's: drop them, or choose --rig fr3.")
         if self.rig == "development" and self.contact is not None:
             raise UserError("--contact is rig fr3's, whose arm stops itself: drop it, or choose --rig fr3.")
         if self.trials > (most := len(seeds.SEEDS[self.split])):
             raise UserError(f"--trials is {self.trials}: an object has {most} places; choose that or less.")
+        if not self.objects:
+            raise UserError(f"--objects names none: give names, or {EVERYTHING}.")
         known = self.known()
         names = known if self.objects == (EVERYTHING,) else self.objects
         for name in names:
