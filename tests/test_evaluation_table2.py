@@ -155,6 +155,8 @@ def test_rows_are_chosen_by_name_or_by_table():
     assert rows.chosen((), ("main",)) == TABLES["main"].rows
     assert rows.chosen(("ddg", "sim_gt", "ddg"), ("main",)) == ("ddg", "sim_gt")
     assert set(rows.chosen((), ("main", "ripple", "filled", "grafting"))) == set(ROWS)
+    with pytest.raises(UserError, match=r"--table names none, and --rows neither: give tables \(main"):
+        command("--table").planned()
 
 
 # --- tables --------------------------------------------------------------------------------------
