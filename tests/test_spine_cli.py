@@ -231,6 +231,7 @@ def _changed(config, path, values):
         ("teacher", {"start": "pretrained/x"}, "does not exist: .*/pretrained has what comes with"),
         ("teacher", {"start": "pretrained/student"}, r"holds no policy.msgpack: \S+/pretrained has what"),
         ("ddg", {"init_from": "runs/no"}, "ddg.init_from is 'runs/no', which does not exist"),
+        ("ddg", {"init_from": "pretrained/student"}, r"init_from is \S+student, which is of stage 'student'"),
         (
             "ddg.prior",
             {"source": "inverse_dept"},
