@@ -161,6 +161,22 @@ def test_an_out_that_is_a_file_gets_one_line_from_other_commands(tmp_path):
     assert "file cannot be written (File exists): choose another --out." in _one_error_line(result)
 
 
+@pytest.mark.parametrize("command", ["objects sheet --objects cube", "calibrate board"])
+def test_an_out_that_is_a_folder_is_named_and_no_temporary_file(command, tmp_path):
+    (out := tmp_path / "a.png").mkdir()
+    result = ddgrasp(*command.split(), "--out", str(out))
+    assert result.returncode == 1
+    assert f"ddgrasp: {out} cannot be written (Is a directory): choose another" in _one_error_line(result)
+
+
+def test_an_export_looks_at_out_before_it_works(tmp_path):
+    (tmp_path / "file").touch()
+    below = tmp_path / "file" / "a" / "g.onnx"
+    for out, trouble in ((tmp_path, "a folder: name"), (below, f"and {tmp_path}/file is no folder: name")):
+        with pytest.raises(UserError, match=f"--out is {out}, {trouble}"):
+            parse("ddg export", ["--model", "nowhere", "--out", str(out)]).run()
+
+
 def test_an_unknown_option_is_named():
     result = ddgrasp("run", "--teacher.bogus", "3")
     assert result.returncode == 2

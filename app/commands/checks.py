@@ -67,6 +67,14 @@ def check_objects(world: WorldConfig) -> None:
         get_object(name)
 
 
+def check_file(option: str, path: Path) -> None:
+    """UserError if `path` cannot become a file: it is a folder, or lies below a file."""
+    if path.is_dir():
+        raise UserError(f"{option} is {path}, a folder: name a file, in it or elsewhere.")
+    if not (there := next(place for place in path.absolute().parents if place.exists())).is_dir():
+        raise UserError(f"{option} is {path}, and {there} is no folder: name a file elsewhere.")
+
+
 def check_score(score: ScoreConfig) -> None:
     """UserError unless the networks that the scores name have their weights."""
     from foundation import catalog, store
