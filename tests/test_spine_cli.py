@@ -13,6 +13,7 @@ from app.commands import COMMANDS, parse
 from app.commands.checks import CHECKPOINTS, check_config_values, check_networks, stage_folder
 from app.commands.parsing import HELP_ALL
 from ddgrasp import artifacts
+from ddgrasp.config import CAMERAS
 from ddgrasp.errors import UserError
 from ddgrasp.install import pip_install
 from ddgrasp.presets import PRESETS
@@ -74,6 +75,13 @@ def test_help_shows_a_command_s_own_options_and_help_all_every_value(encoding):
     assert "--resume" in texts["--help"] and "--teacher." not in texts["--help"]
     assert texts["--help"].endswith("score, hosts): ddgrasp teacher train --help-all\n")
     assert "--teacher.num-envs" in texts[HELP_ALL] and "--hosts.process " in texts[HELP_ALL]
+
+
+def test_help_of_deploy_says_what_each_camera_is_and_whose_configuration_counts():
+    words = " ".join(ddgrasp("deploy", "--help").stdout.replace("│", " ").split())
+    described = words.split("--camera {", 1)[1].split("}", 1)[1].split("--recording")[0]
+    assert all(camera in described for camera in CAMERAS)
+    assert "Without --preset the configuration of its run counts" in words
 
 
 def test_help_of_a_command_may_stand_before_it():
@@ -175,6 +183,11 @@ def test_an_export_looks_at_out_before_it_works(tmp_path):
     for out, trouble in ((tmp_path, "a folder: name"), (below, f"and {tmp_path}/file is no folder: name")):
         with pytest.raises(UserError, match=f"--out is {out}, {trouble}"):
             parse("ddg export", ["--model", "nowhere", "--out", str(out)]).run()
+
+
+def test_the_nearest_option_is_named_without_what_stands_behind_it():
+    with pytest.raises(UserError, match=r"Unrecognized options: --mesh\. Did you mean --meshes\? Options:"):
+        parse("objects list", ["--mesh"])
 
 
 def test_an_unknown_option_is_named():
