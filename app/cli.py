@@ -87,10 +87,13 @@ def _one_line(error: BaseException) -> str | None:
                 "What was finished before is intact."
             )
         cause = cause.__cause__ or cause.__context__
+    if not isinstance(error, OSError):
+        return None
+    place = error.filename2 or error.filename  # of a renaming the second is what was asked for
     if isinstance(error, PermissionError):
-        return f"No permission for {error.filename}: choose another --out, or change its owner."
+        return f"No permission for {place}: choose another --out, or change its owner."
     if isinstance(error, (FileExistsError, NotADirectoryError, IsADirectoryError)):
-        return f"{error.filename} cannot be written ({error.strerror}): choose another --out."
+        return f"{place} cannot be written ({error.strerror}): choose another --out."
     return None
 
 

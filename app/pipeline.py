@@ -43,15 +43,16 @@ def run(
 
     Raises UserError if `run_dir` holds a run and `resume` is off, or holds one of another configuration.
     """
-    check_place(run_dir, resume=resume, stages=stages)
+    check_place(config, run_dir, resume=resume, stages=stages)
     for stage in stages:
         make(stage, config, run_dir, resume=resume, quiet=quiet)
         config_file.write(config, run_dir / config_file.CONFIG_FILE)
     return importlib.import_module("evaluation.report.stage").write_report(run_dir)
 
 
-def check_place(run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES) -> None:
-    """UserError if `run_dir` is or lies below a file, or holds a run and `resume` is off. Writes nothing."""
+def check_place(config: Config, run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES) -> None:
+    """UserError if `run_dir` is or lies below a file, holds a run and `resume` is off, or stages that are
+    finished or begun with another configuration. Writes nothing."""
     if not resume:
         _refuse_occupied(run_dir, [stage.name for stage in stages])
     place, first = run_dir.absolute(), run_dir / stages[0].name
@@ -61,6 +62,8 @@ def check_place(run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES
         raise _no_place(first, error.errno) from None
     if not there.is_dir():
         raise _no_place(first, errno.ENOTDIR)
+    for stage in stages:
+        artifacts.check_place(run_dir / stage.name, stage.name, config)
 
 
 def make(

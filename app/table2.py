@@ -53,7 +53,7 @@ class Study:
 
 def check_place(study: Study, resume: bool) -> None:
     """Marks the folder as this study's. UserError if it holds one and `resume` is off, or another one."""
-    pipeline.check_place(study.out / SHARED, resume=resume)
+    pipeline.check_place(study.config, study.out / SHARED, resume=resume)
     pipeline.create(study.out)
     artifacts.begin(study.out, LAST_STAGE, study.config)
 

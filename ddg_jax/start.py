@@ -26,8 +26,10 @@ def folder(config: DDGConfig) -> Path:
 
 
 def check(config: DDGConfig) -> None:
-    """UserError if what `config.init_from` holds has another network or depth space than `config`."""
+    """UserError if what `config.init_from` holds is no generator, or has another network or depth space than
+    `config`."""
     source = folder(config)
+    artifacts.check_stage("ddg.init_from", source, "ddg")
     fitted = artifacts.config_from_json(artifacts.read_manifest(source).config).ddg
     for name in _THE_SAME:
         there, here = map(attrgetter(name), (fitted, config))

@@ -88,7 +88,8 @@ def read_manifest(directory: Path | str) -> Manifest:
         )
     value = read_json(path)
     names = {field.name for field in dataclasses.fields(Manifest)}
-    if not isinstance(value, dict) or names - value.keys() - {"created", upgrades.VERSION_FIELD}:
+    absent = names - value.keys() - {"created", upgrades.VERSION_FIELD} if isinstance(value, dict) else names
+    if absent or not _has_mappings(value, "config", "parents", "metrics"):
         raise UserError(f"{path} is no manifest of this project: delete {directory} and run the stage again.")
     if value["contract_version"] != contract.CONTRACT_VERSION:
         raise UserError(
@@ -99,6 +100,11 @@ def read_manifest(directory: Path | str) -> Manifest:
     return Manifest(**known | {"config": _config_of(value, path), upgrades.VERSION_FIELD: upgrades.VERSION})
 
 
+def _has_mappings(value: Any, *names: str) -> bool:
+    """Whether `value`, as it was read from a file, is a mapping with mappings under these `names`."""
+    return isinstance(value, dict) and all(isinstance(value.get(name), dict) for name in names)
+
+
 def _config_of(value: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """The configuration in a manifest or started.json, with the fields that this code has."""
     version = value.get(upgrades.VERSION_FIELD, 1)
@@ -107,7 +113,7 @@ def _config_of(value: Mapping[str, Any], path: Path) -> dict[str, Any]:
             f"{path} is of version {version}, this code reads up to {upgrades.VERSION}: use the release that "
             "made it, or make it again."
         )
-    return upgrades.upgraded(value.get("config", {}), version)
+    return upgrades.upgraded(value["config"], version)
 
 
 def read_artifact(directory: Path | str) -> Artifact:
@@ -158,6 +164,15 @@ def finish(
     )
 
 
+def check_stage(option: str, directory: Path, stage: str) -> None:
+    """UserError if the finished stage in `directory`, which `option` names, is another than `stage`."""
+    if (there := read_manifest(directory).stage) != stage:
+        raise UserError(
+            f"{option} is {directory}, which is of stage {there!r}: give a run that has made {stage}, or its "
+            "folder."
+        )
+
+
 def require(run_dir: Path | str, stage: str, config: Config) -> Artifact:
     """The finished `stage` of the run in `run_dir`, made with this configuration; UserError otherwise."""
     directory = Path(run_dir) / stage
@@ -202,16 +217,8 @@ def begin(
     if write:
         for litter in Path(directory).glob(f"{TEMPORARY}*"):  # of an attempt that was killed mid-write
             litter.unlink(missing_ok=True)
-    path = Path(directory) / STARTED
-    if path.exists() and has_work(directory):
-        started = read_json(path)
-        if started.get("contract_version") != contract.CONTRACT_VERSION:
-            raise UserError(
-                f"{directory} was begun with contract version {started.get('contract_version')}, this code "
-                f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
-            )
-        _check_same_config(Path(directory), stage, _config_of(started, path), config, "begun")
-        before = started.get("inputs", {})
+    if (started := _check_begun(Path(directory), stage, config)) is not None:
+        before = started["inputs"]
         _check_same_inputs(directory, before, {name: inputs.get(name) for name in before}, "begun")
     elif write:
         value = {
@@ -220,14 +227,47 @@ def begin(
             "inputs": inputs,
             "config": config,
         }
-        atomic_write_json(path, value)
+        atomic_write_json(Path(directory) / STARTED, value)
+
+
+def check_place(directory: Path | str, stage: str, config: Config) -> None:
+    """UserError if `stage` is finished or begun in `directory` with another configuration than `config`, or
+    another contract version. Writes nothing."""
+    if is_finished(directory):
+        check_config(read_artifact(directory), config)
+    else:
+        _check_begun(Path(directory), stage, config)
+
+
+def _check_begun(directory: Path, stage: str, config: Config) -> Mapping[str, Any] | None:
+    """What an unfinished attempt noted as it began, None without one; UserError if it used another
+    configuration or contract version."""
+    path = directory / STARTED
+    if not (path.exists() and has_work(directory)):
+        return None
+    started = _read_started(path)
+    if started.get("contract_version") != contract.CONTRACT_VERSION:
+        raise UserError(
+            f"{directory} was begun with contract version {started.get('contract_version')}, this code "
+            f"has {contract.CONTRACT_VERSION}: delete the directory, or choose another --out."
+        )
+    _check_same_config(directory, stage, _config_of(started, path), config, "begun")
+    return started
+
+
+def _read_started(path: Path) -> dict[str, Any]:
+    """What started.json holds; UserError if it is damaged or no such note."""
+    started = read_json(path)
+    if not _has_mappings(started, "config", "inputs"):
+        raise UserError(f"{path} does not say how a stage was begun: delete {path.parent}, run it again.")
+    return started
 
 
 def check_inputs(directory: Path | str, inputs: Mapping[str, str]) -> None:
     """UserError if the finished stage in `directory` noted other `inputs` than these; a path that is there no
     more is let pass, since what is finished does not need it."""
     path = Path(directory) / STARTED
-    noted = read_json(path).get("inputs", {}) if path.exists() else {}
+    noted = _read_started(path)["inputs"] if path.exists() else {}
     there = {
         name: value
         for name, value in noted.items()

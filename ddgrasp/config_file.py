@@ -51,11 +51,11 @@ def read(path: Path) -> Config:
         raise UserError(f"--config {path} is no YAML: {' '.join(str(error).split())}.") from None
     if not isinstance(values, dict) or not isinstance(values.get(_PRESET), str):
         raise UserError(f"--config {path} names no preset: its first line is to be `preset: demo`.")
-    preset = get_preset(values[_PRESET])
     try:
+        preset = get_preset(values[_PRESET])
         if (scale := values.get("scale", 1.0)) != 1:
             preset = scaled(replace(preset, scale=scale), scale)
-        merged = _merged(to_json(preset), values, f"--config {path}", "")
+        merged = _merged(to_json(preset), values, "")
         return config_from_json(merged)
     except UserError as error:
         raise UserError(f"--config {path}: {error}") from None
@@ -89,17 +89,17 @@ def _differences(preset: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str
     return different
 
 
-def _merged(preset: Mapping[str, Any], given: Mapping[str, Any], file: str, section: str) -> dict[str, Any]:
+def _merged(preset: Mapping[str, Any], given: Mapping[str, Any], section: str) -> dict[str, Any]:
     merged = dict(preset)
     for name, value in given.items():
         place = f"{section}{name}"
         if name not in preset:
             known = [f"{section}{other}" for other in preset]
-            raise unknown_name(f"setting in {file}", place, known)
+            raise unknown_name("setting", place, known)
         if isinstance(preset[name], Mapping):
             if not isinstance(value, Mapping):
-                raise UserError(f"{file}: {place} is {value!r}; expected its settings, indented below it.")
-            merged[name] = _merged(preset[name], value, file, f"{place}.")
+                raise UserError(f"{place} is {value!r}; expected its settings, indented below it.")
+            merged[name] = _merged(preset[name], value, f"{place}.")
         else:
             merged[name] = value
     return merged

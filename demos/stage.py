@@ -9,11 +9,10 @@ from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
 from demos.rollout import Roller, noisy_teacher, successful
-from demos.store import EpisodeStore
+from demos.store import STORE, EpisodeStore
 from ppo import policy as teacher_policy
 from ppo.policy import TeacherPolicy
 
-STORE = "episodes.zarr"
 _SEED = 30_000
 _MAX_TRIES = 4
 """Give up when less than one attempt in this many succeeds."""

@@ -17,6 +17,8 @@ from ddgrasp.errors import UserError
 from demos.row_reader import RowReader
 
 _CODEC = BloscCodec(cname="zstd", clevel=3)
+STORE = "episodes.zarr"
+"""In the folder of stage `demos`."""
 _IMAGE_CHUNK = 16
 _ROW_CHUNK = 4096
 

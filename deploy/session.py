@@ -236,5 +236,16 @@ def _row(name: str, percentiles: dict[str, float | None]) -> str:
 
 def _check(options: SessionOptions) -> None:
     check_devices(options)
+    if options.recording is not None and options.camera != "replay":
+        raise UserError(
+            f"--recording is {options.recording}, which camera {options.camera!r} does not play: drop it, or "
+            "choose --camera replay."
+        )
+    of_an_arm = {"--host": options.host, "--calibration": options.calibration}
+    for option, value in of_an_arm.items():
+        if value and options.robot == "sim":
+            raise UserError(
+                f"{option} is {value}, and robot 'sim' has none: drop it, or choose --robot franka."
+            )
     if not options.seconds > 0:
         raise UserError(f"--seconds is {options.seconds:g}: choose more than 0, or inf to run until Ctrl-C.")

@@ -13,7 +13,10 @@ from deploy.trials import TrialResult
 
 
 class TrialLog:
-    """Finished trials on disk, one JSON line each behind a header; a torn last line is dropped."""
+    """Finished trials on disk, one JSON line each behind a header; a torn last line is dropped.
+
+    The file comes with the first trial: one without any, as it was written once, belongs to nobody.
+    """
 
     def __init__(self, path: Path, header: dict[str, Any]):
         """Read what is there. Raises UserError if it belongs to another policy, configuration or rule.
@@ -21,35 +24,54 @@ class TrialLog:
         Args:
             header: what the trials belong to: the policy and the configuration.
         """
-        self._path = path
-        self.results: dict[tuple[int, bool], TrialResult] = {}
-        lines = list(_complete_lines(path))
-        if lines and lines[0] != header:
-            raise UserError(
-                f"{path} was begun with another policy, configuration or rule: delete {path.parent} to "
-                "start them anew, or choose another --out."
-            )
-        for line in lines[1:]:
-            result = TrialResult(**line)
-            self.results[result.key] = result
-        # Written anew, so that the next line starts on a line of its own.
-        text = "".join(_line(value) for value in [header, *map(asdict, self.results.values())])
-        atomic_write_text(path, text)
+        self._path, self._header = path, header
+        self.results = self._read()
+        if self.results:
+            self._write()  # so that the next line starts on a line of its own
 
     def append(self, result: TrialResult) -> None:
-        """Add a finished trial; it is on the disk when this returns."""
+        """Add a finished trial; it is on the disk when this returns.
+
+        Raises UserError if others have begun the file meanwhile, as `__init__` does.
+        """
+        if not self.results:
+            self.results = {**self._read(), result.key: result}
+            self._write()
+            return
         self.results[result.key] = result
         with open(self._path, "a") as file:
             file.write(_line(asdict(result)))
             file.flush()
             os.fsync(file.fileno())
 
+    def _read(self) -> dict[tuple[int, bool], TrialResult]:
+        header, results = read_log(self._path)
+        if results and header != self._header:
+            raise UserError(
+                f"{self._path} was begun with another policy, configuration or rule: delete "
+                f"{self._path.parent} to start them anew, or choose another --out."
+            )
+        return {result.key: result for result in results}
+
+    def _write(self) -> None:
+        lines = [self._header, *map(asdict, self.results.values())]
+        atomic_write_text(self._path, "".join(map(_line, lines)))
+
 
 def read_log(path: Path) -> tuple[dict[str, Any], list[TrialResult]]:
-    """(what the trials in a log belong to, the finished ones, each once); empty both if there is no log."""
+    """(what the trials in a log belong to, the finished ones, each once); empty both if there is no log.
+
+    Raises UserError if the file holds something else.
+    """
     lines = _complete_lines(path)
-    header, results = next(lines, {}), (TrialResult(**line) for line in lines)
-    return header, list({result.key: result for result in results}.values())
+    try:
+        header, results = dict(next(lines, {})), [TrialResult(**line) for line in lines]
+        return header, list({result.key: result for result in results}.values())
+    except (TypeError, ValueError):  # no mapping, or one with other fields
+        raise UserError(
+            f"{path} is no log of trials (other fields than `ddgrasp deploy trials` writes): name another "
+            "folder, or move the file away."
+        ) from None
 
 
 def _line(value: dict[str, Any]) -> str:

@@ -17,6 +17,7 @@ from ddgrasp.progress import Progress
 from deploy.changes import Change
 from deploy.fr3_lab import Shapes, stopping_at
 from deploy.fr3_trials import Fr3Bench, Sight
+from deploy.policy import OnnxPolicy
 from deploy.recorded import RecordedBench, episode_folder
 from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
@@ -63,13 +64,15 @@ class Series:
     """Whether a hand that stands still, or has closed on nothing, tries again (`deploy.retry`)."""
 
     def names(self) -> tuple[str, ...]:
-        """The objects. UserError for an unknown one, or a choice that the rig does not have."""
+        """The objects. UserError for none or an unknown one, or a choice that the rig does not have."""
         if self.rig == "development" and (self.camera == "coarse" or self.shapes != "mesh"):
             raise UserError("--camera coarse and --shapes are rig fr3's: drop them, or choose --rig fr3.")
         if self.rig == "development" and self.contact is not None:
             raise UserError("--contact is rig fr3's, whose arm stops itself: drop it, or choose --rig fr3.")
         if self.trials > (most := len(seeds.SEEDS[self.split])):
             raise UserError(f"--trials is {self.trials}: an object has {most} places; choose that or less.")
+        if not self.objects:
+            raise UserError(f"--objects names none: give names, or {EVERYTHING}.")
         known = self.known()
         names = known if self.objects == (EVERYTHING,) else self.objects
         for name in names:
@@ -87,9 +90,8 @@ class Series:
 
     def configured(self, config: Config, policy: Path) -> Config:
         """`config` with the trials' length, seed, objects and the arm's limits. UserError if `policy` is no
-        file, or a limit not one that an arm has."""
-        if not policy.is_file():
-            raise UserError(f"{policy}: no such file; make one with `ddgrasp export`.")
+        policy that can be run, or a limit not one that an arm has."""
+        OnnxPolicy(policy, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None)
         world = replace(config.world, objects=_trained())
         deploy = replace(config.deploy, retry=self.retry)
         if self.contact is not None:

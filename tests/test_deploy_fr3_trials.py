@@ -114,6 +114,7 @@ def test_a_trial_is_the_same_whichever_others_are_asked_for():
     [
         (Series(objects=("aple",)), "Unknown object 'aple'. Did you mean 'apple'"),
         (Series(rig="development", objects=("mug",)), "Unknown object 'mug'"),
+        (Series(objects=()), "--objects names none: give names, or all"),
         (Series(rig="development", camera="coarse"), "are rig fr3's"),
     ],
 )

@@ -15,9 +15,9 @@ from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from deploy.recorded import RecordedBench
 from deploy.trial_log import TrialLog
-from deploy.trials import Rig, Trial, run_trials
+from deploy.trials import Rig, Trial, TrialResult, run_trials
 from deploy_support import write_policy
-from evaluation import rig_trials
+from evaluation import causes, rig_trials
 from evaluation.report import deployments
 from evaluation.rig_trials import Series
 from sensors.recordings.recording import Recording
@@ -89,11 +89,32 @@ def test_trials_that_were_not_recorded_are_not_passed_over(tmp_path, policy):
     assert "0000-apple" in page.read_text()
 
 
-def test_a_log_without_a_trial_belongs_to_whom_began_it(tmp_path):
-    """Its first trial may be under way."""
-    TrialLog(tmp_path / "trials.jsonl", {"rig": "fr3"})
+@pytest.mark.parametrize("content", ["no onnx", None])
+def test_what_is_no_policy_leaves_the_folder_to_the_right_one(tmp_path, policy, content):
+    (wrong := tmp_path / "wrong.onnx").write_text(content or "")
+    if content is None:
+        wrong = write_policy(wrong, properties={"author": "someone"})
+    out, quiet = tmp_path / "out", Progress(quiet=True)
+    series = Series("development", ("apple",), 1, seconds=0.4)
+    for run in (
+        lambda: rig_trials.run(CONFIG, wrong, series, out, 0, quiet),
+        lambda: causes.run(CONFIG, wrong, ("development",), series, out, 0),
+    ):
+        with pytest.raises(UserError, match=r"wrong\.onnx"):
+            run()
+    assert not out.exists()
+    assert rig_trials.run(CONFIG, policy, series, out, 0, quiet)["all"]["n"] == 1
+
+
+def test_a_log_belongs_to_whose_trial_ended_first(tmp_path):
+    path = tmp_path / "trials.jsonl"
+    path.write_text('{"rig": "of a version that began a log before any trial"}\n')
+    fr3, development = TrialLog(path, {"rig": "fr3"}), TrialLog(path, {"rig": "development"})
+    result = TrialResult(0, "cube", False, True, 1, 0, 0, {}, [], [], [], [], [], [])
+    fr3.append(result)
     with pytest.raises(UserError, match="was begun with another policy"):
-        TrialLog(tmp_path / "trials.jsonl", {"rig": "development"})
+        development.append(result)
+    assert TrialLog(path, {"rig": "fr3"}).results == {(0, False): result}
 
 
 @pytest.mark.parametrize(

@@ -147,7 +147,9 @@ def test_the_command_plays_the_pretrained_student_into_a_film(tmp_path, capsys):
 
 
 def test_the_pretrained_generator_s_depth_stands_beside_the_camera_s(tmp_path):
-    film, generator = tmp_path / "play.mp4", STUDENT.parent / "ddg"
+    film, generator = tmp_path / "play.mp4", tmp_path / "run"
+    generator.mkdir()
+    (generator / "ddg").symlink_to(STUDENT.parent / "ddg")
     options = ["--objects", "cube", "--seconds", "0.5", "--generator", str(generator), "--out", str(film)]
     parse("play", options).run()
     learned = _frames(film)[0, 100:300, -PANEL_PX:].astype(int)
@@ -156,8 +158,9 @@ def test_the_pretrained_generator_s_depth_stands_beside_the_camera_s(tmp_path):
 
 
 def test_a_generator_that_is_not_there_is_refused_before_anything_runs(tmp_path):
-    with pytest.raises(UserError, match="nothing"):
-        parse("play", ["--generator", str(tmp_path / "nothing"), "--out", str(tmp_path / "a.mp4")]).run()
+    for folder, trouble in ((tmp_path / "nothing", "does not exist"), (STUDENT, "is of stage 'student'")):
+        with pytest.raises(UserError, match=f"--generator is {folder}, which {trouble}: give a run that has"):
+            parse("play", ["--generator", str(folder), "--out", str(tmp_path / "a.mp4")]).run()
     assert list(tmp_path.iterdir()) == []
 
 

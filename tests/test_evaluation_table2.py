@@ -155,6 +155,8 @@ def test_rows_are_chosen_by_name_or_by_table():
     assert rows.chosen((), ("main",)) == TABLES["main"].rows
     assert rows.chosen(("ddg", "sim_gt", "ddg"), ("main",)) == ("ddg", "sim_gt")
     assert set(rows.chosen((), ("main", "ripple", "filled", "grafting"))) == set(ROWS)
+    with pytest.raises(UserError, match=r"--table names none, and --rows neither: give tables \(main"):
+        command("--table").planned()
 
 
 # --- tables --------------------------------------------------------------------------------------
@@ -307,6 +309,8 @@ def test_the_paper_s_generator_is_taken_from_elsewhere_and_stays_the_same(tmp_pa
     another = fitted("another", depth=other)
     with pytest.raises(UserError, match="has ddg.depth.representation .* use the same value"):
         planned("--paper-generator", another)
+    with pytest.raises(UserError, match=r"--paper-generator is \S+student, which is of stage 'student'"):
+        planned("--paper-generator", "pretrained/student")
     fitted("study/paper", init_from=paper)  # as the study leaves it when it has taken that one
     assert planned("--paper-generator", paper, "--resume") == paper
     with pytest.raises(

@@ -117,6 +117,13 @@ def test_a_log_says_of_which_trials_it_is_and_counts_each_once(trials):
     assert trials_page.find(trials) is None
 
 
+@pytest.mark.parametrize("content", ['{"policy_sha256": "a"}\n{"trial": 1}', "[]\n[]", "3"])
+def test_a_log_of_something_else_is_named(tmp_path, content):
+    (tmp_path / TRIALS_FILE).write_text(content)
+    with pytest.raises(UserError, match=r"/trials\.jsonl is no log of trials"):
+        parse("report", [str(tmp_path)]).run()
+
+
 def test_a_film_cut_short_is_named(trials):
     (trials / "cube-0-success.png").write_bytes(b"PNG")
     assert "cube-0-success.png cannot be shown" in trials_page.write(trials_page.find(trials)).read_text()

@@ -126,6 +126,24 @@ def test_an_unfinished_attempt_of_another_config_is_refused(tmp_path):
         artifacts.begin(tmp_path / "teacher", "teacher", other)
 
 
+@pytest.mark.parametrize("damage", ["whole", "config", "inputs"])
+def test_notes_that_are_none_are_named(tmp_path, damage):
+    (directory := tmp_path / "teacher").mkdir()
+    begun = {"contract_version": contract.CONTRACT_VERSION, "inputs": {}, "config": to_json(CONFIG)}
+    (directory / artifacts.STARTED).write_text(json.dumps([] if damage == "whole" else begun | {damage: []}))
+    (directory / "checkpoint").touch()
+    with pytest.raises(UserError, match=r"teacher/started\.json does not say how a stage was begun: delete"):
+        artifacts.begin(directory, "teacher", CONFIG)
+    artifacts.finish(directory, "teacher", CONFIG, seconds=1, metrics={})
+    with pytest.raises(UserError, match=r"teacher/started\.json does not say how a stage was begun: delete"):
+        artifacts.check_inputs(directory, {})
+    path = directory / artifacts.MANIFEST
+    made = read_json(path)
+    path.write_text(json.dumps([] if damage == "whole" else made | {damage.replace("inputs", "parents"): 3}))
+    with pytest.raises(UserError, match=r"teacher/manifest\.json is no manifest of this project: delete"):
+        artifacts.require(tmp_path, "teacher", CONFIG)
+
+
 def test_an_unfinished_attempt_with_other_inputs_is_refused(tmp_path):
     artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a"})
     (tmp_path / "ddg" / "checkpoint").touch()

@@ -13,6 +13,7 @@ from app.commands import COMMANDS, parse
 from app.commands.checks import CHECKPOINTS, check_config_values, check_networks, stage_folder
 from app.commands.parsing import HELP_ALL
 from ddgrasp import artifacts
+from ddgrasp.config import CAMERAS
 from ddgrasp.errors import UserError
 from ddgrasp.install import pip_install
 from ddgrasp.presets import PRESETS
@@ -74,6 +75,13 @@ def test_help_shows_a_command_s_own_options_and_help_all_every_value(encoding):
     assert "--resume" in texts["--help"] and "--teacher." not in texts["--help"]
     assert texts["--help"].endswith("score, hosts): ddgrasp teacher train --help-all\n")
     assert "--teacher.num-envs" in texts[HELP_ALL] and "--hosts.process " in texts[HELP_ALL]
+
+
+def test_help_of_deploy_says_what_each_camera_is_and_whose_configuration_counts():
+    words = " ".join(ddgrasp("deploy", "--help").stdout.replace("│", " ").split())
+    described = words.split("--camera {", 1)[1].split("}", 1)[1].split("--recording")[0]
+    assert all(camera in described for camera in CAMERAS)
+    assert "Without --preset the configuration of its run counts" in words
 
 
 def test_help_of_a_command_may_stand_before_it():
@@ -143,11 +151,43 @@ print({{"jax", "mujoco.mjx"}} & set(sys.modules) or "NOTHING HEAVY")
     assert done.stdout.splitlines() == [str([2] * len(given)), "NOTHING HEAVY"], done.stderr
 
 
+def test_a_later_stage_of_another_configuration_is_told_before_jax_is_imported(tmp_path):
+    artifacts.finish(tmp_path / "deploy", "deploy", PRESETS["debug"], seconds=1.0, metrics={})
+    args = ["run", "--preset", "debug", "--out", str(tmp_path), "--resume", "--evaluation.rig-trials", "7"]
+    code = f"import sys; from app.cli import main; print(main({args}), 'jax' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.stdout == "2 False\n", done.stderr
+    assert "deploy was made with another configuration" in done.stderr and done.stderr.count("\n") == 1
+    assert "evaluation.rig_trials is" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["deploy"]
+
+
 def test_an_out_that_is_a_file_gets_one_line_from_other_commands(tmp_path):
     (tmp_path / "file").touch()
     result = ddgrasp("objects", "sheet", "--objects", "cube", "--out", str(tmp_path / "file" / "a.png"))
     assert result.returncode == 1
     assert "file cannot be written (File exists): choose another --out." in _one_error_line(result)
+
+
+@pytest.mark.parametrize("command", ["objects sheet --objects cube", "calibrate board"])
+def test_an_out_that_is_a_folder_is_named_and_no_temporary_file(command, tmp_path):
+    (out := tmp_path / "a.png").mkdir()
+    result = ddgrasp(*command.split(), "--out", str(out))
+    assert result.returncode == 1
+    assert f"ddgrasp: {out} cannot be written (Is a directory): choose another" in _one_error_line(result)
+
+
+def test_an_export_looks_at_out_before_it_works(tmp_path):
+    (tmp_path / "file").touch()
+    below = tmp_path / "file" / "a" / "g.onnx"
+    for out, trouble in ((tmp_path, "a folder: name"), (below, f"and {tmp_path}/file is no folder: name")):
+        with pytest.raises(UserError, match=f"--out is {out}, {trouble}"):
+            parse("ddg export", ["--model", "nowhere", "--out", str(out)]).run()
+
+
+def test_the_nearest_option_is_named_without_what_stands_behind_it():
+    with pytest.raises(UserError, match=r"Unrecognized options: --mesh\. Did you mean --meshes\? Options:"):
+        parse("objects list", ["--mesh"])
 
 
 def test_an_unknown_option_is_named():
@@ -220,6 +260,7 @@ def _changed(config, path, values):
         ("teacher", {"start": "pretrained/x"}, "does not exist: .*/pretrained has what comes with"),
         ("teacher", {"start": "pretrained/student"}, r"holds no policy.msgpack: \S+/pretrained has what"),
         ("ddg", {"init_from": "runs/no"}, "ddg.init_from is 'runs/no', which does not exist"),
+        ("ddg", {"init_from": "pretrained/student"}, r"init_from is \S+student, which is of stage 'student'"),
         (
             "ddg.prior",
             {"source": "inverse_dept"},
@@ -299,6 +340,31 @@ def test_a_fitted_generator_is_found_in_a_run_and_in_its_folder(tmp_path):
         stage_folder("--model", Path("nowhere"), "ddg")
     with pytest.raises(UserError, match="holds no finished stage: give a run that has made demos"):
         stage_folder("--demos", tmp_path, "demos")
+    with pytest.raises(UserError, match=r"--demos is \S+ddg, which is of stage 'ddg': give a run that has"):
+        stage_folder("--demos", ddg, "demos")
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ("ddg fit --data {}", "--data is {}, which holds no recording (color/, depth/, meta.json): give one"),
+        ("ddg fit --data {}/a.bag", "--data is {}/a.bag, a file: give a recording or a folder of them"),
+        ("ddg fit --data {}/a.bag", "`ddgrasp record import {}/a.bag` makes one"),
+        ("ddg distil --model pretrained/ddg --data {}", "--data is {}, which holds no recording"),
+        ("ddg score --real {}", "--real is {}, which holds no recording"),
+        ("ddg generate --model pretrained/ddg --demos pretrained/student", "is of stage 'student': give a"),
+        ("ddg generate --model pretrained/ddg --demos {}", "{}/demos/episodes.zarr is no episode store"),
+    ],
+)
+def test_material_that_is_none_is_refused_before_a_stage_is_begun(command, expected, tmp_path):
+    (material := tmp_path / "material").mkdir()
+    (material / "a.bag").touch()
+    artifacts.finish(material / "demos", "demos", PRESETS["debug"], seconds=1.0, metrics={})
+    group, name, *options = command.format(material).split()
+    with pytest.raises(UserError) as error:
+        parse(f"{group} {name}", [*options, "--out", str(tmp_path / "out")]).run()
+    assert expected.format(material) in str(error.value)
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_is_absent_is_brought_to_the_python_that_runs(monkeypatch, tmp_path):

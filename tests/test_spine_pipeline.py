@@ -113,6 +113,20 @@ def test_resume_with_another_config_is_refused_and_loses_nothing(stages, tmp_pat
     assert artifacts.read_artifact(run_dir / "record") == before
 
 
+def test_a_later_stage_of_another_config_is_refused_before_an_earlier_one_is_made(stages, tmp_path):
+    run_dir = tmp_path / "run"
+    _run(stages, run_dir)
+    (run_dir / "teacher" / artifacts.MANIFEST).unlink()
+    other = dataclasses.replace(CONFIG, record=dataclasses.replace(CONFIG.record, frames=7))
+    before = _log(run_dir)
+    with pytest.raises(UserError, match=r"record was made with another .* record\.frames is \d+ there, 7"):
+        _run(stages, run_dir, other, resume=True)
+    (run_dir / "record" / artifacts.MANIFEST).rename(run_dir / "record" / "checkpoint")
+    with pytest.raises(UserError, match=r"record was begun with another .* record\.frames is \d+ there, 7"):
+        _run(stages, run_dir, other, resume=True)
+    assert _log(run_dir) == before
+
+
 def test_a_finished_stage_of_other_material_is_not_taken_for_this_one_s(stages, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

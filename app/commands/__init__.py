@@ -43,7 +43,7 @@ class Run(FromPreset):
     def run(self) -> None:
         """Says what memory the stages will take, makes those that are not finished, prints the table."""
         check_config_values(self.config)
-        pipeline.check_place(self.out, resume=self.resume)
+        pipeline.check_place(self.config, self.out, resume=self.resume)
         check_devices(self.config, self.out)
         for need in check_networks(self.config, self.out):
             print(need, file=sys.stderr, flush=True)

@@ -57,7 +57,7 @@ class OneStage(FromPreset):
     def run(self) -> None:
         """Says what memory the stage will take and makes it from its finished parents in the run."""
         stage, config = get_stage(self.stage), check_config_values(self.config)
-        pipeline.check_place(self.out, resume=self.resume, stages=[stage])
+        pipeline.check_place(config, self.out, resume=self.resume, stages=[stage])
         for name in stage.parents:
             artifacts.require(self.out, name, config)
         for need in check_networks(config, self.out, {stage.name}.intersection(ON_PICTURES)):

@@ -67,6 +67,14 @@ def check_objects(world: WorldConfig) -> None:
         get_object(name)
 
 
+def check_file(option: str, path: Path) -> None:
+    """UserError if `path` cannot become a file: it is a folder, or lies below a file."""
+    if path.is_dir():
+        raise UserError(f"{option} is {path}, a folder: name a file, in it or elsewhere.")
+    if not (there := next(place for place in path.absolute().parents if place.exists())).is_dir():
+        raise UserError(f"{option} is {path}, and {there} is no folder: name a file elsewhere.")
+
+
 def check_score(score: ScoreConfig) -> None:
     """UserError unless the networks that the scores name have their weights."""
     from foundation import catalog, store
@@ -80,8 +88,20 @@ def check_score(score: ScoreConfig) -> None:
 
 def check_data(option: str, path: Path) -> None:
     """UserError unless there is a recording, or a folder of them, to read."""
+    from sensors.recordings.recording import recording_folders
+
     if not path.exists():
         raise UserError(f"{option} is {path}, which does not exist: give a recording or a folder of them.")
+    if not path.is_dir():
+        raise UserError(
+            f"{option} is {path}, a file: give a recording or a folder of them; of a RealSense file "
+            f"`ddgrasp record import {path}` makes one."
+        )
+    if not recording_folders(path):
+        raise UserError(
+            f"{option} is {path}, which holds no recording (color/, depth/, meta.json): give one or a folder "
+            "of them; `ddgrasp record import` makes them of pictures or RealSense files."
+        )
 
 
 def recordings_in(option: str, path: Path) -> dict[str, Any]:
@@ -89,12 +109,14 @@ def recordings_in(option: str, path: Path) -> dict[str, Any]:
     from sensors.recordings.recording import contents
 
     check_data(option, path)
-    return {"data": path} | ({"recordings": contents(path)} if path.is_dir() else {})
+    return {"data": path, "recordings": contents(path)}
 
 
 def stage_folder(option: str, path: Path, stage: str) -> Path:
-    """The finished `stage` that `path` is, or that lies in the run `path`; UserError if there is none."""
+    """The finished `stage` that `path` is, or that lies in the run `path`; UserError if there is none, or if
+    `path` is another stage's."""
     if found := holding(path, artifacts.MANIFEST, stage):
+        artifacts.check_stage(option, found, stage)
         return found
     trouble = "holds no finished stage" if shipped(path).exists() else "does not exist"
     raise UserError(f"{option} is {path}, which {trouble}: give a run that has made {stage}, or its folder.")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from app import pipeline
 from app.commands.base import OneStage
-from app.commands.checks import check_config_values, check_data, recordings_in, stage_folder
+from app.commands.checks import check_config_values, check_data, check_file, recordings_in, stage_folder
 from ddgrasp import artifacts
 from ddgrasp.config.checks import Count, Seed, Steps, Text
 from ddgrasp.config.ddg import HALVED_SPACINGS, PROGRESSIVE, Sampler
@@ -116,7 +116,10 @@ class DDGGenerate:
 
     def run(self) -> None:
         """Writes depth.zarr episode by episode and prints how much of it is invalid."""
+        from demos.store import STORE, EpisodeStore
+
         demos = stage_folder("--demos", self.demos, "demos")
+        EpisodeStore(demos / STORE)
         parents = {
             "ddg": artifacts.read_artifact(_fitted(self.model)),
             "demos": artifacts.read_artifact(demos),
@@ -177,12 +180,14 @@ class DDGExport:
 
     def run(self) -> None:
         """Writes the file and prints how it compares with JAX."""
-        from export.generator import export_generator
-
+        check_file("--out", self.out)
         if self.data is not None:
             check_data("--data", self.data)
+        model = _fitted(self.model)
+        from export.generator import export_generator
+
         measured = export_generator(
-            _fitted(self.model),
+            model,
             self.out,
             data=self.data,
             licence=self.licence,

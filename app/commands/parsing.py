@@ -71,7 +71,7 @@ def refused(box: str, command: str) -> UserError:
     if (number := _NUMBER.search(trouble)) is not None:
         kind = "a whole number" if number["int"] else "a number"
         return UserError(f"{number['option']} is {number['value']}; expected {kind}.")
-    nearest = [re.search(r"--\S+", block) for block in more if block.startswith("Perhaps you meant")]
+    nearest = [re.search(r"--[^\s,]+", block) for block in more if block.startswith("Perhaps you meant")]
     hint = f" Did you mean {nearest[0].group()}?" if nearest and nearest[0] else ""
     return UserError(f"{trouble.rstrip('.')}.{hint} Options: {command} --help.")
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 import tyro
 
 from app import extras
+from app.commands.checks import stage_folder
 from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
@@ -58,8 +59,8 @@ class Play:
     number: Annotated[int, Range(0, 999)] = 0
     """Another number, other places of the objects."""
     generator: Path | None = None
-    """Folder of a fitted generator (a run's ddg) for noise generator, instead of pretrained/ddg; a film then
-    shows its depth beside the camera's."""
+    """A run with a fitted generator, or its folder ddg, for noise generator, instead of pretrained/ddg; a
+    film then shows its depth beside the camera's."""
     viewer: Literal["auto", "film", "mujoco", "rerun", "web"] = "auto"
     """film (a file), mujoco (MuJoCo's window), rerun (Rerun's), web (Rerun in the browser, also of another
     machine), or auto: on a terminal mujoco if there is a display, or else web if Rerun is installed; a film
@@ -74,6 +75,8 @@ class Play:
         replace(self, viewer=chosen)._run()
 
     def _run(self) -> None:
+        given = self.generator
+        generator = stage_folder("--generator", given, "ddg") if given else PRETRAINED_GENERATOR
         from evaluation.rig_trials import Series
 
         if self.rig == "fr3":
@@ -81,7 +84,7 @@ class Play:
         series = Series(self.rig, self.objects, self.trials, number=self.number, seconds=self.seconds)
         trials = series.plan()
         controls = Controls(_objects_by_rig(series), self.rig, self.noise)
-        noise = _ChosenNoise(controls, self.generator or PRETRAINED_GENERATOR)
+        noise = _ChosenNoise(controls, generator)
         viewer = self._viewer(noise)
         rigs = _Rigs(series, self.policy or _pretrained(), noise)
         try:

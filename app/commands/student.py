@@ -99,13 +99,14 @@ class Deploy:
     config: Annotated[Config, tyro.conf.arg(name="")]
     """Without --preset: the configuration of the run that the policy lies in."""
     policy: Path
-    """ONNX file that `ddgrasp export` wrote."""
+    """ONNX file that `ddgrasp export` wrote. Without --preset the configuration of its run counts."""
     robot: Robot = "sim"
     """sim (the pseudo-real rig) or franka."""
     host: str = ""
     """Address of franka's control unit; empty takes deploy.franka.host, or 127.0.0.1 with camera rig."""
     camera: Camera = "stereo"
-    """stereo (the rig's own), realsense, replay (a recording), or rig (the FR3 rig at --host)."""
+    """stereo (the rig's own), realsense, replay (a recording), rig (the FR3 rig at --host), or rig-ideal (the
+    same without errors)."""
     recording: Path | None = None
     """Recording for camera replay."""
     object_name: str = ""

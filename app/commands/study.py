@@ -59,7 +59,7 @@ class StudyTable2(FromPreset):
         from app import table2
         from evaluation.table2 import page, results
 
-        pipeline.check_place(self.out / results.SHARED, resume=self.resume)
+        pipeline.check_place(self.config, self.out / results.SHARED, resume=self.resume)
         study = self.planned()
         table2.check_place(study, self.resume)
         if not results.has_students(self.out, study.rows):
@@ -156,7 +156,9 @@ def _check_paper_generator(config: DDGConfig, given: str, made: Path) -> None:
             )
     check_start("ddg", "--paper-generator", given)
     if given:
-        fitted = artifacts.read_manifest(start.folder(replace(config, init_from=given))).config["ddg"]
+        source = start.folder(replace(config, init_from=given))
+        artifacts.check_stage("--paper-generator", source, "ddg")
+        fitted = artifacts.read_manifest(source).config["ddg"]
         if (weight := fitted["training"]["loss_weight"]) != UNIFORM:
             raise UserError(
                 f"--paper-generator is {given!r}, fitted with ddg.training.loss_weight {weight!r}; the "

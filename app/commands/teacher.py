@@ -33,7 +33,7 @@ class TeacherTrain(OneStage):
         """Trains with every process that --hosts names."""
         stage = get_stage(self.stage)
         check_config_values(self.config)
-        pipeline.check_place(self.out, resume=self.resume, stages=[stage])
+        pipeline.check_place(self.config, self.out, resume=self.resume, stages=[stage])
         from ppo import hosts
 
         hosts.connect(self.hosts)

@@ -110,7 +110,7 @@ def chosen(rows: Sequence[str], tables: Sequence[str]) -> tuple[str, ...]:
     """Names of the rows asked for, in the order in which they are to be made: those named, else the tables',
     each once.
 
-    Raises UserError for an unknown row or table.
+    Raises UserError for an unknown row or table, or none at all.
     """
     for name in rows:
         if name not in ROWS:
@@ -118,6 +118,8 @@ def chosen(rows: Sequence[str], tables: Sequence[str]) -> tuple[str, ...]:
     for name in tables:
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)
+    if not rows and not tables:
+        raise UserError(f"--table names none, and --rows neither: give tables ({', '.join(TABLES)}) or rows.")
     return tuple(dict.fromkeys(rows or (row for name in tables for row in TABLES[name].rows)))
 
 

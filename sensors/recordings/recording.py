@@ -193,7 +193,7 @@ def find_recordings(root: str | os.PathLike) -> list[Recording]:
     root = Path(root)
     if not root.is_dir():
         raise UserError(f"{root}: no such folder; expected a recording or a folder of recordings.")
-    folders = _folders(root)
+    folders = recording_folders(root)
     if not folders:
         raise UserError(
             f"{root}: no recording in it (a recording has color/, depth/ and {META_FILE}); "
@@ -208,7 +208,7 @@ def contents(root: str | os.PathLike) -> str:
     Their number, that of their pictures, and a hash of names (not of a single one), numbers and meta.json.
     """
     root = Path(root)
-    folders, digest, pictures = _folders(root), hashlib.sha256(), 0
+    folders, digest, pictures = recording_folders(root), hashlib.sha256(), 0
     for folder in folders:
         count = sum(1 for _ in (folder / "depth").iterdir())
         name, meta = folder.relative_to(root), folder / META_FILE
@@ -217,7 +217,7 @@ def contents(root: str | os.PathLike) -> str:
     return f"{len(folders)} recordings of {pictures} pictures, {digest.hexdigest()[:8]}"
 
 
-def _folders(root: Path) -> list[Path]:
+def recording_folders(root: Path) -> list[Path]:
     """`root` itself if it has pictures, else the finished recordings directly below it, by name."""
     if (root / "depth").is_dir():
         return [root]
