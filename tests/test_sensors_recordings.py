@@ -121,6 +121,17 @@ def test_damaged_frames_are_named_and_the_rest_stays_readable(tmp_path):
     np.testing.assert_array_equal(recording.depth_mm(1), _frame(6)[1])
 
 
+@pytest.mark.parametrize("names", [("8", "9", "10", "100"), ("9.25", "9.5", "10", "10.125")])
+def test_frames_are_in_time_order_whatever_their_names_widths(tmp_path, names):
+    path = _write(tmp_path / "a", frames=len(names))
+    for index, name in enumerate(names):
+        _replace_depth(path, index, np.full((24, 32), 600 + index, np.uint16))
+        (path / "depth" / f"{index:06d}.png").rename(path / "depth" / f"{name}.png")
+        (path / "color" / f"{index:06d}.jpg").rename(path / "color" / f"{name}.jpg")
+    read = Recording.open(path)
+    assert [int(read.depth_mm(i).max()) for i in range(len(read))] == [600, 601, 602, 603]
+
+
 @pytest.mark.parametrize(
     ("image", "message"),
     [

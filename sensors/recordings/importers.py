@@ -6,7 +6,6 @@ named and left out; a source none of whose frames can be used, or whose depth is
 
 import json
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from sensors.recordings.recording import (
     NEAREST_MEDIAN_M,
     UNIT_CHECK_FRAMES,
     RecordingWriter,
+    in_time,
 )
 from sensors.recordings.sources import RawFrame, Source
 
@@ -199,7 +199,7 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
         UserError: no depth pictures, or a meta.json that is none.
     """
     pictures = (p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
-    files = sorted(pictures, key=_in_time)
+    files = sorted(pictures, key=in_time)
     if not files:
         raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
     own = _own_meta(folder / META_FILE)
@@ -233,12 +233,6 @@ def _own_meta(file: Path) -> dict[str, Any]:
     if isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit <= 1:
         raise UserError(f"{file}: depth_unit_m is {unit!r}; expected metres per unit of depth, up to 1.")
     return meta
-
-
-def _in_time(file: Path) -> list[tuple[int, str]]:
-    """Numbers in a name count as numbers: 10.png comes after 9.png."""
-    parts = re.split(r"(\d+)", file.name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _is_pair(folder: Path) -> bool:

@@ -8,9 +8,11 @@ whose depth cannot be what it claims (unit, type, size) is refused. NumPy and Op
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, SupportsIndex
 
@@ -202,6 +204,15 @@ def find_recordings(root: str | os.PathLike) -> list[Recording]:
     return [Recording.open(folder) for folder in folders]
 
 
+def in_time(file: Path) -> list[tuple[Decimal, str]]:
+    """Key that sorts a recording's pictures: numbers in a name count as numbers, 10.png comes after 9.png.
+
+    A point between digits is a decimal point, as in names that are seconds: 4.5.png comes after 4.25.png.
+    """
+    parts = enumerate(re.split(r"(\d+(?:\.\d+)?)", file.name))  # text and numbers in turn
+    return [(Decimal(part), "") if place % 2 else (Decimal(-1), part) for place, part in parts]
+
+
 def contents(root: str | os.PathLike) -> str:
     """Tells one set of finished recordings at or directly below `root` from another.
 
@@ -357,7 +368,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 def _depth_files(path: Path) -> list[Path]:
     folder = path / "depth"
-    files = sorted(p for p in folder.iterdir() if p.is_file()) if folder.is_dir() else []
+    files = sorted((p for p in folder.iterdir() if p.is_file()), key=in_time) if folder.is_dir() else []
     for file in files:
         if file.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".exr", ".pfm"):
             raise UserError(
