@@ -167,6 +167,17 @@ def test_unit_that_cannot_be_is_refused(tmp_path, factor, message):
         Recording.open(path)
 
 
+@pytest.mark.parametrize(("counts", "unit_m"), [(9, 1e-5), (60_000, 1e-2)])
+def test_a_unit_that_leaves_no_depth_is_refused_in_one_line(tmp_path, counts, unit_m):
+    path = _write(tmp_path / "a")
+    for index in range(4):
+        _replace_depth(path, index, np.full((24, 32), counts, np.uint16))
+    _set_meta(path, depth_unit_m=unit_m)
+    with pytest.raises(UserError, match=f"a: with depth_unit_m {unit_m:g} no pixel of 4 of its") as error:
+        Recording.open(path)
+    assert "\n" not in str(error.value)
+
+
 def test_declared_unit_is_converted_to_millimetres(tmp_path):
     path = _write(tmp_path / "a")
     for index in range(4):

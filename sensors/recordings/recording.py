@@ -390,8 +390,14 @@ def _check_unit(recording: Recording) -> None:
     """Refuse depth whose median cannot be a D4xx's in the declared unit."""
     indices = np.linspace(0, len(recording) - 1, min(UNIT_CHECK_FRAMES, len(recording))).astype(int)
     values = np.concatenate([d[d > 0] for d in (recording.depth_mm(i) for i in indices)])
-    median_m = float(np.median(values)) * DEPTH_UNIT_M
     unit = recording.meta["depth_unit_m"]
+    if not len(values):
+        raise UserError(
+            f"{recording.path}: with depth_unit_m {unit:g} no pixel of {len(indices)} of its frames lies "
+            f"between {DEPTH_UNIT_M:g} and {depth.MAX_MM * DEPTH_UNIT_M:g} m: correct depth_unit_m in "
+            f"{META_FILE}."
+        )
+    median_m = float(np.median(values)) * DEPTH_UNIT_M
     if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
         return
     finer = unit / 10 ** round(np.log10(median_m))
