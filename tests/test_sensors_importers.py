@@ -135,6 +135,7 @@ def test_a_source_that_cannot_be_opened_does_not_stop_the_others(tmp_path, capsy
 def test_a_recording_imported_again_says_the_same_of_its_camera(tmp_path):
     root = make_folder(tmp_path / "desk", color="color")
     known = {"depth_unit_m": 0.0005, "sensor": "D435", "fx_px": 380.0, "hz": 15, "consecutive_frames": True}
+    known |= {"licence": "CC BY 4.0", "source": "a kitchen"}
     (root / "meta.json").write_text(json.dumps({**known, "contract_version": -1, "frames": 99}))
     run(root, "--out", tmp_path / "out")
     again = Recording.open(tmp_path / "out" / "desk")

@@ -1,7 +1,8 @@
 """Recordings from elsewhere into the format of `recordings.py`: folders of pictures, RealSense files.
 
-Only pictures and what the camera is are kept: no pose, no CAD, no pairing. A frame that cannot be used is
-named and left out; a source none of whose frames can be used, or whose depth is in another unit, is refused.
+Only pictures, what the camera is, and licence and source are kept: no pose, no CAD, no pairing. A frame that
+cannot be used is named and left out; a source none of whose frames can be used, or whose depth is in another
+unit, is refused.
 """
 
 import json
@@ -31,7 +32,10 @@ COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 REALSENSE_SUFFIXES = (".bag", ".db3")
-KEPT_META = ("sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth")
+KEPT_META = (
+    "sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth",
+    "licence", "source",
+)  # fmt: skip
 """What is taken over of a folder's own meta.json."""
 _ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
 
