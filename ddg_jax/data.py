@@ -75,20 +75,26 @@ class Frames:
 def load_frames(
     root: Path, config: DDGConfig, prior: Prior, seed: int, progress: Progress, max_frames: int | None = None
 ) -> Frames:
-    """The usable frames of the recordings at or below `root`, at most `max_frames`, with their priors.
+    """The usable frames of the recordings at or below `root`, with their priors.
 
-    Names what it leaves out, and says at the end how much that was. Raises UserError if there is no
-    recording, none can be used, or they are of another contract version (sensors/recordings/recording.py).
+    Of their first `max_frames` alone; those that cannot be used count towards it, and none behind them is
+    read instead. Names what it leaves out, and says at the end how much that was. Raises UserError if there
+    is no recording, none can be used, or they are of another contract version
+    (sensors/recordings/recording.py).
     """
     folders = _folders(root)
     depth, priors, index, skipped, refused = [], [], [], 0, []
     left = sys.maxsize if max_frames is None else max_frames
     for number, folder in enumerate(progress.track(folders, "reading recordings")):
+        if not left:
+            break
         try:
             recording = find_recordings(folder)[0]
+            count = min(left, len(recording))
+            left -= count
             if number == 0:
                 _tell_of_crop(recording, config, progress)
-            frames, rgb, left_out = _read(recording, left, config, prior, progress)
+            frames, rgb, left_out = _read(recording, count, config, prior, progress)
         except UserError as error:
             if len(folders) == 1:
                 raise
@@ -100,8 +106,6 @@ def load_frames(
         priors.append(c.astype(np.float16))
         depth.append(frames)
         index.append(np.full(len(frames), number))
-        if (left := left - len(frames)) <= 0:
-            break
     if not depth:
         raise UserError(
             f"{root}: none of its {len(folders)} recording(s) can be used. The first: {refused[0]}"
@@ -141,10 +145,10 @@ def _folders(root: Path) -> list[Path]:
 
 
 def _read(
-    recording: Recording, limit: int, config: DDGConfig, prior: Prior, progress: Progress
+    recording: Recording, count: int, config: DDGConfig, prior: Prior, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """The first `limit` frames: (depth (T, H, W) in metres at the generator's size, rgb (T, h, w, 3) if the
-    prior wants it, number of frames left out).
+    """The usable ones of the first `count` frames: (depth (T, H, W) in metres at the generator's size, rgb
+    (T, h, w, 3) if the prior wants it, number of frames left out).
     """
     if recording.skipped:
         progress.note(recording.skipped_summary())
@@ -154,7 +158,6 @@ def _read(
             "align it when recording, or --ddg.prior.source inverse_depth."
         )
     size = (config.depth.height_px, config.depth.width_px)
-    count = min(limit, len(recording))
     frames = np.stack([crop_nearest(recording.depth_m(i), size) for i in range(count)])
     usable = np.flatnonzero((frames > 0).any(axis=(1, 2)))
     blind = len(frames) - len(usable)
