@@ -128,6 +128,14 @@ def test_the_score_has_every_column_the_floor_and_the_targets(scored):
     assert result["features"]["depthfeat-v1"]["sha256"]
 
 
+def test_a_generator_of_another_shape_than_the_camera_is_refused_before_recording(run_dir, tmp_path):
+    depth = replace(CONFIG.ddg.depth, height_px=48)
+    square = replace(CONFIG, ddg=replace(CONFIG.ddg, depth=depth))
+    with pytest.raises(UserError, match="depth is 320x180, the generator's 64x48: .*height-px 36"):
+        score_data.record_rig(square, run_dir / "teacher", tmp_path / "data", False, Progress(quiet=True))
+    assert not (tmp_path / "data").exists()
+
+
 def test_hole_figures_say_what_must_be_so(scored):
     result = json.loads((scored / "score" / "score.json").read_text())["holes"]
     value = {name: {k: v["value"] for k, v in item["figures"].items()} for name, item in result.items()}

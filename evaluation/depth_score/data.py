@@ -68,7 +68,12 @@ def record_rig(
     """Files of `config.score.trajectories` episodes per side, real first; those there already are kept.
 
     teacher: directory of the finished teacher stage.
+
+    Raises UserError, before anything is recorded, if the generator has another aspect ratio than the camera.
     """
+    from ddg_jax.sample import check_aspect
+
+    check_aspect((config.world.profile.height_px, config.world.profile.width_px), config.ddg)
     names = [
         (side, directory / f"{side}_{i:04d}.npz") for side in SIDES for i in range(config.score.trajectories)
     ]
