@@ -201,6 +201,37 @@ def test_disparity_is_the_recorded_cameras_own(tmp_path):
         score_data.load_real(tmp_path / "room", 32, 2)
 
 
+def test_blocks_are_of_one_recording_each(tmp_path):
+    for name, frames in (("a", 11), ("b", 13), ("c", 16), ("d", 7)):
+        write_recording(tmp_path / name, frames, (48, 64))
+    real = score_data.load_real(tmp_path, 32, 40)  # the last four of a
+    assert real.recording.tolist() == [0] * 4 + [1] * 13 + [2] * 16 + [3] * 7
+    assert real.blocks == [4, 17, 25]
+    episodes = score_data.real_episodes(real, with_rgb=True)
+    assert [(e.side, e.number, e.group) for e in episodes] == [
+        (side, number, number % 3) for number, side in enumerate(["real"] * 3 + ["sim"] * 3)
+    ]
+    for episode, rows in ((episodes[0], np.s_[4:12:2]), (episodes[4], np.s_[18:25:2])):
+        np.testing.assert_array_equal(episode.sensed_mm, real.depth_mm[rows])
+        np.testing.assert_array_equal(episode.rgb, real.rgb[rows])
+    assert score_data.load_real(tmp_path / "c", 32, 15).blocks == [0]  # from the first frame, as ever
+
+
+def test_scored_recordings_are_of_one_camera_and_long_enough(tmp_path, capsys):
+    for name in ("a", "b", "c"):
+        write_recording(tmp_path / "rooms" / name, 9, (48, 64))
+    meta = tmp_path / "rooms" / "a" / "meta.json"
+    meta.write_text(meta.read_text().replace("D435", "D455"))
+    command = ["ddg", "score", *SIZES, "--out", str(tmp_path / "out"), "--real", str(tmp_path / "rooms")]
+    assert cli.main([*command, "--fit-frames", "2", "--score-frames", "19"]) == 2
+    said = capsys.readouterr().err
+    assert "b has focal length and baseline (38.4, 0.05), " in said and "a (38.4, 0.095)" in said
+    assert score_data.load_real(tmp_path / "rooms", 32, 18).baseline_m == 0.05  # a is not among them
+    assert cli.main([*command, "--fit-frames", "2", "--score-frames", "16", "--resume"]) == 2
+    assert "16 hold 1 run(s) of 8 frames of one recording; expected 2" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "score_real" / "ddg").exists()
+
+
 def test_colour_of_another_view_is_no_monocular_network_s(tmp_path):
     write_recording(tmp_path / "room", 8, (48, 64))
     meta = tmp_path / "room" / "meta.json"
