@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ from evaluation.depth_score.domains import (
     sense,
     wanted_domains,
 )
-from evaluation.depth_score.episodes import Scored
+from evaluation.depth_score.episodes import Scored, collect, score_episodes
 from evaluation.depth_score.figures import draw_efficiency
 from evaluation.report.stage import write_report
 from foundation import convert, store
@@ -346,6 +347,22 @@ def test_domains_belong_to_one_side_and_depend_on_seed_and_episode_alone(run_dir
     assert off_per_m.max() <= LIMIT_PER_M + 0.002  # and half a millimetre of rounding
     other = sense(replace(methods, seed=1), episode("sim"), ["sim_ddg", "sim_rand_noise"])
     assert all((other[name] != sim[name]).any() for name in other)
+
+
+def test_episodes_scored_for_other_columns_are_scored_again(run_dir, tmp_path):
+    methods = Methods(ScoreConfig(), 0, Generator.load(run_dir / "ddg"))
+    extractors, loads = [score_features.load("depthfeat-v1")], [partial(episode, s) for s in score_data.SIDES]
+
+    def score(*names: str) -> dict[str, int]:
+        files = score_episodes(methods, extractors, loads, names, tmp_path, Progress(quiet=True))
+        return {name: len(s.features) for name, s in collect(files).features["depthfeat-v1"].items()}
+
+    assert score("real_raw", FLOOR) == {"real_raw": 3, FLOOR: 3}
+    times = [file.stat().st_mtime_ns for file in sorted(tmp_path.iterdir())]
+    assert score("real_raw", FLOOR, "real_inpaint") == {"real_raw": 3, FLOOR: 3, "real_inpaint": 3}
+    again = [file.stat().st_mtime_ns for file in sorted(tmp_path.iterdir())]
+    assert again[0] > times[0] and again[1] == times[1]  # nothing new of the simulated side
+    assert score("real_raw", FLOOR) == {"real_raw": 3, FLOOR: 3}
 
 
 def test_the_monocular_column_uses_the_users_weights(run_dir, tmp_path):
