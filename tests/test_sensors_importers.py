@@ -148,6 +148,13 @@ def test_a_recording_imported_again_says_the_same_of_its_camera(tmp_path):
     np.testing.assert_array_equal(given.depth_mm(2), depth_mm(2))
 
 
+@pytest.mark.parametrize(("unit_m", "said"), [("0.0005", 1), ("0.001", 0), ("0.002", 0)])
+def test_what_is_lost_of_finer_depth_is_said_once(tmp_path, capsys, unit_m, said):
+    run(make_folder(tmp_path / "desk"), "--out", tmp_path / "out", "--depth-unit-m", unit_m)
+    line = f"{tmp_path / 'out' / 'desk'}: depth in units of {unit_m} m was rounded to whole millimetres"
+    assert capsys.readouterr().out.count(line) == said
+
+
 @pytest.mark.parametrize("text", ["{", "[1]", '{"depth_unit_m": "mm"}', '{"depth_unit_m": 0}'])
 def test_a_broken_meta_json_is_named(tmp_path, text):
     root = make_folder(tmp_path / "desk")

@@ -186,6 +186,21 @@ def test_declared_unit_is_converted_to_millimetres(tmp_path):
     np.testing.assert_array_equal(Recording.open(path).depth_mm(1), _frame(1)[1])
 
 
+def test_depth_in_metres_is_as_fine_as_the_declared_unit(tmp_path):
+    path = _write(tmp_path / "a")
+    counts = np.full((24, 32), 9004, np.uint16)
+    counts[0, :3] = 0, 4, 9006  # 4 is less than half a millimetre: a hole in millimetres, so one in metres
+    for index in range(4):
+        _replace_depth(path, index, counts)
+    _set_meta(path, depth_unit_m=0.0001)
+    recording = Recording.open(path)
+    assert recording.depth_mm(0)[0, :4].tolist() == [0, 0, 901, 900]
+    np.testing.assert_allclose(recording.depth_m(0)[0, :4], [0, 0, 0.9006, 0.9004], rtol=1e-6)
+    assert recording.depth_m(0).dtype == np.float32
+    _set_meta(path, depth_unit_m=0.0002)
+    assert Recording.open(path).depth_m(0)[1, 1] == np.float32(1.8008)
+
+
 @pytest.mark.parametrize("value", [None, "mm", 1.0])
 def test_undeclared_unit_is_refused(tmp_path, value):
     path = _write(tmp_path / "a")

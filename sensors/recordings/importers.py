@@ -48,6 +48,14 @@ class Imported:
     frames: int
     skipped: tuple[str, ...]
     """Frames left out: name and reason."""
+    loss: str = ""
+    """What of its depth did not fit into the format, if anything."""
+
+    @property
+    def lines(self) -> list[str]:
+        """For people: what was left out, a line each, and `loss`."""
+        left_out = [f"{self.path}: left out {what}" for what in self.skipped]
+        return [*left_out, f"{self.path}: {self.loss}"] if self.loss else left_out
 
 
 def import_recording(source: Source, path: Path) -> Imported:
@@ -87,7 +95,13 @@ def import_recording(source: Source, path: Path) -> Imported:
                 f"{source.path}: none of its {len(skipped)} frames can be used "
                 f"({skipped[0] if skipped else 'it is empty'})."
             )
-    return Imported(path, frames, tuple(skipped))
+    return Imported(path, frames, tuple(skipped), _loss(source.depth_unit_m))
+
+
+def _loss(unit_m: float) -> str:
+    if unit_m >= DEPTH_UNIT_M:
+        return ""
+    return f"depth in units of {unit_m:g} m was rounded to whole millimetres, which recordings here have"
 
 
 def import_all(
@@ -120,7 +134,7 @@ def _name(source: Path) -> str:
 def summary(done: list[Imported], refused: list[str]) -> str:
     """What was imported and left out, counts last."""
     lines = [f"refused: {why}" for why in refused]
-    lines += [f"{one.path}: left out {what}" for one in done for what in one.skipped]
+    lines += [line for one in done for line in one.lines]
     lines += [f"{one.path}: {one.frames} frames" for one in done]
     frames, skipped = sum(one.frames for one in done), sum(len(one.skipped) for one in done)
     return "\n".join(

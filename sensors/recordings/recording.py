@@ -145,15 +145,18 @@ class Recording:
 
     def depth_mm(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 planar depth in millimetres, 0 = invalid."""
+        return depth.from_counts(self._counts(index), self.meta["depth_unit_m"])
+
+    def depth_m(self, index: SupportsIndex) -> Float32[np.ndarray, "H W"]:
+        """(H, W) float32 planar depth in metres, 0 = invalid; as fine as `depth_unit_m`."""
+        return depth.metres_from_counts(self._counts(index), self.meta["depth_unit_m"])
+
+    def _counts(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
         file = self.depth_files[index]
         raw = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
         if raw is None:
             raise UserError(f"{file}: cannot be decoded as PNG; delete it or copy it again.")
-        return depth.from_counts(raw, self.meta["depth_unit_m"])
-
-    def depth_m(self, index: SupportsIndex) -> Float32[np.ndarray, "H W"]:
-        """(H, W) float32 planar depth in metres, 0 = invalid."""
-        return depth.to_metres(self.depth_mm(index))
+        return raw
 
     def rgb(self, index: SupportsIndex) -> UInt8[np.ndarray, "h w 3"]:
         """(h, w, 3) uint8 colour at the colour camera's own size."""
