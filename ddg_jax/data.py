@@ -17,6 +17,7 @@ from ddgrasp.config import PIECEWISE, PLANES, DDGConfig
 from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from learning import memory
 from sensors.recordings.recording import Recording, find_recordings, is_recording
 from sensors.statistics.holes import fill_from_background, smooth_surface
 from sensors.statistics.planes import on_planes
@@ -72,6 +73,11 @@ class Frames:
         return self.part(slice(0, len(self) - held)), self.part(slice(len(self) - held, len(self)))
 
 
+def frames_bytes(config: DDGConfig, count: int) -> int:
+    """Bytes of the arrays of `Frames` with `count` frames."""
+    return count * config.depth.height_px * config.depth.width_px * (4 + 4 + 2)
+
+
 def load_frames(
     root: Path, config: DDGConfig, prior: Prior, seed: int, progress: Progress, max_frames: int | None = None
 ) -> Frames:
@@ -79,10 +85,13 @@ def load_frames(
 
     Of their first `max_frames` alone; those that cannot be used count towards it, and none behind them is
     read instead. Names what it leaves out, and says at the end how much that was. Raises UserError if there
-    is no recording, none can be used, or they are of another contract version
-    (sensors/recordings/recording.py).
+    is no recording, none can be used, they are of another contract version
+    (sensors/recordings/recording.py), or memory is too small for them, before any is read.
     """
     folders = _folders(root)
+    pictures = sum(1 for folder in folders for _ in (folder / "depth").glob("*.png"))
+    host = frames_bytes(config, pictures if max_frames is None else min(pictures, max_frames))
+    memory.check(memory.Need("ddg", 0, host, remedy="the number of recordings"), root)
     depth, priors, index, skipped, refused = [], [], [], 0, []
     left = sys.maxsize if max_frames is None else max_frames
     for number, folder in enumerate(progress.track(folders, "reading recordings")):

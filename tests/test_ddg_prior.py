@@ -14,6 +14,7 @@ from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
+from learning import memory
 from sensors.recordings.recording import RecordingWriter
 from sensors.statistics.holes import fill_from_background
 
@@ -209,6 +210,19 @@ def test_no_frame_behind_the_first_ones_is_read_for_those_that_cannot_be_used(tm
                 made()
         else:
             assert made().recording.tolist() == used
+
+
+def test_more_recordings_than_memory_are_refused_before_any_is_read(recordings, monkeypatch):
+    needed = 6 * 18 * 32 * (4 + 4 + 2)
+    assert data.frames_bytes(WIDE, 6) == needed
+    monkeypatch.setattr(memory, "host_bytes", lambda: needed)
+    assert len(load(recordings)[0]) == 6
+    monkeypatch.setattr(memory, "host_bytes", lambda: needed - 1)
+    monkeypatch.setattr(data, "find_recordings", None)
+    with pytest.raises(
+        UserError, match=r"ddg needs about .* on the host, .*: lower the number of recordings"
+    ):
+        load(recordings)
 
 
 def test_colour_of_another_view_is_refused_where_the_prior_comes_from_it(tmp_path):
