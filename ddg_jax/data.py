@@ -17,6 +17,7 @@ from ddgrasp.config import PIECEWISE, PLANES, DDGConfig
 from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from learning import memory
 from sensors.recordings.recording import Recording, find_recordings, is_recording
 from sensors.statistics.holes import fill_from_background, smooth_surface
 from sensors.statistics.planes import on_planes
@@ -72,23 +73,37 @@ class Frames:
         return self.part(slice(0, len(self) - held)), self.part(slice(len(self) - held, len(self)))
 
 
+def frames_bytes(config: DDGConfig, count: int) -> int:
+    """Bytes of the arrays of `Frames` with `count` frames."""
+    return count * config.depth.height_px * config.depth.width_px * (4 + 4 + 2)
+
+
 def load_frames(
     root: Path, config: DDGConfig, prior: Prior, seed: int, progress: Progress, max_frames: int | None = None
 ) -> Frames:
-    """The usable frames of the recordings at or below `root`, at most `max_frames`, with their priors.
+    """The usable frames of the recordings at or below `root`, with their priors.
 
-    Names what it leaves out, and says at the end how much that was. Raises UserError if there is no
-    recording, none can be used, or they are of another contract version (sensors/recordings/recording.py).
+    Of their first `max_frames` alone; those that cannot be used count towards it, and none behind them is
+    read instead. Names what it leaves out, and says at the end how much that was. Raises UserError if there
+    is no recording, none can be used, they are of another contract version
+    (sensors/recordings/recording.py), or memory is too small for them, before any is read.
     """
     folders = _folders(root)
+    pictures = sum(1 for folder in folders for _ in (folder / "depth").glob("*.png"))
+    host = frames_bytes(config, pictures if max_frames is None else min(pictures, max_frames))
+    memory.check(memory.Need("ddg", 0, host, remedy="the number of recordings"), root)
     depth, priors, index, skipped, refused = [], [], [], 0, []
     left = sys.maxsize if max_frames is None else max_frames
     for number, folder in enumerate(progress.track(folders, "reading recordings")):
+        if not left:
+            break
         try:
             recording = find_recordings(folder)[0]
+            count = min(left, len(recording))
+            left -= count
             if number == 0:
                 _tell_of_crop(recording, config, progress)
-            frames, rgb, left_out = _read(recording, left, config, prior, progress)
+            frames, rgb, left_out = _read(recording, count, config, prior, progress)
         except UserError as error:
             if len(folders) == 1:
                 raise
@@ -100,8 +115,6 @@ def load_frames(
         priors.append(c.astype(np.float16))
         depth.append(frames)
         index.append(np.full(len(frames), number))
-        if (left := left - len(frames)) <= 0:
-            break
     if not depth:
         raise UserError(
             f"{root}: none of its {len(folders)} recording(s) can be used. The first: {refused[0]}"
@@ -141,10 +154,10 @@ def _folders(root: Path) -> list[Path]:
 
 
 def _read(
-    recording: Recording, limit: int, config: DDGConfig, prior: Prior, progress: Progress
+    recording: Recording, count: int, config: DDGConfig, prior: Prior, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """The first `limit` frames: (depth (T, H, W) in metres at the generator's size, rgb (T, h, w, 3) if the
-    prior wants it, number of frames left out).
+    """The usable ones of the first `count` frames: (depth (T, H, W) in metres at the generator's size, rgb
+    (T, h, w, 3) if the prior wants it, number of frames left out).
     """
     if recording.skipped:
         progress.note(recording.skipped_summary())
@@ -154,7 +167,6 @@ def _read(
             "align it when recording, or --ddg.prior.source inverse_depth."
         )
     size = (config.depth.height_px, config.depth.width_px)
-    count = min(limit, len(recording))
     frames = np.stack([crop_nearest(recording.depth_m(i), size) for i in range(count)])
     usable = np.flatnonzero((frames > 0).any(axis=(1, 2)))
     blind = len(frames) - len(usable)

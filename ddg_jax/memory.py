@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from ddg_jax import representation
+from ddg_jax.data import frames_bytes
 from ddg_jax.sample import sample
 from ddg_jax.train import init_state, train_step
 from ddgrasp.config import Config, DDGConfig
@@ -16,8 +17,7 @@ def need(config: Config) -> Need:
     """What stage `ddg` takes; frames are those of the rig's recordings."""
     ddg = config.ddg
     frames = config.record.trajectories * config.record.frames
-    pixels = ddg.depth.height_px * ddg.depth.width_px
-    host = frames * pixels * (4 + 4 + 2)
+    host = frames_bytes(ddg, frames)
     device = max(training_bytes(ddg), sampling_bytes(ddg))
     return Need(
         "ddg", device, host, remedy="ddg.training.batch_size, ddg.sampling.batch_size or record.frames"

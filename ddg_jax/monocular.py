@@ -39,7 +39,7 @@ class MonocularDepth:
         measured_m = to_metres(measured_mm)
         made_m = np.zeros_like(measured_m)
         for i, frame_m in enumerate(measured_m):
-            if np.count_nonzero(frame_m) >= _FEWEST_VALID:  # singly: a prior normalises over its frames
-                relative = self._prior.from_sim(measured_m[i : i + 1], rgb[i : i + 1])[0]
+            if np.count_nonzero(frame_m) >= _FEWEST_VALID:
+                relative = self._prior.relative(rgb[i : i + 1], frame_m.shape)[0]
                 made_m[i] = metric_depth(relative, frame_m, self._far_m)
         return to_millimetres(made_m)

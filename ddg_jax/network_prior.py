@@ -4,7 +4,7 @@ What the paper leaves open is c in simulation. Both readings are here (`DDGConfi
 on simulated RGB, or simulated depth itself, inverted and normalised as the network's output is.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -69,7 +69,13 @@ class DepthNetworkPrior:
             raise UserError(
                 f"ddg.prior.source {self.name} was given no RGB: keep it, or set ddg.prior.in_sim depth."
             )
-        return normalise(np.stack([at_size(frame, (size[0], size[1])) for frame in self._infer(rgb)]))
+        return normalise(self.relative(rgb, size))
+
+    def relative(
+        self, rgb: UInt8[np.ndarray, "T h w 3"], size: Sequence[int]
+    ) -> Float[np.ndarray, "T {size[0]} {size[1]}"]:
+        """Relative inverse depth as the network gives it, at `size`: neither normalised nor clipped."""
+        return np.stack([at_size(frame, (size[0], size[1])) for frame in self._infer(rgb)])
 
     @cached_property
     def _infer(self) -> Callable[[np.ndarray], np.ndarray]:

@@ -302,12 +302,13 @@ def _filled_up(values: np.ndarray, size: int) -> np.ndarray:
 
 
 def check_aspect(size: tuple[int, ...], config: DDGConfig) -> None:
-    """UserError if depth of (H, W) `size` is not of the generator's shape."""
-    height, width = size
-    if abs(width / height / (config.depth.width_px / config.depth.height_px) - 1) > _ASPECT_TOLERANCE:
+    """UserError if simulated depth of (H, W) `size` is not of the generator's shape."""
+    (height, width), maps = size, config.depth
+    if abs(width / height / (maps.width_px / maps.height_px) - 1) > _ASPECT_TOLERANCE:
         raise UserError(
-            f"Simulated depth is {width}x{height}; the generator was fitted at "
-            f"{config.depth.width_px}x{config.depth.height_px}: render with that aspect ratio."
+            f"Simulated depth is {width}x{height}, the generator's {maps.width_px}x{maps.height_px}: render "
+            f"with that aspect ratio, or fit one with --ddg.depth.height-px "
+            f"{round(maps.width_px * height / width)}."
         )
 
 

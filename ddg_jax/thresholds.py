@@ -18,10 +18,12 @@ from matplotlib.figure import Figure
 
 from ddg_jax import data
 from ddg_jax.sample import Generator, grafted, predict
-from ddg_jax.stage import hole_statistics
+from ddg_jax.stage import SCORED_FRAMES, hole_statistics
+from ddgrasp import artifacts
 from ddgrasp.config import DEPTH, DDGConfig
 from ddgrasp.files import atomic_write_bytes, atomic_write_json
 from ddgrasp.progress import Progress
+from ddgrasp.shipped import shipped
 
 THRESHOLDS = tuple(round(-0.9 + 0.1 * i, 1) for i in range(9))
 """Between holes (-1) and surfaces (0 to 1, representation depth)."""
@@ -73,15 +75,17 @@ def masked(
 
 
 def analyse(
-    model: Path, root: Path, out: Path, progress: Progress, *, count: int = 180, seed: int = 1
+    model: Path, root: Path, out: Path, progress: Progress, *, count: int | None = None, seed: int = 1
 ) -> list[Masked]:
     """Writes `out`/thresholds.json and .png for the last `count` frames of the recordings at or below `root`.
 
-    Those the model was fitted on are at the front (`DDGConfig.training.holdout_fraction`).
+    None takes those that the model, fitted on these recordings, was not fitted on: the last ones
+    (`DDGConfig.training.holdout_fraction`), at most SCORED_FRAMES. Says so if there are others among them.
     """
     generator = Generator.load(model)
     config = generator.config
-    frames = data.load_frames(root, config, generator.prior, seed, progress).part(slice(-count, None))
+    frames = data.load_frames(root, config, generator.prior, seed, progress)
+    frames = frames.part(slice(-_count(count, _held_out(model, len(frames)), progress), None))
     x = predict(jax.random.key(seed), generator, frames.prior, episode=frames.recording, frame=frames.number)
     thresholds = THRESHOLDS if config.depth.representation == DEPTH else WIDE_THRESHOLDS
     rows = [masked(config, x, frames, threshold) for threshold in thresholds]
@@ -94,6 +98,30 @@ def analyse(
     atomic_write_json(out / f"{FILE}.json", value)
     atomic_write_bytes(out / f"{FILE}.png", _drawn(rows, recorded, config.graft.noise_threshold))
     return rows
+
+
+def _held_out(model: Path, total: int) -> int | None:
+    """How many of `total` frames the model was not fitted on, by its manifest; None if that does not say.
+
+    `ddg score --real` fits on the first ones, and counts no others.
+    """
+    said = artifacts.read_manifest(shipped(model)).metrics.get("frames", {})
+    left = total - said.get("training", total)
+    return said.get("held_out", left if left > 0 else None)
+
+
+def _count(asked: int | None, held_out: int | None, progress: Progress) -> int:
+    count = asked or min(held_out or SCORED_FRAMES, SCORED_FRAMES)
+    if held_out is None:
+        progress.note(
+            f"the model does not say which frames it was fitted on: they may be among the last {count}"
+        )
+    elif count > held_out:
+        progress.note(
+            f"--count {count} of {held_out} frame(s) held out: if the model was fitted on these "
+            "recordings, the others are ones that it knows"
+        )
+    return count
 
 
 def table(rows: Sequence[Masked]) -> str:

@@ -52,6 +52,17 @@ def from_counts(counts: Real[np.ndarray, "*any"], unit_m: float) -> UInt16[np.nd
     return _whole(np.rint(counts.astype(np.float64) * (unit_m / DEPTH_UNIT_M)), np)
 
 
+def metres_from_counts(counts: UInt16[np.ndarray, "*any"], unit_m: float) -> Float32[np.ndarray, "*any"]:
+    """A file's counts of `unit_m` metres to float32 metres: as fine as they are, where millimetres are not.
+
+    0 where `from_counts` has 0; of counts of a millimetre or more, its millimetres.
+    """
+    millimetres = from_counts(counts, unit_m)
+    if unit_m >= DEPTH_UNIT_M:
+        return to_metres(millimetres)
+    return np.where(millimetres > 0, counts * unit_m, 0).astype(np.float32)
+
+
 def _whole(millimetres: AnyArray, xp: ModuleType) -> AnyArray:
     fits = (millimetres >= 0) & (millimetres <= MAX_MM)  # False for NaN
     return xp.where(fits, millimetres, 0).astype(np.uint16)

@@ -111,7 +111,7 @@ def run(
     for place, name in enumerate(names, 1):
         folder, progress = out / name, Progress(name=name)
         progress.note(f"row {place} of {len(names)}: {ROWS[name].title}")
-        header = rig_trials.made_with(config, policy) | {"row": name, "number": series.number}
+        header = rig_trials.made_with(config, policy) | _said(folder, name, series)
         known = len(_known(folder))
         begun = time.monotonic()
         rig_trials.run_missing(
@@ -123,6 +123,19 @@ def run(
             atomic_write_json(folder / TIMES_FILE, {"seconds_per_trial": seconds, "workers": workers})
         made = write(out, {"number": series.number, "policy": str(policy)})
     return made
+
+
+def _said(folder: Path, row: str, series: Series) -> dict[str, Any]:
+    """A row's own part of its log's header.
+
+    Without the seconds where a log of before 2026-11-28 goes on, which does not name them: the hash of its
+    configuration has them.
+    """
+    said = {"row": row, "number": series.number, "seconds": series.seconds}
+    had = read_log(folder / rig_trials.TRIALS_FILE)[0]
+    if had and "seconds" not in had:
+        del said["seconds"]
+    return said
 
 
 def one_pose(config: Config) -> Config:

@@ -8,13 +8,23 @@ import pytest
 
 from ddg_jax import network_prior, sample
 from ddg_jax.generate import Clip
-from ddg_jax.inverse_depth import invert, normalise
+from ddg_jax.inverse_depth import NORMALISED_LIMIT, invert, normalise
 from ddg_jax.monocular import MonocularDepth
 from ddg_jax.prior import InverseDepthPrior, make_prior
-from ddgrasp.config import Config, DDGConfig, DDGDepthConfig, PriorConfig, PriorInSim, StudentConfig
+from ddgrasp.config import (
+    Config,
+    DDGConfig,
+    DDGDepthConfig,
+    PriorConfig,
+    PriorInSim,
+    ScoreConfig,
+    StudentConfig,
+)
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json
 from demos.rollout import Scene
+from evaluation.depth_score.data import REAL, SIM, Episode
+from evaluation.depth_score.domains import Methods, sense
 from evaluation.treatments import Monocular, make_treatment
 from foundation import convert, store
 from student_jax.act import SourceCamera
@@ -136,14 +146,33 @@ def test_monocular_depth_has_the_scale_of_what_was_measured_and_no_holes(weights
     network = MonocularDepth(settings, str(weights))
     rng = np.random.default_rng(5)
     rgb = rng.integers(0, 256, (2, 28, 42, 3)).astype(np.uint8)
-    relative = make_prior(config(weights, in_sim="rgb")).from_sim(np.ones((2, 28, 42), np.float32), rgb)
-    truth_m = 1 / (0.2 * relative + 1.5)
+    relative = network_prior.DepthNetworkPrior(config(weights)).relative(rgb, (28, 42))
+    truth_m = 1 / (0.2 * (relative - relative.mean()) / relative.std() + 1.5)
     truth_m[:, :3] = 0.0  # a hole does not count, and is filled
     made_mm = network(np.round(1000 * truth_m).astype(np.uint16), rgb)
     np.testing.assert_allclose(made_mm[:, 3:], 1000 * truth_m[:, 3:], atol=3)
     assert made_mm.dtype == np.uint16 and (made_mm > 0).all()
     nothing = network(np.zeros((1, 28, 42), np.uint16), rgb[:1])
     assert not nothing.any()
+
+
+def test_monocular_depth_of_a_perfect_network_is_the_measured_one_far_and_near(weights, monkeypatch):
+    inverse = np.full((1, 24, 32), 0.5, np.float32)  # a wall at 2 m
+    inverse[:, 12:] = 0.4
+    inverse[:, 9:12, 14:17] = 2.0  # a thing at 0.5 m: many mean deviations from the wall
+    assert np.abs(normalise(inverse)).max() == NORMALISED_LIMIT
+    monkeypatch.setattr(
+        network_prior.DepthNetworkPrior, "_infer", staticmethod(lambda rgb: 3 * inverse - 0.2)
+    )
+    truth_mm, rgb = np.rint(1000 / inverse).astype(np.uint16), np.zeros((1, 24, 32, 3), np.uint8)
+    settings = config(weights)
+    np.testing.assert_allclose(MonocularDepth(settings, str(weights))(truth_mm, rgb), truth_mm, atol=1)
+    generator = sample.Generator(settings, {}, make_prior(settings))
+    methods = Methods(ScoreConfig(monocular_weights=str(weights)), 0, generator)
+    for side, sensed_mm in ((REAL, truth_mm), (SIM, 0 * truth_mm)):
+        episode = Episode(side, 0, 0, sensed_mm, truth_mm, truth_mm[:0], rgb, 30.0, 0.05)
+        name = f"{side}_monocular"
+        np.testing.assert_allclose(sense(methods, episode, [name])[name], truth_mm, atol=1)
 
 
 def test_student_and_rig_get_the_same_monocular_depth(weights):

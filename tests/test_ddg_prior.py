@@ -1,6 +1,7 @@
 """The built-in prior and the loading of recordings, by value on small pictures."""
 
 import json
+from functools import partial
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
+from learning import memory
 from sensors.recordings.recording import RecordingWriter
 from sensors.statistics.holes import fill_from_background
 
@@ -190,6 +192,37 @@ def test_what_cannot_be_used_is_named_and_counted(recordings):
     )
     few = data.load_frames(recordings, config, prior.make_prior(config), 0, Progress(quiet=True), 3)
     np.testing.assert_array_equal(few.depth_m, frames.depth_m[:3])
+
+
+def test_no_frame_behind_the_first_ones_is_read_for_those_that_cannot_be_used(tmp_path):
+    edge = np.zeros((64, 64), np.uint16)
+    edge[0] = 900  # outside the window
+    for name, blind in (("a", (0, 1)), ("b", (0,)), ("c", ())):
+        _record(tmp_path / name, size=(64, 64))
+        for frame in blind:
+            _depth(tmp_path, name, frame, edge)
+    for first, used in ((3, None), (4, [1]), (5, [1, 2]), (6, [1, 2, 2]), (9, [1, 2, 2])):
+        made = partial(
+            data.load_frames, tmp_path, WIDE, prior.make_prior(WIDE), 0, Progress(quiet=True), first
+        )
+        if used is None:
+            with pytest.raises(UserError, match="none of its 3 recording"):
+                made()
+        else:
+            assert made().recording.tolist() == used
+
+
+def test_more_recordings_than_memory_are_refused_before_any_is_read(recordings, monkeypatch):
+    needed = 6 * 18 * 32 * (4 + 4 + 2)
+    assert data.frames_bytes(WIDE, 6) == needed
+    monkeypatch.setattr(memory, "host_bytes", lambda: needed)
+    assert len(load(recordings)[0]) == 6
+    monkeypatch.setattr(memory, "host_bytes", lambda: needed - 1)
+    monkeypatch.setattr(data, "find_recordings", None)
+    with pytest.raises(
+        UserError, match=r"ddg needs about .* on the host, .*: lower the number of recordings"
+    ):
+        load(recordings)
 
 
 def test_colour_of_another_view_is_refused_where_the_prior_comes_from_it(tmp_path):

@@ -59,15 +59,44 @@ def test_the_analysis_by_hand():
     assert low.grafted_error_mm == high.grafted_error_mm == 0.0
 
 
-def test_the_command_leaves_a_table_and_a_plot(tmp_path):
+def make(tmp_path, **frames: int) -> None:
+    """A model whose manifest says `frames` of its fit, and a recording whose frame t of four has
+    12 + 24 t of 384 pixels invalid at the model's size."""
     params = init_params(CONFIG, jax.random.key(0))
     save_params(tmp_path / "ddg" / PARAMS_FILE, params)
-    artifacts.finish(tmp_path / "ddg", "ddg", Config(preset="test", ddg=CONFIG), seconds=1, metrics={})
+    metrics = {"frames": frames} if frames else {}
+    artifacts.finish(tmp_path / "ddg", "ddg", Config(preset="test", ddg=CONFIG), seconds=1, metrics=metrics)
     with RecordingWriter(tmp_path / "recording", {}) as writer:
         for t in range(4):
             depth = np.full((32, 48), 900, np.uint16)
             depth[8:20, 16 + t : 20 + t] = 0
+            depth[: 2 * t] = 0
             writer.add(np.zeros((32, 48, 3), np.uint8), depth)
+
+
+@pytest.mark.parametrize(
+    ("frames", "count", "used", "said"),
+    [
+        ({"training": 3, "held_out": 1}, None, 1, None),
+        ({"training": 3, "held_out": 1}, 2, 2, "--count 2 of 1 frame(s) held out: "),
+        ({"training": 2}, None, 2, None),  # `ddg score --real` fits on the first ones
+        ({"training": 500, "held_out": 300}, None, 4, None),  # of other recordings
+        ({"training": 9}, None, 4, "the model does not say which frames it was fitted on"),
+        ({}, None, 4, "the model does not say which frames it was fitted on"),
+    ],
+)
+def test_frames_that_were_fitted_on_are_not_judged_unasked(tmp_path, capsys, frames, count, used, said):
+    make(tmp_path, **frames)
+    given = {} if count is None else {"count": count}
+    thresholds.analyse(tmp_path / "ddg", tmp_path / "recording", tmp_path, Progress(), **given)
+    recorded = json.loads((tmp_path / "thresholds.json").read_text())["recorded"]["invalid_fraction"]
+    assert recorded == pytest.approx(np.mean((12 + 24 * np.arange(4)[-used:]) / 384))
+    notes = capsys.readouterr().err
+    assert said in notes if said else "held out" not in notes and "does not say" not in notes
+
+
+def test_the_command_leaves_a_table_and_a_plot(tmp_path):
+    make(tmp_path)
     out = tmp_path / "out"
     rows = thresholds.analyse(
         tmp_path / "ddg", tmp_path / "recording", out, Progress(quiet=True), count=3, seed=0
@@ -77,6 +106,6 @@ def test_the_command_leaves_a_table_and_a_plot(tmp_path):
     assert [row.threshold for row in rows] == [-0.8, -0.6, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8]
     fractions = [row.invalid_fraction for row in rows]
     assert fractions == sorted(fractions)
-    assert value["recorded"]["invalid_fraction"] == pytest.approx(12 / 384, abs=0.01)
+    assert value["recorded"]["invalid_fraction"] == pytest.approx((12 + 24 * 2) / 384)
     assert cv2.imread(str(out / "thresholds.png")).shape[1] > 1000
     assert len(thresholds.table(rows).splitlines()) == 10

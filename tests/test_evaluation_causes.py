@@ -1,6 +1,7 @@
 """Where a policy loses, by cause: which rows there are, and the table that they leave behind."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from deploy.fr3_trials import Fr3Bench, Fr3Runner
 from deploy.trials import Rig, Trial, drawn
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import causes, rig_trials
+from evaluation.report import trials_page
 from evaluation.rig_trials import Series
 from rig.world import make_world
 
@@ -63,8 +65,35 @@ def test_the_table_is_kept_and_its_trials_are_not_run_again(tmp_path, policy):
     log = (out / "ideal" / rig_trials.TRIALS_FILE).read_bytes()
     assert causes.run(CONFIG, policy, names, SERIES, out, 0)["rows"] == made["rows"]
     assert (out / "ideal" / rig_trials.TRIALS_FILE).read_bytes() == log
+    other = Series("development", ("cube",), 1, number=1, seconds=0.5)
     with pytest.raises(UserError, match="begun with another policy, configuration or rule"):
-        causes.run(CONFIG, policy, names, Series("development", ("cube",), 1, number=1, seconds=0.5), out, 0)
+        causes.run(CONFIG, policy, names, other, out, 0)
+
+
+def test_logs_of_other_lengths_are_not_paired_and_old_ones_without_go_on(tmp_path, policy):
+    short, long = replace(SERIES, objects=("cube",)), replace(SERIES, objects=("cube",), seconds=0.6)
+    for name, series in (("short", short), ("again", short), ("long", long)):
+        causes.run(CONFIG, policy, (causes.REFERENCE,), series, tmp_path / name, 0)
+
+    def trials(name: str) -> trials_page.Trials:
+        made = trials_page.find(tmp_path / name / causes.REFERENCE)
+        assert made is not None
+        return made
+
+    assert (trials("short").belong_to["seconds"], trials("long").belong_to["seconds"]) == (0.5, 0.6)
+    names = ("short", "again", "long")
+    assert trials_page.compare([trials(n) for n in names])[1][-1][2:] == (
+        "0 won, 0 lost of 1, p 1",
+        "other trials",
+    )
+    log = tmp_path / "again" / causes.REFERENCE / rig_trials.TRIALS_FILE
+    log.write_text(log.read_text().replace(', "seconds": 0.5', "", 1))
+    old = log.read_bytes()
+    assert trials_page.compare([trials("short"), trials("again")])[1][-1][2:] == ("other trials",)
+    causes.run(CONFIG, policy, (causes.REFERENCE,), short, tmp_path / "again", 0)
+    assert log.read_bytes() == old
+    with pytest.raises(UserError, match="begun with another policy, configuration or rule"):
+        causes.run(CONFIG, policy, (causes.REFERENCE,), long, tmp_path / "again", 0)
 
 
 def test_pairs_and_holm_are_those_of_the_outcomes(tmp_path, policy):

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ from evaluation.depth_score.domains import (
     sense,
     wanted_domains,
 )
-from evaluation.depth_score.episodes import Scored
+from evaluation.depth_score.episodes import Scored, collect, score_episodes
 from evaluation.depth_score.figures import draw_efficiency
 from evaluation.report.stage import write_report
 from foundation import convert, store
@@ -128,6 +129,14 @@ def test_the_score_has_every_column_the_floor_and_the_targets(scored):
     assert result["features"]["depthfeat-v1"]["sha256"]
 
 
+def test_a_generator_of_another_shape_than_the_camera_is_refused_before_recording(run_dir, tmp_path):
+    depth = replace(CONFIG.ddg.depth, height_px=48)
+    square = replace(CONFIG, ddg=replace(CONFIG.ddg, depth=depth))
+    with pytest.raises(UserError, match="depth is 320x180, the generator's 64x48: .*height-px 36"):
+        score_data.record_rig(square, run_dir / "teacher", tmp_path / "data", False, Progress(quiet=True))
+    assert not (tmp_path / "data").exists()
+
+
 def test_hole_figures_say_what_must_be_so(scored):
     result = json.loads((scored / "score" / "score.json").read_text())["holes"]
     value = {name: {k: v["value"] for k, v in item["figures"].items()} for name, item in result.items()}
@@ -191,6 +200,37 @@ def test_disparity_is_the_recorded_cameras_own(tmp_path):
     meta.write_text(meta.read_text().replace("D435", "of another make"))
     with pytest.raises(UserError, match="add fx_px and baseline_m to meta.json"):
         score_data.load_real(tmp_path / "room", 32, 2)
+
+
+def test_blocks_are_of_one_recording_each(tmp_path):
+    for name, frames in (("a", 11), ("b", 13), ("c", 16), ("d", 7)):
+        write_recording(tmp_path / name, frames, (48, 64))
+    real = score_data.load_real(tmp_path, 32, 40)  # the last four of a
+    assert real.recording.tolist() == [0] * 4 + [1] * 13 + [2] * 16 + [3] * 7
+    assert real.blocks == [4, 17, 25]
+    episodes = score_data.real_episodes(real, with_rgb=True)
+    assert [(e.side, e.number, e.group) for e in episodes] == [
+        (side, number, number % 3) for number, side in enumerate(["real"] * 3 + ["sim"] * 3)
+    ]
+    for episode, rows in ((episodes[0], np.s_[4:12:2]), (episodes[4], np.s_[18:25:2])):
+        np.testing.assert_array_equal(episode.sensed_mm, real.depth_mm[rows])
+        np.testing.assert_array_equal(episode.rgb, real.rgb[rows])
+    assert score_data.load_real(tmp_path / "c", 32, 15).blocks == [0]  # from the first frame, as ever
+
+
+def test_scored_recordings_are_of_one_camera_and_long_enough(tmp_path, capsys):
+    for name in ("a", "b", "c"):
+        write_recording(tmp_path / "rooms" / name, 9, (48, 64))
+    meta = tmp_path / "rooms" / "a" / "meta.json"
+    meta.write_text(meta.read_text().replace("D435", "D455"))
+    command = ["ddg", "score", *SIZES, "--out", str(tmp_path / "out"), "--real", str(tmp_path / "rooms")]
+    assert cli.main([*command, "--fit-frames", "2", "--score-frames", "19"]) == 2
+    said = capsys.readouterr().err
+    assert "b has focal length and baseline (38.4, 0.05), " in said and "a (38.4, 0.095)" in said
+    assert score_data.load_real(tmp_path / "rooms", 32, 18).baseline_m == 0.05  # a is not among them
+    assert cli.main([*command, "--fit-frames", "2", "--score-frames", "16", "--resume"]) == 2
+    assert "16 hold 1 run(s) of 8 frames of one recording; expected 2" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "score_real" / "ddg").exists()
 
 
 def test_colour_of_another_view_is_no_monocular_network_s(tmp_path):
@@ -307,6 +347,22 @@ def test_domains_belong_to_one_side_and_depend_on_seed_and_episode_alone(run_dir
     assert off_per_m.max() <= LIMIT_PER_M + 0.002  # and half a millimetre of rounding
     other = sense(replace(methods, seed=1), episode("sim"), ["sim_ddg", "sim_rand_noise"])
     assert all((other[name] != sim[name]).any() for name in other)
+
+
+def test_episodes_scored_for_other_columns_are_scored_again(run_dir, tmp_path):
+    methods = Methods(ScoreConfig(), 0, Generator.load(run_dir / "ddg"))
+    extractors, loads = [score_features.load("depthfeat-v1")], [partial(episode, s) for s in score_data.SIDES]
+
+    def score(*names: str) -> dict[str, int]:
+        files = score_episodes(methods, extractors, loads, names, tmp_path, Progress(quiet=True))
+        return {name: len(s.features) for name, s in collect(files).features["depthfeat-v1"].items()}
+
+    assert score("real_raw", FLOOR) == {"real_raw": 3, FLOOR: 3}
+    times = [file.stat().st_mtime_ns for file in sorted(tmp_path.iterdir())]
+    assert score("real_raw", FLOOR, "real_inpaint") == {"real_raw": 3, FLOOR: 3, "real_inpaint": 3}
+    again = [file.stat().st_mtime_ns for file in sorted(tmp_path.iterdir())]
+    assert again[0] > times[0] and again[1] == times[1]  # nothing new of the simulated side
+    assert score("real_raw", FLOOR) == {"real_raw": 3, FLOOR: 3}
 
 
 def test_the_monocular_column_uses_the_users_weights(run_dir, tmp_path):

@@ -135,6 +135,7 @@ def test_a_source_that_cannot_be_opened_does_not_stop_the_others(tmp_path, capsy
 def test_a_recording_imported_again_says_the_same_of_its_camera(tmp_path):
     root = make_folder(tmp_path / "desk", color="color")
     known = {"depth_unit_m": 0.0005, "sensor": "D435", "fx_px": 380.0, "hz": 15, "consecutive_frames": True}
+    known |= {"licence": "CC BY 4.0", "source": "a kitchen"}
     (root / "meta.json").write_text(json.dumps({**known, "contract_version": -1, "frames": 99}))
     run(root, "--out", tmp_path / "out")
     again = Recording.open(tmp_path / "out" / "desk")
@@ -145,6 +146,13 @@ def test_a_recording_imported_again_says_the_same_of_its_camera(tmp_path):
     given = Recording.open(tmp_path / "given" / "desk")
     assert (given.meta["sensor"], given.fx_px) == ("D455", 380.0)
     np.testing.assert_array_equal(given.depth_mm(2), depth_mm(2))
+
+
+@pytest.mark.parametrize(("unit_m", "said"), [("0.0005", 1), ("0.001", 0), ("0.002", 0)])
+def test_what_is_lost_of_finer_depth_is_said_once(tmp_path, capsys, unit_m, said):
+    run(make_folder(tmp_path / "desk"), "--out", tmp_path / "out", "--depth-unit-m", unit_m)
+    line = f"{tmp_path / 'out' / 'desk'}: depth in units of {unit_m} m was rounded to whole millimetres"
+    assert capsys.readouterr().out.count(line) == said
 
 
 @pytest.mark.parametrize("text", ["{", "[1]", '{"depth_unit_m": "mm"}', '{"depth_unit_m": 0}'])

@@ -121,6 +121,17 @@ def test_damaged_frames_are_named_and_the_rest_stays_readable(tmp_path):
     np.testing.assert_array_equal(recording.depth_mm(1), _frame(6)[1])
 
 
+@pytest.mark.parametrize("names", [("8", "9", "10", "100"), ("9.25", "9.5", "10", "10.125")])
+def test_frames_are_in_time_order_whatever_their_names_widths(tmp_path, names):
+    path = _write(tmp_path / "a", frames=len(names))
+    for index, name in enumerate(names):
+        _replace_depth(path, index, np.full((24, 32), 600 + index, np.uint16))
+        (path / "depth" / f"{index:06d}.png").rename(path / "depth" / f"{name}.png")
+        (path / "color" / f"{index:06d}.jpg").rename(path / "color" / f"{name}.jpg")
+    read = Recording.open(path)
+    assert [int(read.depth_mm(i).max()) for i in range(len(read))] == [600, 601, 602, 603]
+
+
 @pytest.mark.parametrize(
     ("image", "message"),
     [
@@ -156,12 +167,38 @@ def test_unit_that_cannot_be_is_refused(tmp_path, factor, message):
         Recording.open(path)
 
 
+@pytest.mark.parametrize(("counts", "unit_m"), [(9, 1e-5), (60_000, 1e-2)])
+def test_a_unit_that_leaves_no_depth_is_refused_in_one_line(tmp_path, counts, unit_m):
+    path = _write(tmp_path / "a")
+    for index in range(4):
+        _replace_depth(path, index, np.full((24, 32), counts, np.uint16))
+    _set_meta(path, depth_unit_m=unit_m)
+    with pytest.raises(UserError, match=f"a: with depth_unit_m {unit_m:g} no pixel of 4 of its") as error:
+        Recording.open(path)
+    assert "\n" not in str(error.value)
+
+
 def test_declared_unit_is_converted_to_millimetres(tmp_path):
     path = _write(tmp_path / "a")
     for index in range(4):
         _replace_depth(path, index, _frame(index)[1] * 10)
     _set_meta(path, depth_unit_m=0.0001)
     np.testing.assert_array_equal(Recording.open(path).depth_mm(1), _frame(1)[1])
+
+
+def test_depth_in_metres_is_as_fine_as_the_declared_unit(tmp_path):
+    path = _write(tmp_path / "a")
+    counts = np.full((24, 32), 9004, np.uint16)
+    counts[0, :3] = 0, 4, 9006  # 4 is less than half a millimetre: a hole in millimetres, so one in metres
+    for index in range(4):
+        _replace_depth(path, index, counts)
+    _set_meta(path, depth_unit_m=0.0001)
+    recording = Recording.open(path)
+    assert recording.depth_mm(0)[0, :4].tolist() == [0, 0, 901, 900]
+    np.testing.assert_allclose(recording.depth_m(0)[0, :4], [0, 0, 0.9006, 0.9004], rtol=1e-6)
+    assert recording.depth_m(0).dtype == np.float32
+    _set_meta(path, depth_unit_m=0.0002)
+    assert Recording.open(path).depth_m(0)[1, 1] == np.float32(1.8008)
 
 
 @pytest.mark.parametrize("value", [None, "mm", 1.0])

@@ -333,6 +333,18 @@ def test_a_stage_by_itself_is_refused_what_a_run_is(tmp_path):
     assert not (tmp_path / "student").exists()
 
 
+def test_a_generator_of_another_shape_than_the_camera_is_refused_before_any_stage(tmp_path):
+    square = _with("ddg.depth", height_px=80)
+    with pytest.raises(
+        UserError, match=r"depth is 160x90, the generator's 80x80: .*height-px 45\.$"
+    ) as refused:
+        check_networks(square, tmp_path)
+    assert "\n" not in str(refused.value) and not list(tmp_path.iterdir())
+    formula = dataclasses.replace(square.student, depth_source="dextrah")
+    assert len(check_networks(dataclasses.replace(square, student=formula), tmp_path)) == 3
+    assert check_config_values(square) is square  # a real camera's, to be fitted or scored by itself
+
+
 def test_a_fitted_generator_is_found_in_a_run_and_in_its_folder(tmp_path):
     ddg = artifacts.finish(tmp_path / "ddg", "ddg", PRESETS["debug"], seconds=1.0, metrics={}).directory
     assert stage_folder("--model", tmp_path, "ddg") == stage_folder("--model", ddg, "ddg") == ddg

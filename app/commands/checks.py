@@ -139,8 +139,8 @@ ON_PICTURES = ("demos", "ddg", "student")
 
 
 def check_networks(config: Config, run_dir: Path, stages: Collection[str] = ON_PICTURES) -> list[str]:
-    """What each unfinished of the `stages` will take, a line for each; UserError if it is too much, or if the
-    student would start from another network.
+    """What each unfinished of the `stages` will take, a line for each; UserError if it is too much, if the
+    student would start from another network, or if simulated depth has another shape than the generator's.
 
     Traces a step of each, which the stages do as well.
     """
@@ -148,12 +148,16 @@ def check_networks(config: Config, run_dir: Path, stages: Collection[str] = ON_P
     if not left:
         return []
     from ddg_jax import memory as ddg_memory
+    from ddg_jax.sample import check_aspect
     from demos import memory as demos_memory
     from learning import memory
     from student_jax import memory as student_memory
     from student_jax import start
+    from student_jax.source_check import LEARNED
 
     if "student" in left:
+        if config.student.depth_source in LEARNED:
+            check_aspect((config.world.profile.height_px, config.world.profile.width_px), config.ddg)
         _check_head(config.student)
         start.check(config)
     need_of = {"demos": demos_memory.need, "ddg": ddg_memory.need, "student": student_memory.need}

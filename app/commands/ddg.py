@@ -145,8 +145,8 @@ class DDGThresholds:
     """A recording, or a folder of them; its last frames are used."""
     out: Path = Path()
     """Where thresholds.json and thresholds.png go."""
-    count: Count = 180
-    """Frames."""
+    count: Count | None = None
+    """Frames; none takes as many as were held out at the fit, at most 180."""
     seed: Seed = 1
     """Seed of the noise."""
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Int, UInt8, UInt16
 
 from ddgrasp import depth
 from ddgrasp.config import Config
@@ -31,6 +31,8 @@ SEED_OFFSET = 1_000_000
 BLOCK_FRAMES = 4
 """Frames of one side that a real camera's stream is cut into: neighbours say the same, so blocks are
 resampled together."""
+_RUN_FRAMES = len(SIDES) * BLOCK_FRAMES
+"""Consecutive frames of a recording that a block of either side comes from."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,12 @@ def record_rig(
     """Files of `config.score.trajectories` episodes per side, real first; those there already are kept.
 
     teacher: directory of the finished teacher stage.
+
+    Raises UserError, before anything is recorded, if the generator has another aspect ratio than the camera.
     """
+    from ddg_jax.sample import check_aspect
+
+    check_aspect((config.world.profile.height_px, config.world.profile.width_px), config.ddg)
     names = [
         (side, directory / f"{side}_{i:04d}.npz") for side in SIDES for i in range(config.score.trajectories)
     ]
@@ -173,10 +180,22 @@ class RealFrames:
     """How many frames it has."""
     depth_mm: UInt16[np.ndarray, "N H W"]
     rgb: UInt8[np.ndarray, "N h w 3"]
+    recording: Int[np.ndarray, " N"]
+    """Which one a frame is from."""
     focal_px: float
     baseline_m: float
     unaligned: tuple[Path, ...] = ()
     """Recordings among them whose colour is not aligned to depth."""
+
+    @property
+    def blocks(self) -> list[int]:
+        """First frame of every block: both sides' frames are of one recording, what is left over of it counts
+        for nothing."""
+        firsts: list[int] = []
+        for number in np.unique(self.recording):
+            frames = np.flatnonzero(self.recording == number)
+            firsts += frames[: len(frames) // _RUN_FRAMES * _RUN_FRAMES : _RUN_FRAMES].tolist()
+        return firsts
 
 
 def real_size(root: Path, width_px: int) -> tuple[int, int]:
@@ -190,18 +209,31 @@ def real_size(root: Path, width_px: int) -> tuple[int, int]:
 def load_real(root: Path, width_px: int, last: int) -> RealFrames:
     """The `last` frames of the recordings at or below `root`, at `width_px` (nearest neighbours).
 
-    Raises UserError for recordings of different sizes or of unknown optics, or none.
+    Raises UserError for recordings of different sizes, or none, or if those that the frames are of have
+    different optics, or unknown ones.
     """
     recordings = _of_one_size(root)
-    focal_px, baseline_m = recordings[0].optics()
-    size = _size(recordings[0], width_px)
-    frames = [(r, i) for r in recordings for i in range(len(r))]
-    chosen = frames[-last:]
+    frames = [(number, i) for number, r in enumerate(recordings) for i in range(len(r))]
+    numbers = np.array([number for number, _ in frames[-last:]])
+    focal_px, baseline_m = _optics([recordings[number] for number in np.unique(numbers)])
+    size, chosen = _size(recordings[0], width_px), [(recordings[number], i) for number, i in frames[-last:]]
     depth_mm = np.stack([depth.crop_nearest(r.depth_mm(i), size) for r, i in chosen])
     rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
     unaligned = tuple(r.path for r in recordings if not r.color_aligned)
     focal_px *= width_px / recordings[0].width_px
-    return RealFrames(len(frames), depth_mm, rgb, focal_px, baseline_m, unaligned)
+    return RealFrames(len(frames), depth_mm, rgb, numbers, focal_px, baseline_m, unaligned)
+
+
+def _optics(recordings: Sequence[Recording]) -> tuple[float, float]:
+    """`Recording.optics` of all of them; UserError if two differ."""
+    first, *others = recordings
+    for other in others:
+        if other.optics() != first.optics():
+            raise UserError(
+                f"{other.path} has focal length and baseline {other.optics()}, {first.path} {first.optics()} "
+                "(px, m): score recordings of one camera."
+            )
+    return first.optics()
 
 
 def _of_one_size(root: Path) -> list[Recording]:
@@ -234,8 +266,8 @@ def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
     clean = depth.to_millimetres(surfaces(depth.to_metres(depth_mm), PIECEWISE))
     episodes = []
     for parity, side in enumerate(SIDES):
-        for block in range(len(depth_mm) // (2 * BLOCK_FRAMES)):
-            rows = np.arange(BLOCK_FRAMES) * 2 + parity + block * 2 * BLOCK_FRAMES
+        for block, first in enumerate(frames.blocks):
+            rows = np.arange(first + parity, first + _RUN_FRAMES, len(SIDES))
             episodes.append(
                 Episode(
                     side, len(episodes), block, depth_mm[rows], clean[rows],

@@ -19,7 +19,7 @@ from evaluation.depth_score.data import REAL, SIM, Episode
 from sensors.inpainting import inpainted
 
 if TYPE_CHECKING:
-    import ddg_jax.prior
+    import ddg_jax.network_prior
     import ddg_jax.sample
 
 Maps = dict[str, UInt16[np.ndarray, "_ _ _"]]
@@ -44,10 +44,9 @@ class Methods:
     generator: "ddg_jax.sample.Generator"
 
     @cached_property
-    def monocular(self) -> "ddg_jax.prior.Prior | None":
+    def monocular(self) -> "ddg_jax.network_prior.DepthNetworkPrior | None":
         """The monocular network; None if no folder was named and the usual one is not there."""
-        from ddg_jax.network_prior import weights_folder
-        from ddg_jax.prior import make_prior
+        from ddg_jax.network_prior import DepthNetworkPrior, weights_folder
 
         settings = replace(
             self.generator.config,
@@ -60,7 +59,7 @@ class Methods:
         )
         if not self.config.monocular_weights and not weights_folder(settings).exists():
             return None
-        return make_prior(settings)
+        return DepthNetworkPrior(settings)
 
     @property
     def needs_rgb(self) -> bool:
@@ -136,7 +135,7 @@ def _monocular(name: str) -> Callable[[Methods, Episode], Maps]:
 
         assert methods.monocular is not None and episode.rgb is not None
         reference = to_metres(episode.sensed_mm if episode.side == REAL else episode.clean_mm)
-        relative = methods.monocular.from_recording(reference, episode.rgb, np.random.default_rng(0))
+        relative = methods.monocular.relative(episode.rgb, reference.shape[1:])
         far_m = methods.generator.config.depth.far_m
         fitted = [metric_depth(r, d, far_m) for r, d in zip(relative, reference, strict=True)]
         return {name: to_millimetres(np.stack(fitted))}

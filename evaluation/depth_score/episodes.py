@@ -17,7 +17,7 @@ from ddgrasp.files import DAMAGED_NPZ, atomic_path
 from ddgrasp.progress import Progress
 from evaluation.depth_score import holes
 from evaluation.depth_score.data import Episode
-from evaluation.depth_score.domains import Methods, sense, sense_repeats
+from evaluation.depth_score.domains import DOMAINS, Methods, sense, sense_repeats
 from evaluation.depth_score.features import FeatureExtractor
 from evaluation.depth_score.resampling import Sample
 
@@ -42,14 +42,17 @@ def score_episodes(
     methods: Methods, extractors: Sequence[FeatureExtractor], episodes: Sequence[Load], names: Sequence[str],
     directory: Path, progress: Progress, label: str = "scoring episodes",
 ) -> list[Path]:  # fmt: skip
-    """Files with what every episode says about the domains `names`; those there already are kept."""
+    """Files with what every episode says about the domains `names`; those there already are kept, unless they
+    are about others: weights may have come, or gone, since."""
     files = [directory / f"{number:04d}.npz" for number in range(len(episodes))]
-    done = sum(file.exists() for file in files)
+    done = [file.exists() and _is_about(file, names) for file in files]
+    if stale := sum(file.exists() for file in files) - sum(done):
+        progress.note(f"{stale} episode(s) are scored again: what was there is about other columns")
     with progress.task(label, len(files)) as task:
-        task.start_at(done)
+        task.start_at(sum(done))
         seen: dict[str, int] = {}
-        for load, file in zip(episodes, files, strict=True):
-            if file.exists():
+        for load, file, is_done in zip(episodes, files, done, strict=True):
+            if is_done:
                 continue
             episode = load()
             seen[episode.side] = seen.get(episode.side, 0) + 1
@@ -60,6 +63,13 @@ def score_episodes(
                 np.savez(path, **arrays)
             task.advance()
     return files
+
+
+def _is_about(file: Path, names: Sequence[str]) -> bool:
+    """Whether an episode's file has all those domains `names` that are of its side, and no others."""
+    had = {key.split("|")[0] for key in _read(file) if key != _GROUP}
+    sides = {DOMAINS[name].side for name in had if name in DOMAINS}
+    return had == {name for name in names if DOMAINS[name].side in sides}
 
 
 def _score(

@@ -24,6 +24,9 @@ SETTING = (
     "on both sides, and errors of valid pixels are relative to that stand-in."
 )
 
+_FEWEST_BLOCKS = 2
+"""Of either side: resampling needs two."""
+
 
 def real_config(config: Config, root: Path) -> Config:
     """`config` with the generator's rows those of the recordings below `root`: nothing is cropped."""
@@ -39,7 +42,7 @@ def run(job: Job) -> Artifact:
 
     config, root = job.config, job.inputs["data"]
     fit_frames, score_frames = job.inputs["fit_frames"], job.inputs["score_frames"]
-    least = 4 * score_data.BLOCK_FRAMES
+    least = _FEWEST_BLOCKS * 2 * score_data.BLOCK_FRAMES
     if score_frames < least:
         raise UserError(f"--score-frames is {score_frames}; expected {least} or more: two blocks per side.")
     frames = score_data.load_real(root, config.ddg.depth.width_px, score_frames)
@@ -47,6 +50,12 @@ def run(job: Job) -> Artifact:
         raise UserError(
             f"--fit-frames {fit_frames} and --score-frames {score_frames} of {frames.total} frame(s): "
             "they must not overlap, and fitting needs 2 or more."
+        )
+    if len(frames.blocks) < _FEWEST_BLOCKS:
+        raise UserError(
+            f"--score-frames {score_frames} hold {len(frames.blocks)} run(s) of "
+            f"{2 * score_data.BLOCK_FRAMES} frames of one recording; expected {_FEWEST_BLOCKS} or more: give "
+            "more frames."
         )
     fitted = _fit(job, root, fit_frames)
     methods = Methods(config.score, config.seed, Generator.load(fitted.directory))

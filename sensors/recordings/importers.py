@@ -1,12 +1,12 @@
 """Recordings from elsewhere into the format of `recordings.py`: folders of pictures, RealSense files.
 
-Only pictures and what the camera is are kept: no pose, no CAD, no pairing. A frame that cannot be used is
-named and left out; a source none of whose frames can be used, or whose depth is in another unit, is refused.
+Only pictures, what the camera is, and licence and source are kept: no pose, no CAD, no pairing. A frame that
+cannot be used is named and left out; a source none of whose frames can be used, or whose depth is in another
+unit, is refused.
 """
 
 import json
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,7 @@ from sensors.recordings.recording import (
     NEAREST_MEDIAN_M,
     UNIT_CHECK_FRAMES,
     RecordingWriter,
+    in_time,
 )
 from sensors.recordings.sources import RawFrame, Source
 
@@ -31,7 +32,10 @@ COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 REALSENSE_SUFFIXES = (".bag", ".db3")
-KEPT_META = ("sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth")
+KEPT_META = (
+    "sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth",
+    "licence", "source",
+)  # fmt: skip
 """What is taken over of a folder's own meta.json."""
 _ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
 
@@ -44,6 +48,14 @@ class Imported:
     frames: int
     skipped: tuple[str, ...]
     """Frames left out: name and reason."""
+    loss: str = ""
+    """What of its depth did not fit into the format, if anything."""
+
+    @property
+    def lines(self) -> list[str]:
+        """For people: what was left out, a line each, and `loss`."""
+        left_out = [f"{self.path}: left out {what}" for what in self.skipped]
+        return [*left_out, f"{self.path}: {self.loss}"] if self.loss else left_out
 
 
 def import_recording(source: Source, path: Path) -> Imported:
@@ -83,7 +95,13 @@ def import_recording(source: Source, path: Path) -> Imported:
                 f"{source.path}: none of its {len(skipped)} frames can be used "
                 f"({skipped[0] if skipped else 'it is empty'})."
             )
-    return Imported(path, frames, tuple(skipped))
+    return Imported(path, frames, tuple(skipped), _loss(source.depth_unit_m))
+
+
+def _loss(unit_m: float) -> str:
+    if unit_m >= DEPTH_UNIT_M:
+        return ""
+    return f"depth in units of {unit_m:g} m was rounded to whole millimetres, which recordings here have"
 
 
 def import_all(
@@ -116,7 +134,7 @@ def _name(source: Path) -> str:
 def summary(done: list[Imported], refused: list[str]) -> str:
     """What was imported and left out, counts last."""
     lines = [f"refused: {why}" for why in refused]
-    lines += [f"{one.path}: left out {what}" for one in done for what in one.skipped]
+    lines += [line for one in done for line in one.lines]
     lines += [f"{one.path}: {one.frames} frames" for one in done]
     frames, skipped = sum(one.frames for one in done), sum(len(one.skipped) for one in done)
     return "\n".join(
@@ -199,7 +217,7 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
         UserError: no depth pictures, or a meta.json that is none.
     """
     pictures = (p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
-    files = sorted(pictures, key=_in_time)
+    files = sorted(pictures, key=in_time)
     if not files:
         raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
     own = _own_meta(folder / META_FILE)
@@ -233,12 +251,6 @@ def _own_meta(file: Path) -> dict[str, Any]:
     if isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit <= 1:
         raise UserError(f"{file}: depth_unit_m is {unit!r}; expected metres per unit of depth, up to 1.")
     return meta
-
-
-def _in_time(file: Path) -> list[tuple[int, str]]:
-    """Numbers in a name count as numbers: 10.png comes after 9.png."""
-    parts = re.split(r"(\d+)", file.name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _is_pair(folder: Path) -> bool:

@@ -143,7 +143,7 @@ def record(options: LiveOptions, path: Path, progress: Progress) -> tuple[Import
 
 def summary(imported: Imported, take: Take, frames: int) -> str:
     """What was recorded and what is missing, counts last."""
-    lines = [f"{imported.path}: left out {what}" for what in imported.skipped]
+    lines = imported.lines
     if take.lost:
         lines.append(f"{take.lost} frames were lost, writing them took too long: take a lower --hz or size")
     early = f", stopped before the {frames} asked for" if take.frames < frames else ""

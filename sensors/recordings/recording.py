@@ -8,9 +8,11 @@ whose depth cannot be what it claims (unit, type, size) is refused. NumPy and Op
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, SupportsIndex
 
@@ -143,15 +145,18 @@ class Recording:
 
     def depth_mm(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
         """(H, W) uint16 planar depth in millimetres, 0 = invalid."""
+        return depth.from_counts(self._counts(index), self.meta["depth_unit_m"])
+
+    def depth_m(self, index: SupportsIndex) -> Float32[np.ndarray, "H W"]:
+        """(H, W) float32 planar depth in metres, 0 = invalid; as fine as `depth_unit_m`."""
+        return depth.metres_from_counts(self._counts(index), self.meta["depth_unit_m"])
+
+    def _counts(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
         file = self.depth_files[index]
         raw = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
         if raw is None:
             raise UserError(f"{file}: cannot be decoded as PNG; delete it or copy it again.")
-        return depth.from_counts(raw, self.meta["depth_unit_m"])
-
-    def depth_m(self, index: SupportsIndex) -> Float32[np.ndarray, "H W"]:
-        """(H, W) float32 planar depth in metres, 0 = invalid."""
-        return depth.to_metres(self.depth_mm(index))
+        return raw
 
     def rgb(self, index: SupportsIndex) -> UInt8[np.ndarray, "h w 3"]:
         """(h, w, 3) uint8 colour at the colour camera's own size."""
@@ -200,6 +205,15 @@ def find_recordings(root: str | os.PathLike) -> list[Recording]:
             "make some with `ddgrasp record`."
         )
     return [Recording.open(folder) for folder in folders]
+
+
+def in_time(file: Path) -> list[tuple[Decimal, str]]:
+    """Key that sorts a recording's pictures: numbers in a name count as numbers, 10.png comes after 9.png.
+
+    A point between digits is a decimal point, as in names that are seconds: 4.5.png comes after 4.25.png.
+    """
+    parts = enumerate(re.split(r"(\d+(?:\.\d+)?)", file.name))  # text and numbers in turn
+    return [(Decimal(part), "") if place % 2 else (Decimal(-1), part) for place, part in parts]
 
 
 def contents(root: str | os.PathLike) -> str:
@@ -357,7 +371,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 def _depth_files(path: Path) -> list[Path]:
     folder = path / "depth"
-    files = sorted(p for p in folder.iterdir() if p.is_file()) if folder.is_dir() else []
+    files = sorted((p for p in folder.iterdir() if p.is_file()), key=in_time) if folder.is_dir() else []
     for file in files:
         if file.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".exr", ".pfm"):
             raise UserError(
@@ -379,8 +393,14 @@ def _check_unit(recording: Recording) -> None:
     """Refuse depth whose median cannot be a D4xx's in the declared unit."""
     indices = np.linspace(0, len(recording) - 1, min(UNIT_CHECK_FRAMES, len(recording))).astype(int)
     values = np.concatenate([d[d > 0] for d in (recording.depth_mm(i) for i in indices)])
-    median_m = float(np.median(values)) * DEPTH_UNIT_M
     unit = recording.meta["depth_unit_m"]
+    if not len(values):
+        raise UserError(
+            f"{recording.path}: with depth_unit_m {unit:g} no pixel of {len(indices)} of its frames lies "
+            f"between {DEPTH_UNIT_M:g} and {depth.MAX_MM * DEPTH_UNIT_M:g} m: correct depth_unit_m in "
+            f"{META_FILE}."
+        )
+    median_m = float(np.median(values)) * DEPTH_UNIT_M
     if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
         return
     finer = unit / 10 ** round(np.log10(median_m))
