@@ -25,7 +25,7 @@ SETTING = (
 )
 
 _FEWEST_BLOCKS = 2
-"""Of either side: resampling needs two."""
+"""On either side: resampling needs two."""
 
 
 def real_config(config: Config, root: Path) -> Config:

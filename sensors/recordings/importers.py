@@ -24,9 +24,8 @@ from sensors.recordings.recording import (
     NEAREST_MEDIAN_M,
     UNIT_CHECK_FRAMES,
     RecordingWriter,
-    in_time,
 )
-from sensors.recordings.sources import RawFrame, Source
+from sensors.recordings.sources import RawFrame, Source, in_time
 
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")

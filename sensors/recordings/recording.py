@@ -8,11 +8,9 @@ whose depth cannot be what it claims (unit, type, size) is refused. NumPy and Op
 import hashlib
 import json
 import os
-import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
-from decimal import Decimal
 from pathlib import Path
 from typing import Any, SupportsIndex
 
@@ -24,6 +22,7 @@ from ddgrasp import depth
 from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
 from sensors.recordings.integrity import inspect_frame
+from sensors.recordings.sources import in_time
 
 META_FILE = "meta.json"
 JPEG_QUALITY = 95
@@ -152,10 +151,11 @@ class Recording:
         return depth.metres_from_counts(self._counts(index), self.meta["depth_unit_m"])
 
     def _counts(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
-        file = self.depth_files[index]
-        raw = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
+        raw = cv2.imdecode(np.fromfile(self.depth_files[index], np.uint8), cv2.IMREAD_UNCHANGED)
         if raw is None:
-            raise UserError(f"{file}: cannot be decoded as PNG; delete it or copy it again.")
+            raise UserError(
+                f"{self.depth_files[index]}: cannot be decoded as PNG; delete it or copy it again."
+            )
         return raw
 
     def rgb(self, index: SupportsIndex) -> UInt8[np.ndarray, "h w 3"]:
@@ -205,15 +205,6 @@ def find_recordings(root: str | os.PathLike) -> list[Recording]:
             "make some with `ddgrasp record`."
         )
     return [Recording.open(folder) for folder in folders]
-
-
-def in_time(file: Path) -> list[tuple[Decimal, str]]:
-    """Key that sorts a recording's pictures: numbers in a name count as numbers, 10.png comes after 9.png.
-
-    A point between digits is a decimal point, as in names that are seconds: 4.5.png comes after 4.25.png.
-    """
-    parts = enumerate(re.split(r"(\d+(?:\.\d+)?)", file.name))  # text and numbers in turn
-    return [(Decimal(part), "") if place % 2 else (Decimal(-1), part) for place, part in parts]
 
 
 def contents(root: str | os.PathLike) -> str:
@@ -397,8 +388,7 @@ def _check_unit(recording: Recording) -> None:
     if not len(values):
         raise UserError(
             f"{recording.path}: with depth_unit_m {unit:g} no pixel of {len(indices)} of its frames lies "
-            f"between {DEPTH_UNIT_M:g} and {depth.MAX_MM * DEPTH_UNIT_M:g} m: correct depth_unit_m in "
-            f"{META_FILE}."
+            f"between {DEPTH_UNIT_M:g} and {depth.MAX_MM * DEPTH_UNIT_M:g} m: correct it in {META_FILE}."
         )
     median_m = float(np.median(values)) * DEPTH_UNIT_M
     if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:

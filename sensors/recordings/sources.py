@@ -1,7 +1,9 @@
 """Where recordings come from: frames in time order, as a file, a folder or a camera has them."""
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -37,3 +39,12 @@ class Source:
     cut_short: Callable[[OSError], None] | None = None
     """What is told that a frame could not be written, where the frames before are kept then, since they come
     but once; None keeps none."""
+
+
+def in_time(file: Path) -> list[tuple[Decimal, str]]:
+    """Key that sorts a recording's pictures: numbers in a name count as numbers, 10.png comes after 9.png.
+
+    A point between digits is a decimal point, as in names that are seconds: 4.5.png comes after 4.25.png.
+    """
+    parts = enumerate(re.split(r"(\d+(?:\.\d+)?)", file.name))  # text and numbers in turn
+    return [(Decimal(part), "") if place % 2 else (Decimal(-1), part) for place, part in parts]
