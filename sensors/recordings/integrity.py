@@ -1,4 +1,7 @@
-"""Whether a frame's files are whole: PNG checksums, JPEG markers, a single valid pixel. Few are decoded."""
+"""A recording's files: which there are, and whether those of a frame are whole.
+
+PNG checksums, JPEG markers, a single valid pixel; few are decoded.
+"""
 
 import struct
 import zlib
@@ -8,9 +11,32 @@ import cv2
 import numpy as np
 
 from ddgrasp.errors import UserError
+from sensors.recordings.sources import in_time
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_GREY = 0
+
+
+def find_depth(path: Path) -> list[Path]:
+    """The depth pictures of the recording in `path`, in time order; UserError for none, or other files."""
+    folder = path / "depth"
+    files = sorted((p for p in folder.iterdir() if p.is_file()), key=in_time) if folder.is_dir() else []
+    for file in files:
+        if file.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".exr", ".pfm"):
+            raise UserError(
+                f"{file}: depth as {file.suffix}; expected 16-bit PNG in millimetres: convert float "
+                "metres with np.rint(depth_m * 1000).astype(np.uint16)."
+            )
+    files = [p for p in files if p.suffix.lower() == ".png"]
+    if not files:
+        raise UserError(f"{folder}: no depth pictures; expected 000000.png, 000001.png, ... (16-bit, mm).")
+    return files
+
+
+def find_color(path: Path, depth_file: Path) -> Path:
+    """Where the colour picture of a depth picture is, or would be."""
+    png = path / "color" / f"{depth_file.stem}.png"
+    return png if png.is_file() else path / "color" / f"{depth_file.stem}.jpg"
 
 
 def inspect_frame(depth_file: Path, color_file: Path) -> tuple[str, tuple[int, int]]:

@@ -21,8 +21,7 @@ from jaxtyping import Float32, UInt8, UInt16
 from ddgrasp import depth
 from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
-from sensors.recordings.integrity import inspect_frame
-from sensors.recordings.sources import in_time
+from sensors.recordings.integrity import find_color, find_depth, inspect_frame
 
 META_FILE = "meta.json"
 JPEG_QUALITY = 95
@@ -76,10 +75,10 @@ class Recording:
         """
         path = Path(path)
         meta = _read_meta(path)
-        depth_files = _depth_files(path)
+        depth_files = find_depth(path)
         kept, skipped, size = [], [], None
         for depth_file in depth_files:
-            color_file = _color_file(path, depth_file)
+            color_file = find_color(path, depth_file)
             reason, frame_size = inspect_frame(depth_file, color_file)
             if reason:
                 skipped.append(SkippedFrame(depth_file, reason))
@@ -151,11 +150,10 @@ class Recording:
         return depth.metres_from_counts(self._counts(index), self.meta["depth_unit_m"])
 
     def _counts(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
-        raw = cv2.imdecode(np.fromfile(self.depth_files[index], np.uint8), cv2.IMREAD_UNCHANGED)
+        file = self.depth_files[index]
+        raw = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
         if raw is None:
-            raise UserError(
-                f"{self.depth_files[index]}: cannot be decoded as PNG; delete it or copy it again."
-            )
+            raise UserError(f"{file}: cannot be decoded as PNG; delete it or copy it again.")
         return raw
 
     def rgb(self, index: SupportsIndex) -> UInt8[np.ndarray, "h w 3"]:
@@ -358,26 +356,6 @@ def _read_meta(path: Path) -> dict[str, Any]:
             "import it again, or use the release that made it."
         )
     return meta
-
-
-def _depth_files(path: Path) -> list[Path]:
-    folder = path / "depth"
-    files = sorted((p for p in folder.iterdir() if p.is_file()), key=in_time) if folder.is_dir() else []
-    for file in files:
-        if file.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".exr", ".pfm"):
-            raise UserError(
-                f"{file}: depth as {file.suffix}; expected 16-bit PNG in millimetres: convert float "
-                "metres with np.rint(depth_m * 1000).astype(np.uint16)."
-            )
-    files = [p for p in files if p.suffix.lower() == ".png"]
-    if not files:
-        raise UserError(f"{folder}: no depth pictures; expected 000000.png, 000001.png, ... (16-bit, mm).")
-    return files
-
-
-def _color_file(path: Path, depth_file: Path) -> Path:
-    png = path / "color" / f"{depth_file.stem}.png"
-    return png if png.is_file() else path / "color" / f"{depth_file.stem}.jpg"
 
 
 def _check_unit(recording: Recording) -> None:
