@@ -51,9 +51,15 @@ class Study:
         return row_config(self.config, row, self.paper_from)
 
 
+def check_shared(config: Config, out: Path, resume: bool) -> None:
+    """UserError unless the study in `out` can make or take its shared stages; a run that was lent to it may
+    have gone on with a student of its own. Writes nothing."""
+    pipeline.check_place(config, out / SHARED, resume=resume, stages=[get_stage(name) for name in _COMMON])
+
+
 def check_place(study: Study, resume: bool) -> None:
     """Marks the folder as this study's. UserError if it holds one and `resume` is off, or another one."""
-    pipeline.check_place(study.config, study.out / SHARED, resume=resume)
+    check_shared(study.config, study.out, resume)
     pipeline.create(study.out)
     artifacts.begin(study.out, LAST_STAGE, study.config)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from app import extras, pipeline
+from app import extras
 from app.commands.base import FromPreset
 from app.commands.checks import check_config_values, check_devices, check_networks, check_start
 from ddgrasp import artifacts, contract
@@ -59,7 +59,7 @@ class StudyTable2(FromPreset):
         from app import table2
         from evaluation.table2 import page, results
 
-        pipeline.check_place(self.config, self.out / results.SHARED, resume=self.resume)
+        table2.check_shared(self.config, self.out, self.resume)
         study = self.planned()
         table2.check_place(study, self.resume)
         if not results.has_students(self.out, study.rows):
