@@ -27,6 +27,7 @@ from ddgrasp.config import (
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import diffusion as schedule
+from xla_support import optimized
 
 TINY = DDGConfig(
     depth=DDGDepthConfig(height_px=16, width_px=24),
@@ -166,7 +167,8 @@ def fit_by(tmp_path_factory):
                 TINY.training, steps=300, batch_size=16, checkpoint_every=1000, hole_loss=hole_loss
             ),
         )
-        params = train.fit(config, pictures(64), tmp_path_factory.mktemp("ddg"), 0, Progress(quiet=True))
+        with optimized():
+            params = train.fit(config, pictures(64), tmp_path_factory.mktemp("ddg"), 0, Progress(quiet=True))
         return sample.Generator(config, params, make_prior(config))
 
     return fitted_generator

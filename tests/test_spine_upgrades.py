@@ -17,9 +17,9 @@ ROOT = Path(__file__).parents[1]
 
 
 def _as_before(config):
-    """`config` as it was before versions 5, 7, 8, 9 and 10: a closing of the gripper could be taken back, demos
-    were taken whole, holes stayed holes, a generator did not know where in the picture it is, and the policy
-    alone acted."""
+    """`config` as it was before versions 5, 7, 8, 9 and 10: a closing of the gripper could be taken back,
+    demos were taken whole, holes stayed holes, a generator did not know where in the picture it is, and the
+    policy alone acted."""
     head = dataclasses.replace(config.student.head, closing_steps=0)
     picture = dataclasses.replace(config.student.picture, fill_holes=False)
     training = dataclasses.replace(config.student.training, demo_stretch_steps=0)

@@ -14,6 +14,7 @@ from ddgrasp.errors import UserError
 from mjx_envs import kinematics, scene
 from mjx_envs.camera import nominal_camera
 from student_jax import denoiser, encoder, hand_view, policy, preprocess
+from xla_support import optimized
 
 PROFILE = contract.D455.scaled(0.25)
 CONFIG = StudentConfig()
@@ -280,7 +281,8 @@ def test_the_encoder_learns_where_an_object_is_within_seconds():
 
     batches = [disc_scene(rng, 32) for _ in range(20)]
     moments = optimiser.init(params)
-    for index in range(80):
-        params, moments, _ = step(params, moments, *batches[index % len(batches)])
+    with optimized():
+        for index in range(80):
+            params, moments, _ = step(params, moments, *batches[index % len(batches)])
     unseen = disc_scene(rng, 32)
     assert float(step(params, moments, *unseen)[2]) < 0.04
