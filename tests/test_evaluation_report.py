@@ -109,6 +109,15 @@ def test_an_incomplete_run_says_what_was_not_run(tmp_path):
     assert "student_rig" not in build_report(tmp_path)
 
 
+def test_a_machine_too_slow_for_the_real_clock_is_said(tmp_path):
+    """Where a simulated camera's picture takes longer than frames may be old, no step runs the network."""
+    nothing = {"p50": None, "p99": None}
+    artifacts.finish(tmp_path / "deploy", "deploy", CONFIG, seconds=1, metrics={"latency_ms": nothing})
+    report = write_report(tmp_path)
+    assert summary_rows(report)[-1][-1].startswith("frame to command not measured: on the real clock every")
+    assert "frame to command not measured" in (tmp_path / "report.html").read_text()
+
+
 def test_an_empty_directory_is_refused(tmp_path):
     with pytest.raises(UserError, match="holds no finished stage"):
         build_report(tmp_path)
