@@ -23,6 +23,7 @@ from mjx_envs.physics import interface, mjx_collision, mjx_kinematics
 from mjx_envs.physics.mjx_jax import JaxPhysics
 from ppo import rollout, warmup
 from ppo.policy import TeacherPolicy
+from xla_support import optimized
 
 BATCH = 64
 SLOWER_THAN_C = 40.0
@@ -50,10 +51,8 @@ AS_USERS = (
 @pytest.fixture
 def all_optimizations():
     """Programs as users compile them, with `AS_USERS`; the other tests do without."""
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+    with optimized():
+        yield
 
 
 def _random_qpos(model: mujoco.MjModel, count: int) -> np.ndarray:

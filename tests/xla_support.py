@@ -1,6 +1,5 @@
 """How XLA compiles in tests."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -13,8 +12,9 @@ _FLAG = "jax_disable_most_optimizations"
 def optimized() -> Iterator[None]:
     """Programs compiled in here have all of XLA's optimisations, which `conftest` leaves out: worth it where
     steps take longer than their compilation."""
+    before = jax.config.values[_FLAG]
     jax.config.update(_FLAG, False)
     try:
         yield
     finally:
-        jax.config.update(_FLAG, os.environ[_FLAG.upper()] == "1")
+        jax.config.update(_FLAG, before)
