@@ -3,7 +3,6 @@
 Stages are imported inside `run`, so that `--help` starts without JAX.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -15,7 +14,7 @@ import tyro
 from app import pipeline
 from app.commands.base import DEFAULT_PRESET, Command, FromPreset
 from app.commands.calibrate import Calibrate, CalibrateBoard
-from app.commands.checks import check_config_values, check_devices, check_networks, check_options
+from app.commands.checks import check_config_values, check_devices, check_options, tell_needs
 from app.commands.dataset import DemosExport
 from app.commands.ddg import DDGDistil, DDGExport, DDGFit, DDGGenerate, DDGSample, DDGThresholds
 from app.commands.depth import DemosCollect, Record, RecordFr3, RecordImport, RecordRealsense, SensorsCompare
@@ -45,8 +44,7 @@ class Run(FromPreset):
         check_config_values(self.config)
         pipeline.check_place(self.config, self.out, resume=self.resume)
         check_devices(self.config, self.out)
-        for need in check_networks(self.config, self.out):
-            print(need, file=sys.stderr, flush=True)
+        tell_needs(self.config, self.out)
         report = pipeline.run(self.config, self.out, resume=self.resume)
         from evaluation.report.summary import print_summary
 

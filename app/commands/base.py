@@ -1,6 +1,5 @@
 """What commands have in common, and how their defaults are found."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Protocol
@@ -8,7 +7,7 @@ from typing import Annotated, Protocol
 import tyro
 
 from app import pipeline
-from app.commands.checks import ON_PICTURES, check_config_values, check_networks
+from app.commands.checks import check_config_values, tell_needs
 from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.stages import get_stage
@@ -60,8 +59,7 @@ class OneStage(FromPreset):
         pipeline.check_place(config, self.out, resume=self.resume, stages=[stage])
         for name in stage.parents:
             artifacts.require(self.out, name, config)
-        for need in check_networks(config, self.out, {stage.name}.intersection(ON_PICTURES)):
-            print(need, file=sys.stderr, flush=True)
+        tell_needs(config, self.out, (stage.name,))
         pipeline.make(stage, config, self.out, resume=self.resume)
 
 

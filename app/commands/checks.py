@@ -4,6 +4,7 @@ What a value of the configuration may be, the configuration itself knows (ddgras
 files, devices or packages above it.
 """
 
+import sys
 import types
 import typing
 from collections.abc import Collection
@@ -144,7 +145,7 @@ def check_networks(config: Config, run_dir: Path, stages: Collection[str] = ON_P
 
     Traces a step of each, which the stages do as well.
     """
-    left = [name for name in stages if not artifacts.is_finished(run_dir / name)]
+    left = [name for name in ON_PICTURES if name in stages and not artifacts.is_finished(run_dir / name)]
     if not left:
         return []
     from ddg_jax import memory as ddg_memory
@@ -166,6 +167,12 @@ def check_networks(config: Config, run_dir: Path, stages: Collection[str] = ON_P
         needs.append(need_of[name](config))
         memory.check(needs[-1], run_dir)
     return [str(need) for need in needs]
+
+
+def tell_needs(config: Config, run_dir: Path, stages: Collection[str] = ON_PICTURES) -> None:
+    """`check_networks`, its lines on standard error."""
+    for need in check_networks(config, run_dir, stages):
+        print(need, file=sys.stderr, flush=True)
 
 
 def _check_head(student: StudentConfig) -> None:

@@ -1,13 +1,12 @@
 """ddgrasp study: Table II with its ablations, and where a policy loses, by cause."""
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from app import extras
 from app.commands.base import FromPreset
-from app.commands.checks import check_config_values, check_devices, check_networks, check_start
+from app.commands.checks import check_config_values, check_devices, check_start, tell_needs
 from ddgrasp import artifacts, contract
 from ddgrasp.config import UNIFORM, Config, DDGConfig
 from ddgrasp.config.checks import Count, Range
@@ -63,8 +62,7 @@ class StudyTable2(FromPreset):
         study = self.planned()
         table2.check_place(study, self.resume)
         if not results.has_students(self.out, study.rows):
-            for need in check_networks(study.config, self.out / results.SHARED):
-                print(need, file=sys.stderr, flush=True)
+            tell_needs(study.config, self.out / results.SHARED)
         made = table2.run(study)
         print(*(self.out / name for name in (table2.STUDY_JSON, table2.STUDY_HTML)), sep="\n")
         print(page.describe(made, results.set_name(study.series)))
