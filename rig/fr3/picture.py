@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 
 from ddgrasp.errors import UserError
 from mjx_envs.camera import Buffers, Camera
+from rig.fr3.canvas import Canvas
 from sensors.models.materials import geom_rgb
 
 CAMERA = "depth_camera"
@@ -19,8 +20,6 @@ FAR_M = 10.0
 """What is further away counts as nothing."""
 _T_OPENCV_OPENGL = np.diag([1.0, -1.0, -1.0])
 """MuJoCo's cameras look along -z with y up, OpenCV's along z with y down."""
-_GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
-"""As a number: an array compared with the enumeration itself is compared object by object."""
 
 
 def prepare(root: ET.Element, largest_px: int = 2048) -> None:
@@ -50,7 +49,7 @@ class ScenePicture:
         self._rgb = np.concatenate(
             [geom_rgb(self.model), np.zeros((1, 3), np.float32)]
         )  # black where none is
-        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
+        self._canvases: dict[tuple[int, int], Canvas] = {}
         _without_display()
 
     def pose(self, qpos: Float64[np.ndarray, " nq"]) -> None:
@@ -60,42 +59,37 @@ class ScenePicture:
 
     def depth_m(self, camera: Camera) -> Float32[np.ndarray, "H W"]:
         """(H, W) planar depth, metres; 0 = nothing there."""
-        renderer = self._look(camera)
-        renderer.enable_depth_rendering()
-        depth_m = renderer.render()
-        renderer.disable_depth_rendering()
+        depth_m = self._look(camera).depth_m()
         return np.where(depth_m < FAR_M, depth_m, np.float32(0))
 
     def rgb(self, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour."""
-        return self._look(camera).render().copy()
+        return self._look(camera).rgb()
 
     def buffers(self, camera: Camera) -> Buffers:
         """Depth, geoms, their colours without light, and normals; what `ActiveStereo` draws with."""
-        depth_m = self.depth_m(camera)
-        renderer = self._look(camera)
-        renderer.enable_segmentation_rendering()
-        ids, kinds = np.moveaxis(renderer.render(), -1, 0)
-        renderer.disable_segmentation_rendering()
-        geoms = np.where((kinds == _GEOM) & (depth_m > 0), ids, -1).astype(np.int32)
-        return Buffers(depth_m, self._rgb[geoms], geoms, _normals(depth_m, geoms, camera))
+        depth_m, geoms = self._look(camera).depth_and_geoms()
+        nowhere = depth_m >= FAR_M
+        depth_m[nowhere], geoms[nowhere] = 0, -1
+        return Buffers(depth_m, self._rgb.take(geoms, axis=0), geoms, _normals(depth_m, geoms, camera))
 
     def close(self) -> None:
         """Lets go of the OpenGL contexts."""
-        for renderer in self._renderers.values():
-            renderer.close()
+        for canvas in self._canvases.values():
+            canvas.close()
+        self._canvases.clear()
 
-    def _look(self, camera: Camera) -> mujoco.Renderer:
+    def _look(self, camera: Camera) -> Canvas:
         assert camera.cx_px == camera.width_px / 2 and camera.cy_px == camera.height_px / 2
         own, T = self.model.camera(CAMERA), np.asarray(camera.T_world_cam)
         own.pos, own.fovy = T[:3, 3], math.degrees(2 * math.atan(camera.height_px / 2 / camera.fy_px))
         mujoco.mju_mat2Quat(own.quat, (T[:3, :3] @ _T_OPENCV_OPENGL).ravel())
         mujoco.mj_camlight(self.model, self.data)
         size = (camera.height_px, camera.width_px)
-        if size not in self._renderers:
-            self._renderers[size] = mujoco.Renderer(self.model, *size)
-        self._renderers[size].update_scene(self.data, CAMERA)
-        return self._renderers[size]
+        if size not in self._canvases:
+            self._canvases[size] = Canvas(self.model, *size)
+        self._canvases[size].look(self.data, own.id)
+        return self._canvases[size]
 
 
 def _normals(
@@ -105,7 +99,7 @@ def _normals(
     x = ((np.arange(camera.width_px) + 0.5 - camera.cx_px) / camera.fx_px).astype(np.float32)[None, :]
     y = ((np.arange(camera.height_px) + 0.5 - camera.cy_px) / camera.fy_px).astype(np.float32)[:, None]
     points = (x * depth_m, y * depth_m, depth_m)  # planes: arrays whose last axis has three numbers are slow
-    (ax, ay, az), (bx, by, bz) = ([_slope(plane, geoms, axis) for plane in points] for axis in (0, 1))
+    (ax, ay, az), (bx, by, bz) = (_slopes(points, geoms, axis) for axis in (0, 1))
     normal = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
     length = np.sqrt(_dot(normal, normal))
     nowhere = (geoms < 0) | (length == 0)
@@ -121,21 +115,24 @@ def _dot(
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _slope(
-    plane: Float32[np.ndarray, "H W"], geoms: Int32[np.ndarray, "H W"], axis: int
-) -> Float32[np.ndarray, "H W"]:
-    """Along an axis of the picture: the sum of the differences to both neighbours, but to other geoms."""
-    step = np.diff(plane, axis=axis) * (np.diff(geoms, axis=axis) == 0)
-    slope = np.zeros_like(plane)
-    here, there = np.moveaxis(slope, axis, 0)[1:], np.moveaxis(slope, axis, 0)[:-1]
-    step = np.moveaxis(step, axis, 0)
-    here += step
-    there += step
-    return slope
+def _slopes(
+    planes: Sequence[Float32[np.ndarray, "H W"]], geoms: Int32[np.ndarray, "H W"], axis: int
+) -> list[Float32[np.ndarray, "H W"]]:
+    """Along an axis of the picture: the sums of the differences to both neighbours, but to other geoms."""
+    lower, upper = ([slice(None)] * axis + [part] for part in (slice(-1), slice(1, None)))
+    lower, upper = tuple(lower), tuple(upper)
+    alike = geoms[upper] == geoms[lower]
+    slopes = [np.zeros_like(plane) for plane in planes]
+    for plane, slope in zip(planes, slopes, strict=True):
+        step = plane[upper] - plane[lower]
+        step *= alike
+        slope[upper] += step
+        slope[lower] += step
+    return slopes
 
 
 def _without_display() -> None:
-    """Lets mujoco.Renderer draw through EGL on a machine without a screen. Raises UserError without EGL."""
+    """Lets MuJoCo draw through EGL on a machine without a screen. Raises UserError without EGL."""
     if sys.platform != "linux" or os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY"):
         return
     from mujoco.rendering.classic import gl_context
