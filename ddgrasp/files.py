@@ -35,9 +35,10 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         _fsync(temporary)
         os.replace(temporary, path)
         _fsync(path.parent)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+        _name(error, temporary, path)
         raise
 
 
@@ -54,9 +55,18 @@ def new_folder(path: Path | str) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
         _fsync(path.parent)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
+        _name(error, temporary, path)
         raise
+
+
+def _name(error: BaseException, temporary: Path, path: Path) -> None:
+    """What could not be written is called by its own name: nobody knows the temporary one."""
+    if isinstance(error, OSError) and error.filename == str(temporary):
+        error.filename = str(path)
+        if error.filename2 is not None:  # 'temporary' -> 'path'
+            del error.filename2
 
 
 def user_cache(name: str) -> Path:

@@ -84,8 +84,10 @@ ROWS: dict[str, Row] = {
 def chosen(names: Sequence[str]) -> tuple[str, ...]:
     """Rows by name, with those that they are compared with, in the table's order.
 
-    UserError for an unknown one, or for one whose packages are absent.
+    UserError for an unknown one, none at all, or one whose packages are absent.
     """
+    if not names:
+        raise UserError(f"--rows names none: give {EVERYTHING}, or of {', '.join(ROWS)}.")
     asked = tuple(ROWS) if tuple(names) == (EVERYTHING,) else names
     for name in asked:
         if name not in ROWS:

@@ -47,6 +47,8 @@ def test_rows_bring_what_they_are_compared_with():
     assert causes.chosen(("all",)) == tuple(causes.ROWS)
     with pytest.raises(UserError, match="Unknown row 'mesh'. Did you mean 'meshes'"):
         causes.chosen(("mesh",))
+    with pytest.raises(UserError, match="--rows names none: give all, or of development, ideal"):
+        causes.chosen(())
 
 
 def test_the_table_is_kept_and_its_trials_are_not_run_again(tmp_path, policy):

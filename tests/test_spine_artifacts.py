@@ -50,6 +50,18 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
     assert (tmp_path / "sets" / "set" / "file").read_text() == "whole"
 
 
+@pytest.mark.parametrize("make", [atomic_path, new_folder])
+def test_what_cannot_be_written_is_called_by_its_own_name(make, tmp_path):
+    path = tmp_path / "is" / "there"
+    (path / "file").mkdir(parents=True)
+    with pytest.raises(OSError) as replaced, make(path) as temporary:
+        temporary.mkdir() if make is new_folder else temporary.touch()
+    assert str(replaced.value).endswith(f": '{path}'")
+    with pytest.raises(FileNotFoundError) as opened, make(tmp_path / "new") as temporary:
+        open(temporary)
+    assert str(opened.value).endswith(f": '{tmp_path / 'new'}'")
+
+
 def test_a_disk_that_fills_up_mid_write_leaves_the_previous_artifact(tmp_path):
     """The limit on file size makes the operating system itself refuse the write half-way."""
     path = tmp_path / "params.bin"
