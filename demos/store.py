@@ -89,7 +89,11 @@ class EpisodeStore:
             ) from None
 
     def append(self, steps: Mapping[str, np.ndarray], episode: Mapping[str, ArrayLike]) -> None:
-        """Adds one episode: arrays (T, ...) per step and (...) per episode."""
+        """Adds one episode: arrays (T, ...) per step and (...) per episode.
+
+        Raises UserError, and leaves what is there, for steps of other fields, sizes or types than it has.
+        """
+        self._check(steps)
         ends = self.ends
         start, length = (int(ends[-1]) if len(ends) else 0), len(next(iter(steps.values())))
         for name, value in steps.items():
@@ -99,6 +103,17 @@ class EpisodeStore:
         for name, value in episode.items():
             _put(self._meta, name, len(ends), np.asarray(value)[None])
         _put(self._meta, "episode_ends", len(ends), np.array([start + length], np.int64))
+
+    def _check(self, steps: Mapping[str, np.ndarray]) -> None:
+        if len(self) and steps.keys() != set(self.fields):
+            raise UserError(f"{self.path} has {', '.join(self.fields)}, not {', '.join(sorted(steps))}.")
+        for name, rows in steps.items():
+            there = _array(self._data, name) if name in self._data else rows
+            if there.shape[1:] != rows.shape[1:] or there.dtype != rows.dtype:
+                raise UserError(
+                    f"{self.path}: {name} is {there.dtype} {there.shape[1:]} per step, not {rows.dtype} "
+                    f"{rows.shape[1:]}."
+                )
 
 
 def _group(parent: zarr.Group, name: str) -> zarr.Group:

@@ -141,6 +141,7 @@ class OnnxPolicy:
         """
         if problem := self.check_fit(depth) or _wrong_state(state):
             raise UserError(f"{problem}.")
+        depth = depth.copy()  # cameras fill their buffers again
         self._frames.append(depth)
         while len(self._frames) < contract.DEPTH_FRAMES:
             self._frames.append(depth)

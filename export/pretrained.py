@@ -7,15 +7,22 @@ from pathlib import Path
 
 from ddgrasp import artifacts
 from ddgrasp.files import atomic_write_bytes
+from ddgrasp.progress import Progress
 from ddgrasp.shipped import PRETRAINED
-from export.stage import POLICY_FILE, export_policy, load_student
+from export.stage import POLICY_FILE, export_policy, load_student, measure
 
 
 def write(student: Path = PRETRAINED / "student") -> Path:
-    """Exports the finished student stage in `student` into its own folder; UserError if there is none."""
+    """Exports the finished student stage in `student` into its own folder.
+
+    UserError if there is none, or the file does not do what the student does.
+    """
     artifact = artifacts.read_artifact(student)
     config = artifacts.config_from_json(artifact.manifest.config)
-    atomic_write_bytes(student / POLICY_FILE, export_policy(config, load_student(student), artifact.hash))
+    params = load_student(student)
+    model = export_policy(config, params, artifact.hash)
+    measure(config, params, model, None, Progress(name="export"))
+    atomic_write_bytes(student / POLICY_FILE, model)
     return student / POLICY_FILE
 
 

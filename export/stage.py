@@ -1,5 +1,6 @@
 """Export: <run>/student -> <run>/export/policy.onnx, checked against JAX and timed."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,11 @@ def measure(
 
     difference = parity.max_abs_diff(session, reference, batches())
     bound = config.export.max_abs_diff
+    if not math.isfinite(difference):
+        raise UserError(
+            "The policy's actions are no finite numbers on some inputs; nothing was written. Its parameters "
+            "have diverged: train the student again."
+        )
     if not difference <= bound:
         raise UserError(
             f"The ONNX policy differs from JAX by {difference:.2e}, more than export.max_abs_diff = "

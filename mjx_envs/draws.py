@@ -1,8 +1,7 @@
 """What differs from episode to episode, as formulas of uniform numbers already drawn.
 
 Training (`mjx_envs/randomize.py`, JAX) and the rig (`rig/world.py`, NumPy) draw the numbers, each with a
-generator of its own; what becomes of them stands here. `xp` is the array namespace. This module imports NumPy
-alone.
+generator of its own; what becomes of them stands here. `xp` is the array namespace. Free of JAX.
 """
 
 from types import ModuleType

@@ -1,7 +1,7 @@
 """Forward kinematics of the scene and quaternion algebra, for NumPy and JAX alike.
 
 Quaternions are (w, x, y, z). `xp` is the array namespace: numpy or jax.numpy. All functions take
-leading batch dimensions. This module imports NumPy alone.
+leading batch dimensions. Free of JAX.
 """
 
 from types import ModuleType

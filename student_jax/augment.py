@@ -57,7 +57,7 @@ def disparity_noise(
         The same shape; invalid pixels stay so.
     """
     batch, frames, height, width = depth_m.shape
-    k_strength, k_shared, k_own, k_where, k_wrong = jax.random.split(key, 5)
+    k_strength, k_shared, k_own, k_where, k_wrong, k_edges = jax.random.split(key, 6)
     coarse = (batch, frames, -(-height // CORRELATION_PX), -(-width // CORRELATION_PX))
     field = _half_shared(k_shared, k_own, coarse)
     strength = config.training.disparity_noise_px * jax.random.uniform(k_strength, (batch, 1, 1, 1))
@@ -68,7 +68,7 @@ def disparity_noise(
     fb = profile.fx_px * profile.baseline_m
     disparity = fb / jnp.maximum(depth_m, 1e-3)
     if config.training.edge_noise_px:
-        field += _edge_noise(jax.random.fold_in(key, 1), disparity, depth_m > 0, profile, config)
+        field += _edge_noise(k_edges, disparity, depth_m > 0, profile, config)
     disparity += field
     return jnp.where(depth_m > 0, fb / jnp.maximum(disparity, _MIN_DISPARITY_PX), 0.0)
 

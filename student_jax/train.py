@@ -143,13 +143,13 @@ def train_step(
 ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
     """One optimiser step on pictures. Pure: noise comes from `step_key`."""
     policy = StudentPolicy(config, profile)
-    key, k_noise = jax.random.split(step_key(state))
+    key, k_noise, k_unseen = jax.random.split(step_key(state), 3)
     depth_m = to_metres(batch.depth_mm)
     if _ripples(config):
         depth_m = disparity_noise(k_noise, depth_m, profile, config)
     if config.training.unseen_share:
         grasp_m = position_to_world(batch.aux.position)
-        depth_m = unseen_objects(jax.random.fold_in(k_noise, 1), depth_m, grasp_m, profile, config)
+        depth_m = unseen_objects(k_unseen, depth_m, grasp_m, profile, config)
 
     def loss_fn(params):
         params = params | frozen

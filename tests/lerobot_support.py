@@ -53,7 +53,12 @@ def write_noisy(run: Path) -> list[np.ndarray]:
 
 
 def write_deployment(
-    folder: Path, *, success: bool | None = True, frames: int = 4, held: tuple[int, ...] = (), **about: str
+    folder: Path,
+    *,
+    success: bool | None = True,
+    frames: int = 4,
+    held: tuple[int, ...] = (),
+    **about: str | int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Makes a deployment of four steps as `deploy.record` leaves it; returns (states, depth_mm)."""
     rng = np.random.default_rng(len(folder.name))

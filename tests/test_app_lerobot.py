@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -97,10 +98,14 @@ def test_a_deployment_is_an_episode_with_its_verdict(tmp_path):
 def test_deployments_that_are_no_episodes_are_named(tmp_path):
     write_deployment(tmp_path / "judged")
     write_deployment(tmp_path / "open", success=None)
+    _, depth_mm = write_deployment(tmp_path / "blind")
+    (picture, *_) = sorted((tmp_path / "blind" / "depth").iterdir())
+    cv2.imwrite(str(picture), np.zeros_like(depth_mm[0]))
     write_deployment(tmp_path / "thin", frames=1)
     source = open_source(tmp_path)
     assert [read().name for read in source.episodes] == ["judged"]
-    assert sorted(line.split(":")[0] for line in source.left_out) == ["open", "thin"]
+    assert sorted(line.split(":")[0] for line in source.left_out) == ["blind", "open", "thin"]
+    assert "left out 1 of 4 frames" in " ".join(source.left_out)
     assert "1 pictures for 4 steps" in " ".join(source.left_out)
     assert open_source(tmp_path / "judged").episodes[0]().task == "grasp the object and lift it"
     with pytest.raises(UserError, match="no episode can be used .*film-every 1"):
@@ -149,7 +154,17 @@ def test_the_card_says_what_is_in_it(tmp_path):
         steps.POSE in text
         and f"`{steps.COLOUR}`" not in text
         and "held" not in text.split("##")[0].split("* ")
+        and "control periods" not in text
     )
+
+
+def test_the_card_counts_what_the_loop_missed(tmp_path):
+    write_deployment(tmp_path / "late", missed_deadlines=2)
+    source = open_source(tmp_path)
+    contents = card.Contents(keys=tuple(steps.features(SIZE, SIZE, False, "video")))
+    contents.count(source.episodes[0](), 0)
+    how = {"name": "set", "storage": "video", "licence": "cc-by-4.0", "command": "ddgrasp demos export x"}
+    assert "**Time**: 2 control periods passed without a step" in card.render(source, contents, **how)
 
 
 def test_what_stands_there_is_not_touched(tmp_path, monkeypatch):

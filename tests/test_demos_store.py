@@ -98,3 +98,19 @@ def test_zeros_are_kept_over_several_appends(tmp_path):
         store = EpisodeStore(tmp_path / "e", create=True)
         store.append({"held": np.zeros(length, bool)}, {"object_index": np.int32(0)})
     assert store.steps("held").tolist() == [False] * 7 and store.episodes("object_index").tolist() == [0, 0]
+
+
+def test_steps_of_another_kind_are_refused_and_spoil_nothing(tmp_path):
+    store = EpisodeStore(tmp_path / "e", create=True)
+    depth_mm, state = np.full((3, 8, 10), 700, np.uint16), np.ones((3, 8), np.float32)
+    store.append({"depth_mm": depth_mm, "state": state}, {"object_index": np.int32(0)})
+    for steps, problem in (
+        ({"depth_mm": depth_mm[:, :4, :5], "state": state}, r"depth_mm is uint16 \(8, 10\) per step, not"),
+        ({"depth_mm": depth_mm / 1000, "state": state}, "not float64"),
+        ({"depth_mm": depth_mm}, "has depth_mm, state, not depth_mm"),
+        ({"depth_mm": depth_mm, "state": state, "rgb": depth_mm}, "not depth_mm, rgb, state"),
+    ):
+        with pytest.raises(UserError, match=problem):
+            store.append(steps, {"object_index": np.int32(0)})
+    assert len(store) == 1
+    np.testing.assert_array_equal(store.steps("depth_mm"), depth_mm)

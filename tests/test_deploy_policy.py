@@ -26,6 +26,15 @@ def test_first_frame_fills_the_buffer_then_oldest_leaves_first(tmp_path):
     assert policy.act(depth_mm(900), STATE)[:3].tolist() == [900, 900, 900]
 
 
+def test_a_camera_may_fill_its_buffer_again(tmp_path):
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", depth_gain=frames_weighted()))
+    buffer = depth_mm(0)
+    for mm in (500, 600, 700):
+        buffer[:] = mm
+        seen = policy.act(buffer, STATE)[:3].tolist()
+    assert seen == [500, 600, 700]
+
+
 def test_state_reaches_the_network_in_order(tmp_path):
     gain = np.zeros((9, 4, 8))
     gain[np.arange(8), 0, np.arange(8)] = 2.0

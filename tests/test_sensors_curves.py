@@ -93,6 +93,13 @@ def test_standing_frames_are_found():
     assert curves.static_runs(depth.astype(np.uint16), FB_PX_M) == (slice(0, 7),)
 
 
+def test_a_frame_that_comes_again_stands_for_no_still_camera():
+    rng = np.random.default_rng(0)
+    still = 1000 * FB_PX_M / (16.0 + 0.05 * rng.standard_normal((16, *SIZE)))
+    again = np.concatenate([still[:8], np.repeat(still[8:9], 6, axis=0), still[9:]])
+    assert curves.static_runs(again.astype(np.uint16), FB_PX_M) == (slice(0, 9), slice(13, 21))
+
+
 def test_a_blind_frame_leaves_the_standing_ones_before_and_after_it():
     rng = np.random.default_rng(0)
     still = 1000 * FB_PX_M / (16.0 + 0.05 * rng.standard_normal((13, *SIZE)))

@@ -53,6 +53,14 @@ def test_folder_becomes_a_recording(tmp_path, capsys):
     )
 
 
+def test_colour_of_a_lens_of_its_own_is_called_so(tmp_path):
+    make_folder(tmp_path / "desk")
+    run(tmp_path / "desk", "--out", tmp_path / "out", "--no-aligned")
+    assert not Recording.open(tmp_path / "out" / "desk").color_aligned
+    run(tmp_path / "desk", "--out", tmp_path / "beside")
+    assert Recording.open(tmp_path / "beside" / "desk").color_aligned
+
+
 def test_bad_frames_are_named_and_counted(tmp_path, capsys):
     root = make_folder(tmp_path / "desk", frames=6)
     cv2.imwrite(str(root / "depth" / "0001_depth.png"), depth_mm(1, (30, 40)))

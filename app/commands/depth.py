@@ -47,6 +47,9 @@ class RecordImport:
     """Distance between the imagers; 0 if unknown."""
     consecutive: bool = False
     """The pictures follow each other in time (a RealSense file's do)."""
+    aligned: bool = True
+    """Colour is seen from where depth is; --no-aligned if it is the colour camera's own picture, as
+    RealSense Viewer exports it (a RealSense file says so itself)."""
 
     def run(self) -> None:
         """Imports every source that can be used and says what was left out."""
@@ -56,6 +59,8 @@ class RecordImport:
         meta = {name: value for name, value in known.items() if value}
         if self.consecutive:
             meta["consecutive_frames"] = True
+        if not self.aligned:
+            meta["color_aligned_to_depth"] = False
         sources, refused = importers.find_sources(self.source, self.depth_unit_m, meta)
         print(importers.summary(*importers.import_all(sources, self.out, refused)))
 

@@ -62,6 +62,8 @@ class Contents:
     """Whether each episode succeeded."""
     held: int = 0
     """Steps in which the control loop held the arm."""
+    missed: int = 0
+    """Control periods without a step."""
     farther: int = 0
     """Pixels that were too far for a depth video."""
     objects: dict[str, int] = field(default_factory=dict)
@@ -77,6 +79,7 @@ class Contents:
         self.steps += len(episode.state)
         self.outcomes.append(episode.success)
         self.held += int(episode.held.sum())
+        self.missed += episode.missed
         self.farther += farther
         self.objects[episode.object_name] = self.objects.get(episode.object_name, 0) + 1
 
@@ -107,6 +110,11 @@ def render(
         about += [
             f"* **Held**: in {contents.held} steps the control loop held the arm; their `action` is no joint "
             "step, and the gripper as before."
+        ]
+    if contents.missed:
+        about += [
+            f"* **Time**: {contents.missed} control periods passed without a step; timestamps count steps, "
+            "so around them more time lies between two steps than they say."
         ]
     rows = [f"| `{key}` | {_ROWS[key]} |" for key in contents.keys]
     stored = _STORAGE[storage].format(farther=contents.farther)

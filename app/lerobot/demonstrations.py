@@ -17,6 +17,8 @@ STORE, STAGE = "episodes.zarr", "demos"
 """As `demos.stage` names them, which imports JAX."""
 NOISY_STORE, NOISY_STAGE = "depth.zarr", "noisy"
 """As `ddg_jax.generate` names them."""
+_ENGINE = {"cpu": "MuJoCo", "jax": "MuJoCo MJX", "warp": "MuJoCo Warp"}
+"""By `world.backend`."""
 CLEAN_DEPTH = "its depth is clean: no holes, no noise"
 
 
@@ -51,7 +53,7 @@ def read(folder: Path, objects: Sequence[str] = (), noisy: Path | None = None) -
     width, height = config.world.profile.width_px, config.world.profile.height_px
     noise = f"standard deviation {config.demos.action_noise:g}" if config.demos.noise_share else "none"
     about = {
-        "Robot": "Franka Emika Panda with its hand, simulated in MuJoCo MJX.",
+        "Robot": f"Franka Emika Panda with its hand, simulated in {_ENGINE[config.world.backend]}.",
         "Camera": f"An ideal one with a RealSense D455's view, {width} x {height}, fixed across the table; "
         f"{depth_is}.",
         "How it was made": f"A policy that sees the simulator's state, trained by PPO "

@@ -61,7 +61,10 @@ def _unusable(deployment: Deployment) -> str:
         return f"{lacks}: on a rig deploy with --deploy.film-every 1"
     if not is_recording(deployment.folder):
         return "its pictures are gone"
-    return ""
+    try:
+        return Recording.open(deployment.folder).skipped_summary()
+    except UserError as error:
+        return str(error)
 
 
 def _read(deployment: Deployment) -> Episode:
@@ -84,6 +87,7 @@ def _read(deployment: Deployment) -> Episode:
         action=actions(rows),
         pictures=pictures,
         held=np.array([row["action"] is None for row in rows]),
+        missed=int(deployment.report.get("missed_deadlines", 0)),
     )
 
 

@@ -27,6 +27,8 @@ class Episode:
     """T pictures in order."""
     held: Bool[np.ndarray, " T"]
     """Steps in which the control loop held the arm where it was, whatever the policy said."""
+    missed: int = 0
+    """Control periods without a step, since the loop came late."""
     T_world_cam: Float32[np.ndarray, "4 4"] | None = None
     """The camera's pose, metres, OpenCV axes; None where it is unknown."""
 

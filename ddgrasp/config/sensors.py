@@ -99,7 +99,8 @@ class StereoConfig(Section, name="record.stereo"):
 
 @dataclass(frozen=True)
 class DextrahConfig(Section, name="sensor.dextrah"):
-    """Depth noise as DextrAH-G trains with, in pixels of its 160 x 120 pictures."""
+    """Depth noise with the numbers that DextrAH-G trains with, there in pixels of 160 x 120 pictures, here in
+    those of whatever picture is given."""
 
     shift_px: Annotated[float, Range(0, 100)] = 0.5
     """Standard deviation of the field by which pixels look up their depth beside themselves (sigma_s)."""

@@ -27,8 +27,9 @@ from mjx_envs.render.visual import Viewer
 Keys = UInt32[np.ndarray, "n 2"]
 Observation = Any
 """(N, 40) float32, or {"depth": (N, H, W), "state": (N, 8)} float32."""
-_CAMERA = 2
-"""Folded into an episode's key for its camera."""
+_CAMERA = 1000
+"""Folded into an episode's key for its camera; beyond what `GraspEnv.reset` splits it into, since
+fold_in(key, i) is split(key, n)[i]."""
 
 
 @struct.dataclass

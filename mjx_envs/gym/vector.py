@@ -3,8 +3,9 @@
 Environment i of N does what the single environment does with seed `seed + i`.
 """
 
+import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, SupportsIndex
 
 import jax
 import numpy as np
@@ -20,7 +21,7 @@ from mjx_envs.gym.env import PickEnv
 from mjx_envs.gym.simulator import Scenes, draw_keys, simulator
 from mjx_envs.gym.spaces import action_space
 
-Seeds = int | Sequence[int | None] | None
+Seeds = SupportsIndex | Sequence[SupportsIndex | None] | np.ndarray | None
 Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 """(observations, rewards (N,) float64, terminations (N,) bool, truncations (N,) bool, infos)."""
 
@@ -67,17 +68,17 @@ class PickVectorEnv(VectorEnv):
           seed: environment i's is `seed + i`; or one for each; None goes on with the random numbers.
           options: reset_mask, (N,) bool, which environments begin anew; all without.
         """
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        seeds = _seeds(seed, self.num_envs)
+        super().reset(seed=None if isinstance(seed, Sequence | np.ndarray) else seeds[0])
         everyone = np.ones(self.num_envs, bool)
         mask = np.asarray((options or {}).get("reset_mask", everyone), bool)
-        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed or [None] * self.num_envs
         if len(seeds) != self.num_envs or mask.shape != (self.num_envs,):
             raise UserError(
                 f"{len(seeds)} seeds, and a reset_mask of {mask.shape}; expected {self.num_envs} of each."
             )
-        for i, one in enumerate(seeds):
-            if one is not None and mask[i]:
-                self._generators[i] = seeding.np_random(one)[0]
+        for i, own in enumerate(seeds):
+            if own is not None and mask[i]:
+                self._generators[i] = seeding.np_random(own)[0]
         if mask.all() or self._scenes is None:
             self._scenes = self._simulator.begin(draw_keys(self._generators))
         else:
@@ -137,3 +138,13 @@ class PickVectorEnv(VectorEnv):
             }
             infos = self._add_info(infos, final, int(i))
         return infos
+
+
+def _seeds(seed: Seeds, count: int) -> list[int | None]:
+    """One for each of `count` environments, or as many as were given."""
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, Sequence | np.ndarray):
+        return [None if own is None else operator.index(own) for own in seed]
+    first = operator.index(seed)
+    return [first + i for i in range(count)]

@@ -26,7 +26,8 @@ MOST_STICKS = 4.0
 
 
 def dextrah(config: DextrahConfig, profile: CameraProfile) -> Sense:
-    """DextrAH-G's depth noise. `profile` gives focal length times baseline."""
+    """DextrAH-G's depth noise. `profile` gives focal length times baseline; strengths in pixels are of the
+    picture that is given, whatever its size: in one twice as wide they are half as much depth."""
     return batched(partial(_dextrah_frame, config, profile.fx_px * profile.baseline_m))
 
 
@@ -45,8 +46,8 @@ def _dextrah_frame(
     noisy = add_disparity(shifted(depth_m, shift), noise, fb_px_m)
     near, far = config.random_near_m, config.random_far_m
     values = jax.random.uniform(value_key, shape, minval=near, maxval=far)
-    noisy = jnp.where(jax.random.bernoulli(replace_key, config.random_value, shape), values, noisy)
-    noisy = jnp.where(jax.random.bernoulli(drop_key, config.dropout, shape), 0.0, noisy)
+    noisy = jnp.where(jax.random.bernoulli(replace_key, float(config.random_value), shape), values, noisy)
+    noisy = jnp.where(jax.random.bernoulli(drop_key, float(config.dropout), shape), 0.0, noisy)
     return draw_sticks(stick_key, noisy, config)
 
 

@@ -303,8 +303,8 @@ def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple
 
     def given(file: Path) -> Source:
         source = file_source(file)
-        unit_m = depth_unit_m or source.depth_unit_m
-        return replace(source, depth_unit_m=unit_m, meta={**source.meta, **meta})
+        source = replace(source, meta={**source.meta, **meta})
+        return replace(source, depth_unit_m=depth_unit_m, unit_is_certain=False) if depth_unit_m else source
 
     return _each(files, given)
 

@@ -29,7 +29,7 @@ def file_source(file: Path) -> Source:
     rs = load_pyrealsense2()
     _, _, profile = _opened(rs, file)
     meta, unit_m = describe(rs, profile)
-    return Source(file, lambda: _frames(rs, file), unit_m, meta)
+    return Source(file, lambda: _frames(rs, file), unit_m, meta, unit_is_certain=True)
 
 
 def describe(rs: Any, profile: Any) -> tuple[dict[str, Any], float]:

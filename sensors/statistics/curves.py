@@ -250,14 +250,11 @@ def static_runs(depth_mm: Real[np.ndarray, "T H W"], fb_px_m: float) -> tuple[sl
     """Runs of at least STATIC_FRAMES consecutive frames of a (T, H, W) recording that stand still.
 
     The median change of disparity between two frames has a floor, the camera's noise; a pair near the
-    quietest tenth of the pairs is taken to stand still; one that shares no valid pixel is not.
+    quietest tenth of the pairs is taken to stand still; one that shares no valid pixel is not. Nor is a frame
+    that comes again to the bit, which no camera measures twice.
     """
-    change = np.array(
-        [
-            _median_valid(np.abs(_disparity(a, fb_px_m) - _disparity(b, fb_px_m)))
-            for a, b in zip(depth_mm[:-1], depth_mm[1:], strict=True)
-        ]
-    )
+    pairs = zip(depth_mm[:-1], depth_mm[1:], strict=True)
+    change = np.array([_change_px(before, after, fb_px_m) for before, after in pairs])
     if np.isnan(change).all():
         return ()
     still = change <= STATIC_RATIO * np.nanquantile(change, 0.1)
@@ -290,6 +287,13 @@ def _disparity(depth_mm: np.ndarray, fb_px_m: float) -> np.ndarray:
     """float32 pixels, nan where invalid."""
     depth = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float32)
     return np.float32(1000.0 * fb_px_m) / depth
+
+
+def _change_px(before_mm: np.ndarray, after_mm: np.ndarray, fb_px_m: float) -> np.floating:
+    """Median change of disparity; nan where nothing is shared, or `after_mm` is `before_mm` again."""
+    if np.array_equal(before_mm, after_mm):
+        return np.float32("nan")
+    return _median_valid(np.abs(_disparity(before_mm, fb_px_m) - _disparity(after_mm, fb_px_m)))
 
 
 def _median_valid(values: np.ndarray) -> np.floating:
