@@ -187,6 +187,7 @@ def _check_values(metadata: PolicyMetadata, source: str) -> None:
         "joint_names": contract.ARM_JOINTS,
         "depth_frames": contract.DEPTH_FRAMES,
         "control_hz": contract.CONTROL_HZ,
+        "action_scale_rad": contract.ACTION_SCALE_RAD,
         "state": STATE_LAYOUT,
     }
     for name, expected in fixed.items():

@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeVar
 from ddgrasp.config.deploy import DeployConfig, FrankaConfig
 from ddgrasp.errors import UserError
 from deploy.clock import RobotClock
+from deploy.devices.franka_faults import NO_FRANKA
 from deploy.devices.franka_robot import LOST, FrankaRobot
 from deploy.interfaces import CameraError, RobotError
 from rig.fr3 import scene
@@ -63,7 +64,7 @@ class Fr3Lab:
                 lost = "the FR3 rig has gone"
             except (ChannelLost, CameraError, RobotError, UserError) as error:
                 lost = str(error)
-                if self._is_up() and not lost.startswith(LOST):
+                if self._is_up() and not any(sign in lost for sign in (LOST, NO_FRANKA)):
                     raise
             self.close()
         raise UserError(f"{lost} ({ATTEMPTS} times): use fewer --workers, or end what else runs here.")

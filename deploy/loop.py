@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from ddgrasp.errors import UserError
 from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotError, RobotState
+from deploy.interrupts import unbroken
 from deploy.pace import Pace
 from deploy.policy import OnnxPolicy
 from deploy.retry import EMPTY_WIDTH_M, Retry, patience, still_for
@@ -333,12 +334,13 @@ class ControlLoop:
         self._log("fault", str(error))
 
     def _stop_both(self) -> None:
-        try:
-            self._robot.stop()
-        except RobotError as error:
-            self._fail(error)
-        finally:
-            self._camera.stop()
+        with unbroken():
+            try:
+                self._robot.stop()
+            except RobotError as error:
+                self._fail(error)
+            finally:
+                self._camera.stop()
 
     def _log(self, kind: str, reason: str) -> None:
         event = Event(self._report.steps, self._now_s(), kind, reason)

@@ -5,6 +5,7 @@ generator to what the robot just saw.
 """
 
 import json
+import math
 import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -17,7 +18,6 @@ from jaxtyping import UInt8
 
 from ddgrasp import contract
 from ddgrasp.depth import to_millimetres
-from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from deploy.interfaces import Camera, Filmed, Judge
 from deploy.loop import Step
@@ -41,12 +41,11 @@ class DeploymentRecord:
     ):
         """`profile` is the policy's picture; `film_every` as in `DeployConfig`."""
         self._camera, self._picture_every, self._film_every = camera, film_every, film_every
-        apart = film_every if isinstance(camera, Filmed) else 1  # steps; a camera's own are all kept
         self._meta = {
             "sensor": sensor, "fx_px": profile.fx_px, "baseline_m": profile.baseline_m,
-            "hz": contract.CONTROL_HZ / apart, "consecutive_frames": apart == 1,
             "color_aligned_to_depth": isinstance(camera, Filmed),  # a camera's own is of another lens
         }  # fmt: skip
+        self._newest_s = -math.inf
         self._rows: list[dict[str, Any]] = []
         self._queue: queue.Queue[tuple[np.ndarray, np.ndarray] | None] = queue.Queue()
         self._film: list[tuple[int, UInt8[np.ndarray, "h w 3"], np.ndarray]] = []
@@ -79,6 +78,12 @@ class DeploymentRecord:
         if step.frame is None:
             return
         rgb = step.frame.rgb
+        if not self._queued:  # a camera's own are all kept
+            apart = self._picture_every if rgb is None else 1
+            self._meta |= {"hz": contract.CONTROL_HZ / apart, "consecutive_frames": apart == 1}
+        if step.frame.timestamp_s == self._newest_s:  # the loop holds, and has no other
+            self._meta["consecutive_frames"] = False
+        self._newest_s = step.frame.timestamp_s
         if rgb is None and step.index % self._picture_every == 0 and isinstance(self._camera, Filmed):
             rgb = self._camera.picture()
         if rgb is None:
@@ -130,7 +135,8 @@ class DeploymentRecord:
             with RecordingWriter(folder, self._meta) as writer:
                 while taken is not None and self._add(writer, *taken):
                     taken = self._queue.get()
-        except (UserError, OSError, ImportError) as error:
+                writer.meta.update(self._meta)
+        except Exception as error:  # encoders raise what they like
             self._trouble = str(error)  # the arm goes on; the report says what is missing
             self._written = 0
         while taken is not None:  # what cannot be written is not kept in memory either
@@ -140,7 +146,7 @@ class DeploymentRecord:
         """Whether the frame was written. Raises what prevented it if there is none before."""
         try:
             writer.add(rgb, depth_mm)
-        except (UserError, OSError) as error:
+        except Exception as error:
             if not self._written:
                 raise
             self._trouble = f"those after the first {self._written}: {error}"

@@ -2,12 +2,9 @@
 
 import contextlib
 import math
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +20,7 @@ from deploy.devices.options import RIG_CAMERAS, RIG_HOST, SessionOptions, Setup
 from deploy.devices.registry import check_devices, make_devices
 from deploy.dry_run import DryRun
 from deploy.interfaces import Clock, Robot, TimedRobot
+from deploy.interrupts import terminable, unbroken
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.record import ENDED, REPORT_FILE, DeploymentRecord, verdict
@@ -95,7 +93,8 @@ def _run(
             with contextlib.suppress(OSError, ValueError):
                 kept.finish(folder, {**loop.report.as_dict(), "fault": fault}, None, about)
         raise
-    kept.finish(folder, report.as_dict(), success, about)
+    with unbroken():
+        kept.finish(folder, report.as_dict(), success, about)
     if success is not None:
         say(f"verdict: {ENDED[success]}")
     say(f"report: {folder / REPORT_FILE}")
@@ -135,7 +134,11 @@ def ask_person(question: str) -> None:
     """Ask on the terminal. Raises UserError unless the answer is yes, or if nobody can be asked."""
     if not sys.stdin.isatty():
         raise UserError(f"{question} Nobody can be asked here: give --yes.")
-    if input(f"{question} [y/N] ").strip().lower() not in ("y", "yes"):
+    try:
+        answer = input(f"{question} [y/N] ").strip().lower()
+    except EOFError:  # Ctrl-D
+        answer = ""
+    if answer not in ("y", "yes"):
         raise UserError("not confirmed: nothing has moved.")
 
 
@@ -180,32 +183,6 @@ def _new_folder(out: Path) -> Path:
 
 def _stamp() -> str:
     return time.strftime("%Y%m%d-%H%M%S")
-
-
-@contextmanager
-def terminable() -> Iterator[None]:
-    """The first SIGTERM, Ctrl-C or hang-up is KeyboardInterrupt; a second one does not cut stopping short.
-
-    What runs under nohup goes on without its terminal.
-    """
-    ending = [signal.SIGTERM, signal.SIGINT]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        ending.append(signal.SIGHUP)
-
-    def interrupt(signum, frame):
-        for number in ending:
-            signal.signal(number, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():  # signals are someone else's
-        yield
-        return
-    previous = [signal.signal(number, interrupt) for number in ending]
-    try:
-        yield
-    finally:
-        for number, handler in zip(ending, previous, strict=True):
-            signal.signal(number, handler)
 
 
 def describe(report: LoopReport) -> str:

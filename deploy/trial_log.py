@@ -79,12 +79,17 @@ def _line(value: dict[str, Any]) -> str:
 
 
 def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Up to the first that is torn."""
+    """All but the last if it is torn. Raises UserError for one torn before it: nothing is thrown away."""
     if not path.exists():
         return
-    with open(path, errors="replace") as file:
-        for text in file:
-            try:
-                yield json.loads(text)
-            except json.JSONDecodeError:
+    lines = path.read_text(errors="replace").splitlines()
+    for number, text in enumerate(lines, 1):
+        try:
+            yield json.loads(text)
+        except json.JSONDecodeError:
+            if number == len(lines):
                 return
+            raise UserError(
+                f"{path}: line {number} of {len(lines)} is damaged, as by two series at once: take it out, "
+                "and its trial is run again."
+            ) from None

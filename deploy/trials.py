@@ -5,7 +5,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -231,16 +231,27 @@ def run_trials(
         initializer=_start_worker,
         initargs=(config, policy_path, make, os.getpid()),
     )
+    futures = [executor.submit(_run_in_worker, trial) for trial in trials]
+    waiting = set(futures)
     try:
-        for future in as_completed([executor.submit(_run_in_worker, trial) for trial in trials]):
+        for future in as_completed(futures):
+            waiting.discard(future)
             yield future.result()
     except BrokenProcessPool:
         raise UserError(
             "a worker was killed, often for want of memory: finished trials are kept, the same command (with "
             "--resume where it has one) goes on; fewer workers need less."
         ) from None
+    except UserError:  # of one trial: those that run come to their end, and are kept
+        executor.shutdown(wait=True, cancel_futures=True)
+        yield from (future.result() for future in waiting if _has_ended_well(future))
+        raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _has_ended_well(future: Future) -> bool:
+    return future.done() and not future.cancelled() and future.exception() is None
 
 
 class Filming:

@@ -60,8 +60,8 @@ class Series:
     depth: TreatmentName = RECORDED
     """What the policy sees: depth as recorded, inpaint (holes filled on line), or monocular (a network on
     colour, made metric by recorded depth)."""
-    retry: bool = True
-    """Whether a hand that stands still, or has closed on nothing, tries again (`deploy.retry`)."""
+    retry: bool | None = None
+    """Whether a hand that stands still, or has closed on nothing, tries again; None: as `deploy.retry`."""
 
     def names(self) -> tuple[str, ...]:
         """The objects. UserError for none or an unknown one, or a choice that the rig does not have."""
@@ -93,7 +93,7 @@ class Series:
         policy that can be run, or a limit not one that an arm has."""
         OnnxPolicy(policy, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None)
         world = replace(config.world, objects=_trained())
-        deploy = replace(config.deploy, retry=self.retry)
+        deploy = config.deploy if self.retry is None else replace(config.deploy, retry=self.retry)
         if self.contact is not None:
             deploy = stopping_at(deploy, self.contact)
         config = replace(config, seed=seeds.seed(self.split, self.number), world=world, deploy=deploy)
@@ -223,7 +223,10 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     """What the trials belong to; how many of which objects may grow."""
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
-    return made_with(config, policy) | bench | {"contact": config.deploy.franka.contact_force_n}
+    deploy = config.deploy
+    return made_with(config, policy) | bench | {
+        "contact": deploy.franka.contact_force_n, "retry": deploy.retry,
+    }  # fmt: skip
 
 
 def made_with(config: Config, policy: Path) -> dict[str, str]:

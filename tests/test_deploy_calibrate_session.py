@@ -333,6 +333,13 @@ def test_a_workspace_without_room_is_said():
         poses.plan(poses.Bench(limits, LENS, nominal_pose(), BOARD), 2, HOME_RAD, np.random.default_rng(0))
 
 
+def test_a_board_too_large_for_the_picture_is_said():
+    limits = safety_filter(CONFIG.deploy, INFO, "franka").limits
+    bench = poses.Bench(limits, LENS, nominal_pose(), CharucoBoard(square_m=0.3, marker_m=0.2))
+    with pytest.raises(UserError, match="a pattern of 1500 x 2100 mm does not fit into the picture"):
+        poses.plan(bench, 2, HOME_RAD, np.random.default_rng(0))
+
+
 def test_the_jacobian_is_the_derivative_of_the_grip_pose():
     q = HOME_RAD + 0.1 * np.arange(7)
     J, step = kinematics.grip_jacobian(q), 1e-6

@@ -1,5 +1,7 @@
 """Hand-eye calibration: the solver on projected corners, what it refuses, the board, the poses, the file."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
-from deploy.calibration import hand_eye
+from deploy.calibration import hand_eye, session
 from deploy.calibration.hand_eye import View, calibrate, invert, park_martin, project
 from deploy.interfaces import Lens
 from mjx_envs.camera import look_at
@@ -106,6 +108,21 @@ def test_a_view_of_a_single_line_of_corners_is_left_out():
     assert np.linalg.matrix_rank(np.diff(BOARD.corners_m()[line], axis=0)) == 1, "six corners of one column"
     found = calibrate(views, LENS, BOARD)
     assert list(np.flatnonzero(~found.used)) == [7] and np.isnan(found.view_rms_px[7])
+
+
+@pytest.mark.parametrize(
+    ("square_m", "said"), [(0.0295, "1.0 px is much"), (0.025, "are the board's squares 25 mm")]
+)
+def test_squares_of_another_size_than_said_are_noticed(square_m, said, tmp_path):
+    """No view contradicts the others: all are wrong alike."""
+    board, heard = replace(BOARD, square_m=square_m, marker_m=0.018), []
+    found = calibrate(synthetic_views(np.random.default_rng(0)), LENS, board)
+    assert found.used.all()
+    try:
+        session._check_fit(found.rms_px, 1e3 * square_m, tmp_path / "calibration.png", heard.append)
+    except UserError as error:
+        heard.append(str(error))
+    assert said in " ".join(heard)
 
 
 def test_a_board_that_is_not_seen_is_named():

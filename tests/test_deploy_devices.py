@@ -20,7 +20,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy import session
 from deploy.clock import SimClock
-from deploy.devices import franka_hand, franka_probe, franka_robot, registry
+from deploy.devices import franka_faults, franka_hand, franka_probe, franka_robot, registry
 from deploy.devices.franka_hand import FrankaHand, HandError
 from deploy.devices.franka_robot import LOST, FrankaRobot
 from deploy.devices.franka_spring import FrankaSpring
@@ -434,6 +434,17 @@ def test_every_pair_is_refused_or_can_be_made(recording):
     metres = Setup(preset, SessionOptions(camera="realsense"), describe("float32_m"), SimClock())
     with pytest.raises(UserError, match="the policy takes float32_m: export it"):
         registry.make_devices(metres)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('motion aborted by reflex! ["joint_reflex"]', "joint_reflex (it met something: a joint"),
+        ('not possible in the current mode ("Other")! Did you open the brakes?', "Did you open the brakes?"),
+    ],
+)
+def test_an_arm_s_refusal_is_told_in_its_words(text, said):
+    assert said in franka_faults.describe(RuntimeError(f"libfranka: Move command rejected: {text}"))
 
 
 def test_sigterm_holds_and_stops_the_robot_as_ctrl_c_does(tmp_path, monkeypatch):

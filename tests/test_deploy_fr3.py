@@ -4,6 +4,7 @@ The arm, its protocol and its gripper are franky-sim's, in a process of its own.
 time, so a busy machine makes these tests slower and nothing else.
 """
 
+import io
 import json
 import os
 import re
@@ -518,4 +519,9 @@ def test_speed_the_policy_may_ask_for_is_said_when_dynamics_gives_less():
 def test_nobody_to_ask_is_refused(monkeypatch):
     monkeypatch.setattr("sys.stdin", open(os.devnull))
     with pytest.raises(UserError, match="give --yes"):
+        ask_person("Is its way clear?")
+    terminal = io.StringIO()  # Ctrl-D
+    terminal.isatty = lambda: True
+    monkeypatch.setattr("sys.stdin", terminal)
+    with pytest.raises(UserError, match="not confirmed: nothing has moved"):
         ask_person("Is its way clear?")

@@ -11,6 +11,7 @@ pytest.importorskip("franky", reason="needs pip install -e '.[fr3]'")
 
 import xml.etree.ElementTree as ET
 
+import franky
 from franky_sim.mujoco_simulator import MujocoSimulator
 
 from ddgrasp import contract
@@ -19,7 +20,9 @@ from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from deploy.clock import SimClock
 from deploy.devices import fr3_camera
-from deploy.fr3_lab import free_host
+from deploy.devices.franka_faults import no_connection
+from deploy.devices.franka_robot import LOST
+from deploy.fr3_lab import Fr3Lab, free_host
 from deploy.fr3_trials import Fr3Runner
 from deploy.trials import TrialResult
 from deploy_support import constant_bias, describe, write_policy
@@ -155,6 +158,36 @@ def test_the_arm_s_limits_are_the_configuration_s_or_the_series_in_proportion(tm
         assert rig_trials._header(made, policy, series)["contact"] == expected[0]
     with pytest.raises(UserError, match="contact_force_n is 200.0; expected 1 to 100"):
         Series(contact=200.0).configured(own, policy)
+
+
+def test_the_rules_of_trying_again_are_the_configuration_s_or_left_out(tmp_path):
+    policy = write_policy(tmp_path / "policy.onnx", describe(), bias=constant_bias(0.0, -1.0))
+    config = get_preset("debug")
+    without = replace(config, deploy=replace(config.deploy, retry=False))
+    for given, asked, expected in ((config, None, True), (without, None, False), (config, False, False)):
+        series = Series(retry=asked)
+        made = series.configured(given, policy)
+        assert made.deploy.retry is expected
+        assert rig_trials._header(made, policy, series)["retry"] is expected
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        f"on the way to the start pose {LOST} 127.0.0.2 is lost (UDP receive: Timeout).",
+        no_connection(franky, "127.0.0.2", "fr3", RuntimeError("UDP receive: Timeout")),
+    ],
+)
+def test_a_connection_lost_at_the_start_is_made_again(said):
+    attempts = []
+
+    def attempt() -> str:
+        attempts.append(said)
+        if len(attempts) == 1:
+            raise UserError(said)
+        return "made"
+
+    assert Fr3Lab("primitive").repeated(attempt) == "made" and len(attempts) == 2
 
 
 def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):

@@ -226,6 +226,43 @@ def test_a_second_signal_does_not_cut_the_stopping_short(run, number, hang_ups_c
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_nor_does_the_first_where_the_time_is_over(run, number, hang_ups_count):
+    class Stopping(ColourCamera):
+        def stop(self):
+            os.kill(os.getpid(), number)
+            stopped.append(self)
+
+    stopped = []
+    report, folder = run(Stopping)
+    assert stopped and report.steps == len(Recording.open(folder)) == 5
+    assert not report.interrupted and not report.fault
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_camera_of_a_rig_that_gives_colour_with_every_frame_is_kept_as_often(run):
+    class Rig(ColourCamera):
+        def picture(self):
+            return np.zeros((180, 320, 3), np.uint8)
+
+    meta = Recording.open(run(Rig)[1]).meta
+    assert (meta["hz"], meta["consecutive_frames"]) == (10.0, True)
+
+
+def test_a_frame_that_came_again_is_no_next_one(run):
+    class Stalled(ColourCamera):
+        def read(self):
+            if self._reads != 2:
+                self.newest = super().read()
+            else:
+                self._reads += 1
+            return self.newest
+
+    report, folder = run(Stalled)
+    recording = Recording.open(folder)
+    assert report.holds == 1 and len(recording) == 5 and not recording.consecutive
+
+
 def test_where_nothing_can_be_kept_nothing_moves(run, tmp_path, monkeypatch):
     monkeypatch.setattr(KinematicRobot, "start", lambda self: pytest.fail("the robot was started"))
     (tmp_path / "file").touch()

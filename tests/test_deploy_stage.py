@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,20 @@ def test_torn_last_line_is_dropped_and_the_next_one_is_whole(tmp_path):
     torn.append(result(2))
     assert list(TrialLog(path, header).results) == [(0, False), (2, False)]
     assert all(json.loads(line) for line in path.read_text().splitlines())
+
+
+def test_a_line_damaged_before_the_last_is_named_and_costs_none_behind_it(tmp_path):
+    path, header = tmp_path / "trials.jsonl", {"policy_sha256": "a"}
+    log = TrialLog(path, header)
+    for index in range(3):
+        log.append(result(index))
+    lines = path.read_text().splitlines()
+    lines[2] = lines[2][:-20]
+    path.write_text("\n".join(lines) + "\n")
+    before = path.read_bytes()
+    with pytest.raises(UserError, match="line 3 of 4 is damaged"):
+        TrialLog(path, header)
+    assert path.read_bytes() == before
 
 
 def test_trials_of_another_policy_are_refused_and_kept(tmp_path):
@@ -227,6 +242,30 @@ def test_what_ends_a_trial_with_success_has_one_whatever_the_last_command_does(p
     assert made.success and made.steps == contract.HOLD_STEPS + 1
     bench.run(Trial(0, "cube"), lambda step, camera: lifted(step, camera) or step.index == 3)
     assert not bench.run(Trial(0, "cube"))[0].success  # the one before says nothing about this one
+
+
+class LosesFirst:
+    """The bench on which trial 0 cannot be tried while others run."""
+
+    def __init__(self, config: Config, policy: Path):
+        pass
+
+    def run(self, trial: Trial) -> tuple[TrialResult, None]:
+        time.sleep(0.5 if trial.index == 0 else 1.0)
+        if trial.index == 0:
+            raise UserError("the rig has gone")
+        return result(trial.index), None
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_a_trial_that_cannot_be_tried_costs_none_that_ran_beside_it(tmp_path):
+    trials, made = [Trial(index, "apple") for index in range(4)], []
+    with pytest.raises(UserError, match="the rig has gone"):
+        for tried_one, _ in run_trials(CONFIG, tmp_path, trials, 2, LosesFirst):
+            made.append(tried_one.index)
+    assert 1 in made and 0 not in made
 
 
 def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):

@@ -45,6 +45,7 @@ def test_a_file_of_before_does_not_latch_a_closing():
         ({"depth_height": "180"}, "depth_height is '180', expected a positive integer"),
         ({"execute_steps": 5, "chunk": 4}, "execute_steps is 5, more than the chunk of 4"),
         ({"control_hz": 30.0}, "control_hz is 30.0, this code expects 10.0"),
+        ({"action_scale_rad": -0.1}, "action_scale_rad is -0.1, this code expects 0.1"),
         ({"joint_names": ["a"]}, "joint_names"),
         ({"closing_steps": -1}, "closing_steps is -1, expected 0 or more"),
     ],

@@ -37,7 +37,8 @@ class DeployTrials:
     depth: Literal["recorded", "inpaint", "monocular"] = "recorded"
     """What the policy sees: recorded, inpaint (holes filled on line), or monocular (a network on colour)."""
     retry: bool = True
-    """A hand that stands still or has closed on nothing tries again; --no-retry lets the policy alone act."""
+    """A hand that stands still or has closed on nothing tries again, unless the configuration's deploy.retry
+    is off; --no-retry lets the policy alone act."""
     preset: str | None = None
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
     workers: Annotated[int, Range(1, 64)] = 2
@@ -64,7 +65,7 @@ class DeployTrials:
             self.seconds,
             self.contact,
             self.depth,
-            self.retry,
+            None if self.retry else False,
         )
         config = config_of(self.policy, self.preset)
         progress = Progress(name="deploy trials")

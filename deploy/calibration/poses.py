@@ -27,6 +27,8 @@ _PATH_STEP_RAD = 0.1
 _TRIES = 15
 """Random poses drawn for each that is wanted, in each of `_ROUNDS`: the straight way to some is not free."""
 _ROUNDS = 4
+_VIEW_TRIES = 2000
+"""Random views drawn for one with the whole pattern in the picture."""
 _LINKS = slice(0, 7)
 """Those of the arm's spheres that the board could touch; hand and flange hold it."""
 
@@ -120,11 +122,11 @@ def _reached(bench: Bench, count: int, q_start_rad: np.ndarray, rng: np.random.G
 
 
 def _random_view(bench: Bench, rng: np.random.Generator) -> np.ndarray:
-    """(4, 4) T_cam_board with the whole pattern in the picture."""
+    """(4, 4) T_cam_board with the whole pattern in the picture. UserError if it hardly ever fits."""
     lens, board = bench.lens, bench.board
     width, height = board.size_m
     outline = board.outline_m()
-    while True:
+    for _ in range(_VIEW_TRIES):
         tilt, roll = rng.uniform(-TILT_RAD, TILT_RAD, 2), rng.uniform(-ROLL_RAD, ROLL_RAD)
         T = np.eye(4)
         T[:3, :3] = (Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, roll])).as_matrix()
@@ -136,6 +138,11 @@ def _random_view(bench: Bench, rng: np.random.Generator) -> np.ndarray:
         size = (lens.width_px - 1, lens.height_px - 1)
         if (seen > EDGE_PX).all() and (seen < np.array(size) - EDGE_PX).all():
             return T
+    near_m, far_m = DISTANCE_M
+    raise UserError(
+        f"a pattern of {1e3 * width:.0f} x {1e3 * height:.0f} mm does not fit into the picture at {near_m:g} "
+        f"to {far_m:g} m: print it smaller, and give --board.square-mm in millimetres."
+    )
 
 
 def _is_board_free(bench: Bench, T_base_grip: np.ndarray) -> bool:

@@ -23,7 +23,8 @@ from deploy.clock import RealClock, RobotClock
 from deploy.devices.options import SessionOptions, Setup
 from deploy.devices.registry import IMAGERS, ROBOTS
 from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, Robot, RobotError
-from deploy.session import ask_person, for_devices, keep_time_of, terminable
+from deploy.interrupts import terminable
+from deploy.session import ask_person, for_devices, keep_time_of
 from deploy.setup import safety_filter
 from sensors.charuco_board import CharucoBoard, Corners
 
@@ -31,6 +32,9 @@ HOPELESS = 4
 """So many pictures without a glimpse of the board end the run."""
 MOVED_RAD = 1e-3
 """An arm that moved by more while the picture was taken spoils the view."""
+MUCH_RMS_PX, MOST_RMS_PX = 1.0, 3.0
+"""Reprojection error of a calibration that is warned of, and of one that is refused. Squares 3 % smaller than
+said give 2 px, and move the camera by 6 mm."""
 
 
 @dataclass(frozen=True)
@@ -248,13 +252,29 @@ def _solved(
     details = _details(taken, found, lens, options.board, truth)
     host = config.deploy.franka.host
     result = Calibration(standing.now(), options.camera, host, found.T_base_cam, found.rms_px, details)
-    standing.save(options.out, result)
     sheet = options.out.with_suffix(".png")
     atomic_write_bytes(sheet, picture.sheet(taken.pictures, taken.views, found, lens, options.board))
+    _check_fit(found.rms_px, 1e3 * options.board.square_m, sheet, say)
+    standing.save(options.out, result)
     say(f"{options.out}, {sheet}: `ddgrasp deploy` reads the first, look at the second")
     away = standing.offset(found.T_base_cam, standing.nominal_pose())
     say(standing.describe(away, config.world.random))
     return result
+
+
+def _check_fit(rms_px: float, square_mm: float, sheet: Path, say: Callable[[str], None]) -> None:
+    """UserError, or a warning, for views that contradict one another all alike, of which none is left out."""
+    if rms_px > MOST_RMS_PX:
+        raise UserError(
+            f"the views contradict one another by {rms_px:.1f} px, more than {MOST_RMS_PX:g}: are the "
+            f"board's squares {square_mm:g} mm wide as printed (--board.square-mm)? Look at {sheet}; the "
+            "result is not saved."
+        )
+    if rms_px > MUCH_RMS_PX:
+        say(
+            f"{rms_px:.1f} px is much: measure the printed squares (--board.square-mm is {square_mm:g}), and "
+            "see that the board is flat and fast in the hand"
+        )
 
 
 def _details(

@@ -15,6 +15,10 @@ MEANINGS = {
 """By the name in Franka's `Errors`. Any other name is reported as it is."""
 
 
+NO_FRANKA = "no Franka"
+"""What the line begins with that says that no arm answers."""
+
+
 def one_line(error: BaseException) -> str:
     """The arm's own words without their statistics."""
     return " ".join(str(error).split("control_command_success_rate")[0].split())
@@ -22,7 +26,8 @@ def one_line(error: BaseException) -> str:
 
 def names(error: BaseException) -> list[str]:
     """Errors that the arm names as the reason why a motion ended: `["joint_reflex"]`."""
-    return re.findall(r'"(\w+)"', str(error))
+    listed = re.findall(r"\[([^\]]*)\]", str(error))  # a mode is quoted too, outside
+    return [name for names in listed for name in re.findall(r'"(\w+)"', names)]
 
 
 def describe(error: BaseException) -> str:
@@ -44,7 +49,7 @@ def no_connection(franky: Any, host: str, model: str, error: BaseException) -> s
     if isinstance(error, franky.RealtimeException):
         return f"{said}: install a realtime kernel, or set deploy.franka.kernel any and expect lost packets."
     return (
-        f"no Franka at {host!r} ({said}): unlock the joints, activate FCI in Desk, end other programs that "
+        f"{NO_FRANKA} at {host!r} ({said}): unlock the joints, activate FCI in Desk, end other programs that "
         "drive it, and check --host."
     )
 

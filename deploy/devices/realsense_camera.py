@@ -4,6 +4,7 @@ Written against pyrealsense2 2.59's documented API and tried through librealsens
 a synthetic stream; it has not been run on a camera by us.
 """
 
+import contextlib
 import time
 from dataclasses import replace
 from typing import Any
@@ -80,9 +81,15 @@ class RealSenseCamera:
                 f"({error}); check the USB 3 cable and deploy.realsense.serial {self._serial!r}."
             ) from error
         self._pipeline = pipeline
-        project(rs, active)
-        self._unit_m = active.get_device().first_depth_sensor().get_depth_scale()
-        intrinsics = active.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
+        try:
+            project(rs, active)
+            self._unit_m = active.get_device().first_depth_sensor().get_depth_scale()
+            intrinsics = active.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
+        except RuntimeError as error:
+            self.stop()
+            raise UserError(
+                f"the RealSense streams, and does not answer ({error}): plug it in anew."
+            ) from error
         self._stream = self._checked(intrinsics)
 
     def read(self) -> Frame:
@@ -112,9 +119,10 @@ class RealSenseCamera:
 
     def stop(self) -> None:
         """Close the stream, if it is open."""
-        if self._pipeline is not None:
-            self._pipeline.stop()
-            self._pipeline = None
+        pipeline, self._pipeline = self._pipeline, None
+        if pipeline is not None:
+            with contextlib.suppress(RuntimeError):  # one that was unplugged
+                pipeline.stop()
 
     def _exposed_s(self, taken: Any) -> float:
         """When the frame was exposed, on the loop's clock: the host's time of day tells its age."""

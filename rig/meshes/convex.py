@@ -107,7 +107,7 @@ def _read(file: Path, key: str) -> list[Hull] | None:
 def _write(file: Path, found: dict[str, list[Hull]]) -> None:
     arrays: dict[str, np.ndarray] = {}
     for key, hulls in found.items():
-        arrays[key] = np.rint(np.concatenate(hulls) / _STORED_MM).astype(np.int16)
+        arrays[key] = np.rint(np.concatenate(hulls) / _STORED_MM).astype(np.int32)
         arrays[f"{key}-counts"] = np.array([len(hull) for hull in hulls])
     with atomic_path(file) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, **arrays)
