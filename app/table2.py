@@ -14,7 +14,7 @@ from app import pipeline
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
-from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text, to_json
+from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text, read_json, to_json
 from ddgrasp.progress import Progress
 from ddgrasp.stages import get_stage
 from evaluation.rig_trials import Series
@@ -120,6 +120,7 @@ def write(study: Study) -> dict[str, Any]:
     from evaluation.table2 import page
 
     config = to_json(study.config)
+    collected, left_out = results.collect(study.out), _left_out(study.out) | dict(study.left_out)
     made = {
         "preset": study.config.preset,
         "seed": study.config.seed,
@@ -127,8 +128,8 @@ def write(study: Study) -> dict[str, Any]:
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "machine": describe_machine(),
         "versions": artifacts.library_versions(),
-        "left_out": dict(study.left_out),
-        **results.collect(study.out),
+        "left_out": {name: why for name, why in left_out.items() if name not in collected["rows"]},
+        **collected,
         "config": config,
     }
     picture = page.draw(made)
@@ -136,3 +137,9 @@ def write(study: Study) -> dict[str, Any]:
     atomic_write_text(study.out / STUDY_HTML, page.render(made, picture))
     atomic_write_json(study.out / STUDY_JSON, made)
     return made
+
+
+def _left_out(out: Path) -> dict[str, str]:
+    """Why which rows could not be made when they were last asked for."""
+    path = out / STUDY_JSON
+    return dict(read_json(path).get("left_out", {})) if path.exists() else {}

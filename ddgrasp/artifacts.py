@@ -268,6 +268,8 @@ def check_inputs(directory: Path | str, inputs: Mapping[str, str]) -> None:
     more is let pass, since what is finished does not need it."""
     path = Path(directory) / STARTED
     noted = _read_started(path)["inputs"] if path.exists() else {}
+    if noted and inputs and not noted.keys() & inputs.keys():  # made of a stage of the run, say
+        _check_same_inputs(directory, noted, inputs, "made")
     there = {
         name: value
         for name, value in noted.items()

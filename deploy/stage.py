@@ -15,7 +15,7 @@ from ddgrasp.progress import Progress
 from deploy.policy import POLICY_FILE
 from deploy.timing import Timings
 from deploy.trial_log import TrialLog
-from deploy.trials import ENDS, TrialResult, lasting, plan, run_trials, tried
+from deploy.trials import RULES, TrialResult, lasting, plan, run_trials, tried
 from rig.film import Film, contact_sheet
 
 STAGE = "deploy"
@@ -76,7 +76,7 @@ def _header(config: Config, policy_path: Path) -> dict[str, Any]:
         "config_hash": artifacts.config_hash(config, STAGE),
         "trial_s": contract.TRIAL_S,
         "objects": list(tried(config).world.objects),
-    } | ENDS
+    } | RULES
 
 
 def _keep_film(directory: Path, result: TrialResult, film: Film, progress: Progress) -> None:

@@ -102,8 +102,13 @@ def lasting(config: Config, seconds: float) -> Config:
 
 
 ENDS = {"ends": "with success, as judged then"}
-"""Header of a log of trials. Those of before 2026-11-25 were judged when their time was over; until the day
-after, trials that success had ended were judged again on the development rig a control period later."""
+"""Part of the header of a log of trials. Those of before 2026-11-25 were judged when their time was over;
+until a day later, trials that success had ended were judged again on the development rig a control period
+later."""
+RULES: dict[str, Any] = {"rules": 1} | ENDS
+"""What a trial is, besides policy, configuration and series: a log goes on by the rules that it began with.
+The number goes up with every change of loop, driver or rig that a trial can tell; before 2026-11-27 there
+was none."""
 
 
 Watch = Callable[[Step, Filmed], bool | None]

@@ -88,6 +88,8 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
     """
     if not names:
         raise UserError(f"--rows names none: give {EVERYTHING}, or of {', '.join(ROWS)}.")
+    if len(names) > 1 and EVERYTHING in names:
+        raise UserError(f"--rows {EVERYTHING} names every row: drop the others, or {EVERYTHING}.")
     asked = tuple(ROWS) if tuple(names) == (EVERYTHING,) else names
     for name in asked:
         if name not in ROWS:

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
+from ddgrasp import artifacts
 from ddgrasp.config import Config
+from ddgrasp.errors import UserError
 from ddgrasp.layout import OBSERVATION
 from ddgrasp.progress import Progress
 from deploy.changes import Change
@@ -41,13 +43,18 @@ class Seen:
 def measure(config: Config, run_dir: Path, series: Series, progress: Progress) -> list[dict[str, Any]]:
     """Rows of `tabulate`, with the policy in `run_dir`/export acting.
 
-    Raises UserError where the run has no exported policy.
+    Raises UserError where the run has no exported policy, or that of an earlier student.
     """
     from learning.params import load_params
     from student_jax.act import perceive
     from student_jax.policy import PARAMS_FILE
 
-    policy = run_dir / "export" / POLICY_FILE
+    exported, student = (artifacts.read_artifact(run_dir / name) for name in ("export", "student"))
+    if exported.manifest.parents.get("student", student.hash) != student.hash:
+        raise UserError(
+            f"{exported.directory} is of an earlier student: delete it, `ddgrasp export` it again."
+        )
+    policy = exported.directory / POLICY_FILE
     config = series.configured(config, policy)
     rig = Rig(config, policy, Change(sight="ideal" if series.camera == "ideal" else "stereo"))
     params = load_params(run_dir / "student" / PARAMS_FILE)

@@ -22,7 +22,7 @@ from deploy.recorded import RecordedBench, episode_folder
 from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
 from deploy.trial_log import TrialLog, read_log
-from deploy.trials import ENDS, Bench, Rig, Trial, TrialResult, lasting, run_trials
+from deploy.trials import RULES, Bench, Rig, Trial, TrialResult, lasting, run_trials
 from evaluation import failure_modes, wilson
 from evaluation.treatments import RECORDED, TreatmentName, make_treatment
 from rig import seeds
@@ -31,6 +31,8 @@ from rig.film import Film, contact_sheet
 RigName = Literal["development", "fr3"]
 TRIALS_FILE, TABLE_FILE, EPISODES = "trials.jsonl", "table.json", "episodes"
 EVERYTHING = "all"
+OF_THE_FR3 = ("shapes", "contact")
+"""What a header says of both rigs, and the development rig does not have."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,8 @@ class Series:
         if not self.objects:
             raise UserError(f"--objects names none: give names, or {EVERYTHING}.")
         known = self.known()
+        if len(self.objects) > 1 and EVERYTHING in self.objects:
+            raise UserError(f"--objects {EVERYTHING} names every object: drop the others, or {EVERYTHING}.")
         names = known if self.objects == (EVERYTHING,) else self.objects
         for name in names:
             if name not in known:
@@ -229,9 +233,9 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def made_with(config: Config, policy: Path) -> dict[str, str]:
+def made_with(config: Config, policy: Path) -> dict[str, Any]:
     """Policy, configuration and rule in the header of a log of trials."""
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),
-    } | ENDS
+    } | RULES

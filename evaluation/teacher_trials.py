@@ -67,12 +67,15 @@ def save(
 
 
 def load(directory: Path) -> list[dict[str, Any]]:
-    """The rows that `save` kept of the teacher now in `directory`; none if there are none of it."""
+    """The rows that `save` kept of the teacher now in `directory`, if it was tried in the world that it was
+    trained in, whatever the objects."""
     path = directory / TRIALS_FILE
     if not path.exists():
         return []
-    saved = read_json(path)
-    return saved["objects"] if saved["teacher"] == artifacts.read_artifact(directory).hash else []
+    saved, teacher = read_json(path), artifacts.read_artifact(directory)
+    here, there = teacher.manifest.config["world"], saved["world"]
+    alike = all(here[name] == there[name] for name in here.keys() & there.keys() - {"objects"})
+    return saved["objects"] if alike and saved["teacher"] == teacher.hash else []
 
 
 def print_summary(summary: Mapping[str, Any]) -> None:

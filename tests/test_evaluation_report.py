@@ -15,6 +15,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config, StudentConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import PICTURES, Progress
+from ddgrasp.stages import get_stage
 from evaluation import wilson
 from evaluation.report import figures
 from evaluation.report.comparison import differences
@@ -107,6 +108,24 @@ def test_an_incomplete_run_says_what_was_not_run(tmp_path):
     rows = summary_rows(build_report(tmp_path))
     assert rows[-1] == ("deploy", "", "", "not run")
     assert "student_rig" not in build_report(tmp_path)
+
+
+def test_what_an_earlier_parent_led_to_is_left_out(tmp_path):
+    made: dict[str, artifacts.Artifact] = {}
+    for name, metrics in METRICS.items():
+        parents = [made[parent] for parent in get_stage(name).parents]
+        about = {"seconds": 10, "metrics": metrics, "parents": parents}
+        made[name] = artifacts.finish(tmp_path / name, name, CONFIG, **about)
+    assert build_report(tmp_path)["outdated"] == {}
+    again = replace(
+        made["student"].manifest, metrics={"student_clean": {"success": {"successes": 0, "n": 7}}}
+    )
+    artifacts.write_manifest(tmp_path / "student", again)
+    report = build_report(tmp_path)
+    assert report["outdated"] == {"export": "student", "deploy": "export"}
+    assert "student_rig" not in report and report["student_clean"]["success"]["n"] == 7
+    rows = {row[0]: row[3] for row in summary_rows(report) if row[0]}
+    assert rows["export"] == "left out: made of an earlier student than is there now"
 
 
 def test_a_machine_too_slow_for_the_real_clock_is_said(tmp_path):

@@ -246,7 +246,9 @@ def test_a_study_without_trials_has_a_page(tmp_path):
 def test_both_rigs_and_splits_stand_apart(tmp_path):
     for series in (Series("development"), Series("fr3", split="test", number=3)):
         write_row(tmp_path, series, "ddg", {"apple": [True]})
-    assert list(results.collect(tmp_path)["sets"]) == ["development-development-0", "fr3-test-3"]
+    (tmp_path / results.TRIALS / ".DS_Store").touch()
+    sets = results.collect(tmp_path)["sets"]
+    assert list(sets) == ["development-development-0", "fr3-test-3"]
 
 
 # --- the command before anything runs ------------------------------------------------------------

@@ -138,6 +138,10 @@ def test_a_finished_stage_of_other_material_is_not_taken_for_this_one_s(stages, 
     assert make("a") == make("a")
     with pytest.raises(UserError, match="was made with other inputs: data is '.*/a' there, '.*/b' here"):
         make("b")
+    with pytest.raises(UserError, match="data is '.*/a' there, None here"):
+        pipeline.make(
+            stages[0], CONFIG, tmp_path / "run", resume=True, inputs={"recordings": tmp_path}, quiet=True
+        )
     (tmp_path / "a").rename(tmp_path / "moved")
     assert make("moved") == make("b")  # what is finished does not need it any more
 

@@ -1,6 +1,7 @@
 """Recorded episodes: the same number per object; moments and visible pixels by hand; files and report."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -96,8 +97,6 @@ def _no_camera_motion():
 
 def _nominal_params(env: GraspEnv):
     """Of a cube of nominal size."""
-    from dataclasses import replace
-
     params = env.reset(jax.random.PRNGKey(0)).info["episode"].params
     table = env.table
     return replace(
@@ -125,7 +124,8 @@ def test_moments_by_hand():
 def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     result, pictures = measured
     directory = tmp_path / "teacher"
-    artifact = artifacts.finish(directory, "teacher", Config(preset="mine"), seconds=1.0, metrics={})
+    config = Config(preset="mine", world=replace(WORLD, objects=("cube",)))
+    artifact = artifacts.finish(directory, "teacher", config, seconds=1.0, metrics={})
     summary = teacher_trials.summarise(result, artifact.hash, WORLD, seed=3)
     teacher_trials.save(directory, summary, pictures, MOMENTS)
     saved = json.loads((directory / teacher_trials.TRIALS_FILE).read_text())
@@ -137,14 +137,16 @@ def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     page = render_html(report, tmp_path)
     assert 'alt="episodes" src="data:image/png' in page
     assert "visible_object_pixels_min" in page
-    teacher_trials.save(directory, summary | {"teacher": "another"}, pictures, MOMENTS)
-    assert "trials" not in build_report(tmp_path)["teacher"]
+    elsewhere = {**summary["world"], "episode_steps": 25}
+    for change in ({"teacher": "another"}, {"world": elsewhere}):
+        teacher_trials.save(directory, summary | change, pictures, MOMENTS)
+        assert "trials" not in build_report(tmp_path)["teacher"]
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--world.objects", "cuba"], "cube"),
+        (["--world.objects", "cuba"], "Did you mean 'cube'"),
         (["--trials", "0"], "--trials is 0; expected at least 1."),
         (["--watched", "0"], "--watched is 0; expected at least 1."),
     ],

@@ -28,7 +28,7 @@ def render(result: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
     """The page: one file with tables and pictures."""
     body = [
         "<h1>Generated depth against recorded depth</h1>",
-        f"<p>{escape(result['setting'])} Intervals: 95 %, bootstrap over trajectories.</p>",
+        f"<p>{escape(result['setting'])} Intervals: 95 %, bootstrap over {escape(result['resampled'])}.</p>",
     ]
     for title, rows in _tables(summary(result)).items():
         columns = list(rows[0])

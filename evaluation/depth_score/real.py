@@ -25,6 +25,8 @@ SETTING = (
 )
 
 _FEWEST_BLOCKS = 2
+_FEW_BLOCKS = 10
+"""With fewer, drawing them again says little of other frames."""
 """On either side: resampling needs two."""
 
 
@@ -62,7 +64,10 @@ def run(job: Job) -> Artifact:
     episodes = score_data.real_episodes(frames, methods.needs_rgb)
     loads: list[Load] = [partial(lambda e: e, episode) for episode in episodes]
     text = SETTING.format(root=root.name, fit=fit_frames, score=score_frames)
-    return score_setting(replace(job, parents={"ddg": fitted}), text, methods, loads)
+    blocks = f"{len(frames.blocks)} runs of {2 * score_data.BLOCK_FRAMES} consecutive frames"
+    if len(frames.blocks) < _FEW_BLOCKS:
+        blocks += ", of which there are few: the true intervals are wider"
+    return score_setting(replace(job, parents={"ddg": fitted}), text, blocks, methods, loads)
 
 
 def _fit(job: Job, root: Path, fit_frames: int) -> Artifact:

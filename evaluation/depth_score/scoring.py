@@ -25,14 +25,19 @@ from evaluation.report.figures import draw_panels
 _EMBED_SEED = 0
 
 
-def score_setting(job: Job, text: str, methods: Methods, loads: Sequence[Load]) -> Artifact:
-    """Scores the episodes behind `loads`; `text` tells people what is compared. Ends the stage."""
+def score_setting(job: Job, text: str, resampled: str, methods: Methods, loads: Sequence[Load]) -> Artifact:
+    """Scores the episodes behind `loads`. Ends the stage.
+
+    Args:
+      text: what is compared, for people.
+      resampled: what an episode is, of which the bootstrap draws.
+    """
     config, directory, progress = job.config, job.directory, job.progress
     extractors = [score_features.load(name) for name in config.score.features]
     names = available_domains(methods)
     files = score_episodes(methods, extractors, loads, names, directory / "episodes", progress)
     scored = collect(files)
-    result = evaluate(scored, config, text, progress)
+    result = evaluate(scored, config, text, resampled, progress)
     result["features"] = {extractor.name: extractor.source for extractor in extractors}
     pictures = _draw(scored, result, config, progress)
     atomic_write_json(directory / JSON, _without_draws(result))
@@ -50,7 +55,7 @@ def available_domains(methods: Methods) -> list[str]:
     return names
 
 
-def evaluate(scored: Scored, config: Config, text: str, progress: Progress) -> dict[str, Any]:
+def evaluate(scored: Scored, config: Config, text: str, resampled: str, progress: Progress) -> dict[str, Any]:
     """All numbers: a table per extractor, hole-level figures, targets judged by the first extractor."""
     tables = {}
     for name in config.score.features:
@@ -59,6 +64,7 @@ def evaluate(scored: Scored, config: Config, text: str, progress: Progress) -> d
     samples = scored.features[config.score.features[0]]
     return {
         "setting": text,
+        "resampled": resampled,
         "maps": {name: len(sample.features) for name, sample in samples.items()},
         "tables": tables,
         "targets": score_table.targets(first),

@@ -27,4 +27,5 @@ def run(job: Job) -> Artifact:
     teacher, data = job.parents["teacher"].directory, job.directory / "data"
     files = score_data.record_rig(config, teacher, data, methods.needs_rgb, job.progress)
     loads = [partial(score_data.load_episode, file) for file in files]
-    return score_setting(job, SETTING.format(n=config.score.trajectories), methods, loads)
+    text = SETTING.format(n=config.score.trajectories)
+    return score_setting(job, text, "trajectories", methods, loads)

@@ -11,7 +11,7 @@ from evaluation.report.meanings import explain
 from evaluation.report.targets import targets, verdict
 
 COMPARISON_HTML, COMPARISON_PNG = "comparison.html", "comparison.png"
-_NO_RESULT = {"stages", "config", "machine", "versions", "created", "contract_version", "targets"}
+_NO_RESULT = {"stages", "outdated", "config", "machine", "versions", "created", "contract_version", "targets"}
 """Parts of a report that measure nothing."""
 Rows = list[tuple[str, ...]]
 

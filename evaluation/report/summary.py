@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp import artifacts, contract, cores
+from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
-from ddgrasp.stages import ON_REQUEST, STAGES
+from ddgrasp.stages import ON_REQUEST, STAGES, get_stage
 from evaluation import backends, perception_table, teacher_trials, wilson
 from evaluation.report.targets import MISSED, targets, verdict
 
@@ -26,21 +27,24 @@ def build_report(run_dir: Path) -> dict[str, Any]:
 
     Keys: `stages.<name>.{seconds, trained, loaded}`; `<name>` holds what that stage measured, except keys
     that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top; `machine`,
+    `outdated`, stages left out since they were made of an earlier parent than is there now -> its name;
     `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`; `targets`, each with what was
     measured and whether it is met. A success rate is {rate, n, successes, low, high}.
     `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows; `teacher.backends`, if `ddgrasp
     teacher compare` was, is `evaluation.backends.table`; `student.perception`, if `ddgrasp student
     perception` was, is `evaluation.perception.tabulate`.
     """
-    finished = {
-        stage.name: artifacts.read_manifest(run_dir / stage.name)
+    found = {
+        stage.name: artifacts.read_artifact(run_dir / stage.name)
         for stage in (*STAGES, *ON_REQUEST)
         if artifacts.is_finished(run_dir / stage.name)
     }
-    if not finished:
+    if not found:
         raise UserError(
             f"{run_dir} holds no finished stage: nothing to report. Start one with `ddgrasp run`."
         )
+    outdated = _outdated(found)
+    finished = {name: artifact.manifest for name, artifact in found.items() if name not in outdated}
     flow = [stage.name for stage in STAGES if stage.name in finished]
     latest = finished[flow[-1]] if flow else next(iter(finished.values()))
     report: dict[str, Any] = {
@@ -51,6 +55,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "machine": describe_machine(),
         "versions": latest.versions,
+        "outdated": outdated,
         "stages": {},
     }
     for name, manifest in finished.items():
@@ -74,6 +79,17 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     report["config"] = latest.config
     report["targets"] = targets(report)
     return report
+
+
+def _outdated(found: Mapping[str, Artifact]) -> dict[str, str]:
+    """Stages made of what is there no more -> the parent that was made again since."""
+    outdated: dict[str, str] = {}
+    for name, artifact in found.items():  # parents come first
+        for parent in get_stage(name).parents:
+            made_of = artifact.manifest.parents.get(parent)
+            if parent in outdated or (made_of and parent in found and found[parent].hash != made_of):
+                outdated[name] = parent
+    return outdated
 
 
 def with_intervals(value: Any) -> Any:
@@ -113,7 +129,9 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     for stage in (*STAGES[:-1], *asked_for, STAGES[-1]):
         entry = report["stages"].get(stage.name)
         if entry is None:
-            rows.append((stage.name, "", "", "not run"))
+            parent = report.get("outdated", {}).get(stage.name)
+            why = f"left out: made of an earlier {parent} than is there now" if parent else "not run"
+            rows.append((stage.name, "", "", why))
             continue
         section = report["config"].get(stage.name, {})
         start = section.get("start") or section.get("init_from", "")

@@ -14,13 +14,13 @@ from evaluation import failure_modes, paired, wilson
 from evaluation.report import success_chart
 from evaluation.report.comparison import COMPARISON_HTML, COMPARISON_PNG
 from evaluation.report.html import REPORT_HTML, contents, film, heading, image, page, table
-from evaluation.rig_trials import TRIALS_FILE, tabulate
+from evaluation.rig_trials import OF_THE_FR3, TRIALS_FILE, tabulate
 from evaluation.treatments import RECORDED
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
 _KINDS = ("rig", "row")
 """The header of a log has one of them: of `deploy trials`, or of `study causes`."""
-_SAME = ("rig", "shapes", "split", "number", "seconds", "ends")
+_SAME = ("rig", "shapes", "split", "number", "seconds", "ends", "rules")
 """What two series agree on where trial i of an object is the same trial."""
 _QUALITY = 75
 """The films' WebP takes a sixth of the PNG files that they are made from."""
@@ -132,7 +132,8 @@ def _settings(trials: Trials) -> list[tuple[str, str]]:
     said = {"trials": f"{sum(counts)}, {each}"}
     if "rig" in trials.belong_to:
         said["depth"] = RECORDED  # what the header leaves out
-    return [(name, str(value)) for name, value in (said | trials.belong_to).items()]
+    other = OF_THE_FR3 if trials.belong_to.get("rig") == "development" else ()
+    return [(name, str(value)) for name, value in (said | trials.belong_to).items() if name not in other]
 
 
 def _outcomes(trials: Trials) -> dict[tuple[int, str], bool]:
