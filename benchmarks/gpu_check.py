@@ -55,6 +55,8 @@ class Sizes:
     """Drawn by every renderer and compared."""
     teacher: dict[str, Any]
     """Fields of TeacherConfig that differ from the presets'."""
+    evaluations: int
+    """Episodes of each evaluation of a teacher."""
     preset: str
     """Whose generator and student are timed."""
     training_steps: int
@@ -72,6 +74,7 @@ GPU = Sizes(
     frame_pixels=2**26,
     scenes=48,
     teacher={"total_steps": 20_000_000, "num_envs": 4096, "minibatches": 16, "eval_every": 2},
+    evaluations=256,
     preset="paper",
     training_steps=50,
     slack=1.0,
@@ -88,6 +91,7 @@ CPU = Sizes(
         "total_steps": 64, "num_envs": 8, "unroll_steps": 4, "minibatches": 2, "epochs": 1, "eval_every": 1,
         "critic_warmup": 0, "hidden": (8,), "clone_envs": 4, "clone_steps": 2,
     },
+    evaluations=8,
     preset="debug",
     training_steps=3,
     slack=5.0,
@@ -272,7 +276,8 @@ def _teacher(sizes: Sizes, save: Save, teacher: TeacherConfig) -> Iterator[str]:
     from ppo.train import train
 
     world = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics[0])
-    config = replace(LAPTOP, world=world, teacher=teacher)
+    evaluation = replace(LAPTOP.evaluation, teacher_trials=sizes.evaluations)
+    config = replace(LAPTOP, world=world, teacher=teacher, evaluation=evaluation)
     save(start=teacher.start, num_envs=teacher.num_envs)
     evaluations: list[dict[str, float]] = []
     start = time.monotonic()

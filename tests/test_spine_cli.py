@@ -1,6 +1,7 @@
 """The command line as a person meets it: in a process of its own."""
 
 import dataclasses
+import json
 import os
 import subprocess
 import sys
@@ -129,26 +130,40 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("args", "expected"), WRONG)
-def test_wrong_input_gets_one_line_and_status_2(args, expected):
+OF_THE_SYSTEM = ("teacher", "train", "--out", "/proc/a")
+"""Told when the folder is made."""
+
+
+@pytest.mark.parametrize(
+    ("args", "expected"), [(args, text) for args, text in WRONG if args == OF_THE_SYSTEM]
+)
+def test_what_the_system_refuses_gets_one_line_and_status_2(args, expected):
     result = ddgrasp(*args)
     assert result.returncode == 2
     assert expected in _one_error_line(result)
-    assert not (ROOT / "nowhere").exists()
 
 
-def test_wrong_input_is_told_before_jax_is_imported():
+def test_wrong_input_gets_one_line_and_status_2_before_jax_is_imported():
     """JAX and MJX take as many seconds as a person waits for the line."""
-    of_the_system = ("teacher", "train", "--out", "/proc/a")  # told when the folder is made
-    given = [args for args, _ in WRONG if args != of_the_system]
+    given = [(args, text) for args, text in WRONG if args != OF_THE_SYSTEM]
     code = f"""
-import sys
+import contextlib, io, json, sys
 from app.cli import main
-print([main(args) for args in {given}])
-print({{"jax", "mujoco.mjx"}} & set(sys.modules) or "NOTHING HEAVY")
+told = []
+for args in {[args for args, _ in given]}:
+    said, printed = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(printed):
+        status = main(args)
+    told.append((status, said.getvalue(), printed.getvalue()))
+print(json.dumps([told, sorted({{"jax", "mujoco.mjx"}} & set(sys.modules))]))
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert done.stdout.splitlines() == [str([2] * len(given)), "NOTHING HEAVY"], done.stderr
+    assert done.returncode == 0, done.stderr
+    told, heavy = json.loads(done.stdout)
+    assert len(told) == len(given) and heavy == []
+    for (args, expected), (status, said, printed) in zip(given, told, strict=True):
+        assert status == 2 and printed == "" and said.count("\n") == 1 and expected in said, (args, said)
+    assert not (ROOT / "nowhere").exists()
 
 
 def test_a_later_stage_of_another_configuration_is_told_before_jax_is_imported(tmp_path):

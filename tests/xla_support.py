@@ -1,7 +1,9 @@
 """How XLA compiles in tests."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
+from typing import Any
 
 import jax
 
@@ -18,3 +20,14 @@ def optimized() -> Iterator[None]:
         yield
     finally:
         jax.config.update(_FLAG, before)
+
+
+def optimizing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, compiled with all of XLA's optimisations where it is called first."""
+
+    @wraps(function)
+    def called(*args: Any, **kwargs: Any) -> Any:
+        with optimized():
+            return function(*args, **kwargs)
+
+    return called
