@@ -153,18 +153,19 @@ def test_the_card_says_what_is_in_it(tmp_path):
     assert (
         steps.POSE in text
         and f"`{steps.COLOUR}`" not in text
-        and "held" not in text.split("##")[0].split("* ")
+        and "**Held**" not in text
         and "control periods" not in text
     )
 
 
-def test_the_card_counts_what_the_loop_missed(tmp_path):
-    write_deployment(tmp_path / "late", missed_deadlines=2)
+def test_the_card_counts_what_the_loop_missed_and_held(tmp_path):
+    write_deployment(tmp_path / "late", held=(1, 2), missed_deadlines=2)
     source = open_source(tmp_path)
     contents = card.Contents(keys=tuple(steps.features(SIZE, SIZE, False, "video")))
     contents.count(source.episodes[0](), 0)
     how = {"name": "set", "storage": "video", "licence": "cc-by-4.0", "command": "ddgrasp demos export x"}
-    assert "**Time**: 2 control periods passed without a step" in card.render(source, contents, **how)
+    text = card.render(source, contents, **how)
+    assert "**Time**: 2 control periods passed without a step" in text and "**Held**: in 2 steps" in text
 
 
 def test_what_stands_there_is_not_touched(tmp_path, monkeypatch):

@@ -5,6 +5,8 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -110,18 +112,29 @@ def test_a_spool_gives_back_whole_episodes(tmp_path):
 
 
 def test_prefetched_batches_come_in_order_one_at_a_time_and_none_beyond_the_end():
-    made, at_once = [], threading.Lock()
+    made, at_once, begun = [], threading.Lock(), {step: threading.Event() for step in range(9)}
 
     def make(step: int) -> int:
-        assert at_once.acquire(blocking=False)
-        made.append(step)
-        at_once.release()
+        with at_once_or_fail(at_once):
+            begun[step].set()
+            time.sleep(0.01)
+            made.append(step)
         return 10 * step
 
     with Prefetched(make, 9) as batches:
-        assert [batches(step) for step in range(3, 9)] == [30, 40, 50, 60, 70, 80]
+        for step in range(3, 9):
+            assert batches(step) == 10 * step
+            assert step == 8 or begun[step + 1].wait(10.0), "ahead of the step that takes it"
     assert made == [3, 4, 5, 6, 7, 8]
-    assert AHEAD >= 1
+
+
+@contextmanager
+def at_once_or_fail(lock: threading.Lock):
+    assert lock.acquire(blocking=False), "two at once"
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def test_what_making_a_batch_raises_reaches_the_step_that_wanted_it():

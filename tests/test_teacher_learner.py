@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -91,17 +92,39 @@ def test_saved_policy_acts_as_braxs_deterministic_policy(uninterrupted, tmp_path
     np.testing.assert_allclose(ours(obs), theirs(jnp.asarray(obs), jax.random.PRNGKey(0))[0], atol=1e-5)
 
 
-def test_warm_start_takes_the_policy(uninterrupted, tmp_path):
+def test_warm_start_takes_the_policy_and_its_normaliser_alone(uninterrupted, tmp_path):
     teacher_policy.save(
         tmp_path / teacher_policy.PARAMS_FILE, uninterrupted.normalizer, uninterrupted.params.policy
     )
     saved = teacher_policy.load_state(tmp_path)
-    started = learner.warm_start(uninterrupted, saved)
-    for a, b in zip(
-        jax.tree.leaves(started.params.policy), jax.tree.leaves(uninterrupted.params.policy), strict=True
-    ):
-        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    other = _scaled(uninterrupted, 2.0)
+    fresh = replace(other, normalizer=replace(other.normalizer, mean=other.normalizer.mean + 1.0))
+    started = learner.warm_start(fresh, saved)
+    jax.tree.map(np.testing.assert_array_equal, started.params.policy, uninterrupted.params.policy)
+    jax.tree.map(np.testing.assert_array_equal, started.params.value, fresh.params.value)
+    for name in ("mean", "std"):
+        kept = getattr(uninterrupted.normalizer, name)
+        np.testing.assert_array_equal(getattr(started.normalizer, name), kept)
     learner.check_start(TEACHER, saved)
+
+
+def _scaled(state: learner.LearnerState, factor: float) -> learner.LearnerState:
+    """`state` with another policy and value network."""
+    return replace(state, params=jax.tree.map(lambda leaf: factor * leaf, state.params))
+
+
+def test_the_best_policy_is_kept_the_later_of_equals_and_after_a_resume(uninterrupted, tmp_path):
+    def kept() -> float:
+        layer = teacher_policy.load_state(tmp_path)["layers"]["hidden_0"]["kernel"]
+        return float(np.median(layer / uninterrupted.params.policy["params"]["hidden_0"]["kernel"]))
+
+    best = ppo_train._Best(tmp_path)
+    for factor, (rate, expected) in enumerate(((0.5, 1), (0.7, 2), (0.6, 2), (0.7, 4)), 1):
+        best.offer(rate, _scaled(uninterrupted, factor))
+        assert kept() == pytest.approx(expected), rate
+    resumed = ppo_train._Best(tmp_path)
+    resumed.offer(0.65, _scaled(uninterrupted, 9.0))
+    assert kept() == pytest.approx(4)
 
 
 def test_a_start_with_other_layers_is_refused_before_any_work(tmp_path):
