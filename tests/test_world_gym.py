@@ -103,14 +103,14 @@ def test_without_autoreset_chosen_environments_begin_anew():
 
 
 def test_the_camera_is_drawn_apart_from_the_object():
-    env = gymnasium.make_vec(ID, num_envs=48, vectorization_mode="vector_entry_point", world=WORLD)
+    env = gymnasium.make_vec(ID, num_envs=256, vectorization_mode="vector_entry_point", world=WORLD)
     env.reset(seed=0)
     scenes = env.unwrapped._scenes
     episode = scenes.state.info["episode"]
     cubes = np.asarray(episode.object_index) == 0
     size = np.asarray(episode.rest_height)[cubes]
     for axis in np.asarray(scenes.T_world_cam)[cubes, :3, 3].T:
-        assert abs(np.corrcoef(size, axis)[0, 1]) < 0.6  # 1 where one key draws both
+        assert abs(np.corrcoef(size, axis)[0, 1]) < 0.35  # 1 where one key draws both
 
 
 def test_a_seed_may_be_a_number_of_numpy():
