@@ -67,6 +67,12 @@ def test_commands_on_a_page_can_be_given(page: str):
     assert wrong == {}
 
 
+def test_the_pages_commands_are_found():
+    """Fences of another spelling would be looked past."""
+    found = [command for page in PAGES for command in shown(page)[0]]
+    assert len(found) > 100
+
+
 def test_a_command_that_does_not_exist_is_found():
     assert "unknown command" in refusal("ddg paint")
     assert "--bogus" in refusal("run --bogus 3")
