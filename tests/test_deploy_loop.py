@@ -12,8 +12,9 @@ import pytest
 from ddgrasp.errors import UserError
 from deploy.clock import RealClock, SimClock
 from deploy.dry_run import DryRun
+from deploy.interfaces import RobotError
 from deploy.kinematics import grip_position
-from deploy.loop import ControlLoop, LoopSettings
+from deploy.loop import KEPT_EVENTS, ControlLoop, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.safety import SafetyFilter, SafetyLimits
 from deploy_support import (
@@ -283,3 +284,69 @@ def test_report_is_plain_json(tmp_path):
     assert values["steps"] == 3 and values["holds"] == 2
     assert set(values["latency_ms"]) == {"p50", "p99"} and values["latency_ms"]["p50"] > 0
     assert values["safety"]["commands"] == 1
+
+
+@pytest.mark.parametrize(
+    ("fails_at", "script", "calls"),
+    [
+        ("read_state", [depth_mm()], ["start", "command", "stop"]),
+        ("command", [depth_mm()], ["start", "command", "stop"]),
+        ("hold", [depth_mm(), "unplugged"], ["start", "command", "stop"]),
+        ("stop", [depth_mm()], ["start", *["command"] * 5]),
+    ],
+)
+def test_a_robot_that_fails_ends_the_run_with_its_words_and_nothing_more_is_told_to_it(
+    tmp_path, monkeypatch, fails_at, script, calls
+):
+    loop, robot, camera = make_loop(tmp_path, script)
+    sound, count = getattr(robot, fails_at), []
+
+    def failing(*args):
+        count.append(fails_at)
+        if fails_at in ("read_state", "command") and len(count) == 1:
+            return sound(*args)
+        raise RobotError(f"{fails_at}: the arm stopped itself")
+
+    monkeypatch.setattr(robot, fails_at, failing)
+    report = loop.run(max_steps=5)
+    assert report.fault == f"{fails_at}: the arm stopped itself"
+    assert robot.calls == calls and camera.stopped
+    assert report.events[-1].kind == "fault" and not report.interrupted
+
+
+def test_of_two_failures_the_first_is_the_fault(tmp_path, monkeypatch):
+    loop, robot, camera = make_loop(tmp_path, [depth_mm()])
+
+    def fail(name):
+        def failing(*args):
+            raise RobotError(name)
+
+        monkeypatch.setattr(robot, name, failing)
+
+    fail("command")
+    fail("stop")
+    report = loop.run(max_steps=5)
+    assert report.fault == "command" and camera.stopped
+    assert [event.reason for event in report.events] == ["command", "stop"]
+
+
+def test_an_arm_that_does_not_hold_after_ctrl_c_is_said_and_stopped(tmp_path, monkeypatch):
+    loop, robot, camera = make_loop(tmp_path, [depth_mm()])
+
+    def held():
+        raise RobotError("no answer")
+
+    def interrupt(step):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(robot, "hold", held)
+    report = loop.run(max_steps=5, on_step=interrupt)
+    assert report.interrupted and report.fault == "no answer"
+    assert robot.calls == ["start", "command", "stop"] and camera.stopped
+
+
+def test_events_beyond_those_kept_are_counted(tmp_path):
+    script = [depth_mm(), "unplugged"] * (KEPT_EVENTS + 5)
+    loop, *_ = make_loop(tmp_path, script)
+    report = loop.run(max_steps=len(script))
+    assert len(report.events) == KEPT_EVENTS and report.events_dropped > 5
