@@ -332,6 +332,56 @@ def test_a_hand_that_fails_leaves_an_arm_that_is_told_to_brake(error, said):
     assert spring.told == ["stay", "stop", "release"]
 
 
+def _connected(**arm) -> FrankaRobot:
+    """A driver at whose other end is an arm that has these attributes."""
+    franky = pytest.importorskip("franky", reason="needs pip install -e '.[franka]'")
+    robot = FrankaRobot(FrankaConfig(host="127.0.0.9"), SimClock(), None)
+    robot._franky, robot._arm = franky, SimpleNamespace(**arm)
+    robot._errors, robot._lost_by = (franky.Exception, RuntimeError), (franky.NetworkException, RuntimeError)
+    return robot
+
+
+def test_an_arm_that_a_person_has_stopped_is_left_alone():
+    franky = pytest.importorskip("franky", reason="needs pip install -e '.[franka]'")
+    robot = _connected(state=SimpleNamespace(robot_mode=franky.RobotMode.UserStopped))
+    with pytest.raises(UserError, match="'127.0.0.9' is stopped by a person: release the stop"):
+        robot._prepare()
+
+
+def test_an_arm_that_does_not_recover_is_named_with_its_error(monkeypatch):
+    franky = pytest.importorskip("franky", reason="needs pip install -e '.[franka]'")
+    monkeypatch.setattr(franka_robot, "RECOVERY_S", 0.0)
+
+    class Errors:
+        def __repr__(self) -> str:
+            return '["joint_reflex"]'
+
+    robot = _connected(
+        state=SimpleNamespace(robot_mode=franky.RobotMode.Reflex, current_errors=Errors()),
+        recover_from_errors=lambda: False,
+        has_errors=True,
+    )
+    with pytest.raises(UserError, match="does not recover from joint_reflex: look at it, clear the error"):
+        robot._prepare()
+
+
+def test_an_arm_that_is_held_up_on_its_way_to_the_start_is_given_up(monkeypatch):
+    monkeypatch.setattr(franka_robot, "_POLL_S", 0.0)
+    seconds = iter(np.arange(0.0, 10 * franka_robot.START_S, 1.0))
+
+    class State:
+        q = np.asarray(HOME_RAD) + 2 * franka_robot.AT_START_RAD
+
+        @property
+        def time(self):
+            return SimpleNamespace(to_sec=lambda: next(seconds))
+
+    robot = _connected(state=State(), poll_motion=lambda: None)
+    with pytest.raises(UserError, match="is not at its start pose after .* s: see what holds it"):
+        robot._wait_at_start()
+    assert next(seconds) < franka_robot.START_S + 4
+
+
 @pytest.mark.parametrize(
     ("module", "start", "extra"),
     [
