@@ -2,8 +2,25 @@
 
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
+
+
+def terminable() -> AbstractContextManager[None]:
+    """The first SIGTERM, Ctrl-C or hang-up is KeyboardInterrupt; a second one does not cut stopping short."""
+
+    def interrupt(signum: int, frame: Any) -> None:
+        for number in _ending():
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    return _handled_by(interrupt)
+
+
+def unbroken() -> AbstractContextManager[None]:
+    """Ctrl-C, SIGTERM and hang-ups change nothing: what ends anyway, as stopping an arm, comes to its end."""
+    return _handled_by(signal.SIG_IGN)
 
 
 def _ending() -> list[signal.Signals]:
@@ -13,36 +30,14 @@ def _ending() -> list[signal.Signals]:
 
 
 @contextmanager
-def terminable() -> Iterator[None]:
-    """The first SIGTERM, Ctrl-C or hang-up is KeyboardInterrupt; a second one does not cut stopping short."""
+def _handled_by(handler: Callable[[int, Any], Any] | signal.Handlers) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # signals are someone else's
         yield
         return
     ending = _ending()
-
-    def interrupt(signum, frame):
-        for number in ending:
-            signal.signal(number, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    previous = [signal.signal(number, interrupt) for number in ending]
+    previous = [signal.signal(number, handler) for number in ending]
     try:
         yield
     finally:
-        for number, handler in zip(ending, previous, strict=True):
-            signal.signal(number, handler)
-
-
-@contextmanager
-def unbroken() -> Iterator[None]:
-    """Ctrl-C, SIGTERM and hang-ups change nothing: what ends anyway, as stopping an arm, comes to its end."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    ending = _ending()
-    previous = [signal.signal(number, signal.SIG_IGN) for number in ending]
-    try:
-        yield
-    finally:
-        for number, handler in zip(ending, previous, strict=True):
-            signal.signal(number, handler)
+        for number, before in zip(ending, previous, strict=True):
+            signal.signal(number, before)

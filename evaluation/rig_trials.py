@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,8 +31,6 @@ from rig.film import Film, contact_sheet
 RigName = Literal["development", "fr3"]
 TRIALS_FILE, TABLE_FILE, EPISODES = "trials.jsonl", "table.json", "episodes"
 EVERYTHING = "all"
-OF_THE_FR3 = ("shapes", "contact")
-"""What a header says of both rigs, and the development rig does not have."""
 
 
 @dataclass(frozen=True)
@@ -231,6 +229,12 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     return made_with(config, policy) | bench | {
         "contact": deploy.franka.contact_force_n, "retry": deploy.retry,
     }  # fmt: skip
+
+
+def shown(header: Mapping[str, Any]) -> dict[str, Any]:
+    """What a log's header tells people: not of the FR3's meshes and thresholds where the rig has neither."""
+    other = ("shapes", "contact") if header.get("rig") == "development" else ()
+    return {name: value for name, value in header.items() if name not in other}
 
 
 def made_with(config: Config, policy: Path) -> dict[str, Any]:

@@ -32,48 +32,54 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
         if unknown := next((name for name in objects if name not in noted), None):
             raise unknown_name("object", unknown, noted)
         found = [deployment for deployment in found if deployment.report.get(OBJECT) in objects]
-    reasons = {deployment.folder: _unusable(deployment) for deployment in found}
-    usable = [deployment for deployment in found if not reasons[deployment.folder]]
-    left_out = [f"{folder.name}: {reason}" for folder, reason in reasons.items() if reason]
+    usable, left_out = {}, []
+    for deployment in found:
+        try:
+            usable[deployment.folder] = deployment, _pictures(deployment)
+        except UserError as error:
+            left_out.append(f"{deployment.folder.name}: {error}")
     if not usable:
         raise UserError(f"{found[0].folder.parent}: no episode can be used ({'; '.join(left_out)}).")
+    taken = [deployment for deployment, _ in usable.values()]
     about = {
-        "Robot": f"Franka arm; driver or rig: {_each(usable, 'robot')}.",
-        "Camera": f"{_each(usable, 'camera')}, across the table; its depth is raw, with its holes and noise.",
-        "How it was made": f"A depth-only policy ({_each(usable, 'policy')}) moved the arm. `action` is what "
+        "Robot": f"Franka arm; driver or rig: {_each(taken, 'robot')}.",
+        "Camera": f"{_each(taken, 'camera')}, across the table; its depth is raw, with its holes and noise.",
+        "How it was made": f"A depth-only policy ({_each(taken, 'policy')}) moved the arm. `action` is what "
         "it asked for, before the safety filter, or what a slow arm lacked of that. Success is what the rig "
         "knows or a person answered.",
     }
-    return Source("deployments", "franka", about, [partial(_read, each) for each in usable], left_out)
+    return Source(
+        "deployments", "franka", about, [partial(_read, *each) for each in usable.values()], left_out
+    )
 
 
 def _each(deployments: Sequence[Deployment], key: str) -> str:
     return ", ".join(dict.fromkeys(str(deployment.report.get(key, "unknown")) for deployment in deployments))
 
 
-def _unusable(deployment: Deployment) -> str:
-    """Why it is no episode; empty if it is one."""
+def _pictures(deployment: Deployment) -> Recording:
+    """One for every step. UserError with the reason where it is no episode."""
     report = deployment.report
     if report["success"] is None:
-        return 'nobody judged it: set "success" in its report.json'
+        raise UserError('nobody judged it: set "success" in its report.json')
     if not report["steps"] or report["frames"] != report["steps"]:
         lacks = f"{report['frames']} pictures for {report['steps']} steps"
-        return f"{lacks}: on a rig deploy with --deploy.film-every 1"
+        raise UserError(f"{lacks}: on a rig deploy with --deploy.film-every 1")
     if not is_recording(deployment.folder):
-        return "its pictures are gone"
-    try:
-        return Recording.open(deployment.folder).skipped_summary()
-    except UserError as error:
-        return str(error)
+        raise UserError("its pictures are gone")
+    recording = Recording.open(deployment.folder)
+    if recording.skipped:
+        raise UserError(recording.skipped_summary())
+    return recording
 
 
-def _read(deployment: Deployment) -> Episode:
+def _read(deployment: Deployment, recording: Recording) -> Episode:
     folder = deployment.folder
     rows = _steps(folder / STEPS_FILE)
-    recording = Recording.open(folder)
     if len(recording) != len(rows):
-        why = recording.skipped_summary() or f"{len(recording)} pictures for {len(rows)} steps"
-        raise UserError(f"{folder} is damaged ({why}): move it elsewhere.")
+        raise UserError(
+            f"{folder} is damaged ({len(recording)} pictures for {len(rows)} steps): move it elsewhere."
+        )
 
     def pictures() -> Iterator[Picture]:
         for rgb, depth_mm in recording.frames():

@@ -27,9 +27,9 @@ def build_report(run_dir: Path) -> dict[str, Any]:
 
     Keys: `stages.<name>.{seconds, trained, loaded}`; `<name>` holds what that stage measured, except keys
     that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top; `machine`,
-    `outdated`, stages left out since they were made of an earlier parent than is there now -> its name;
     `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`; `targets`, each with what was
-    measured and whether it is met. A success rate is {rate, n, successes, low, high}.
+    measured and whether it is met; `outdated.<name>`, the parent that was made again since that stage, which
+    is left out. A success rate is {rate, n, successes, low, high}.
     `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows; `teacher.backends`, if `ddgrasp
     teacher compare` was, is `evaluation.backends.table`; `student.perception`, if `ddgrasp student
     perception` was, is `evaluation.perception.tabulate`.

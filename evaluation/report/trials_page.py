@@ -14,7 +14,7 @@ from evaluation import failure_modes, paired, wilson
 from evaluation.report import success_chart
 from evaluation.report.comparison import COMPARISON_HTML, COMPARISON_PNG
 from evaluation.report.html import REPORT_HTML, contents, film, heading, image, page, table
-from evaluation.rig_trials import OF_THE_FR3, TRIALS_FILE, tabulate
+from evaluation.rig_trials import TRIALS_FILE, shown, tabulate
 from evaluation.treatments import RECORDED
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
@@ -132,8 +132,7 @@ def _settings(trials: Trials) -> list[tuple[str, str]]:
     said = {"trials": f"{sum(counts)}, {each}"}
     if "rig" in trials.belong_to:
         said["depth"] = RECORDED  # what the header leaves out
-    other = OF_THE_FR3 if trials.belong_to.get("rig") == "development" else ()
-    return [(name, str(value)) for name, value in (said | trials.belong_to).items() if name not in other]
+    return [(name, str(value)) for name, value in (said | shown(trials.belong_to)).items()]
 
 
 def _outcomes(trials: Trials) -> dict[tuple[int, str], bool]:

@@ -19,7 +19,7 @@ from deploy.trial_log import read_log
 from deploy.trials import TrialResult
 from evaluation import paired, rig_trials
 from evaluation.report.summary import with_intervals
-from evaluation.rig_trials import OF_THE_FR3, Series
+from evaluation.rig_trials import Series
 from evaluation.table2.rows import DEPLOYED, ROWS, TABLES, TRAINING, Row, Table
 
 SHARED, PAPER, STUDENTS, TRIALS = "shared", "paper", "students", "trials"
@@ -94,9 +94,8 @@ def _set(folder: Path) -> dict[str, Any]:
     }
     belong_to = next((logs[name][0] for name in tried), {})
     same = ("rig", "split", "number", "shapes", "camera", "seconds", "contact")
-    other = OF_THE_FR3 if belong_to.get("rig") == "development" else ()
     return {
-        "trials": {key: belong_to[key] for key in same if key in belong_to and key not in other},
+        "trials": {key: value for key, value in rig_trials.shown(belong_to).items() if key in same},
         "rows": {name: rig_trials.tabulate(results) for name, results in tried.items()},
         "tables": {name: compare(table, tried) for name, table in TABLES.items()},
     }

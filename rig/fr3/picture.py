@@ -119,8 +119,7 @@ def _slopes(
     planes: Sequence[Float32[np.ndarray, "H W"]], geoms: Int32[np.ndarray, "H W"], axis: int
 ) -> list[Float32[np.ndarray, "H W"]]:
     """Along an axis of the picture: the sums of the differences to both neighbours, but to other geoms."""
-    lower, upper = ([slice(None)] * axis + [part] for part in (slice(-1), slice(1, None)))
-    lower, upper = tuple(lower), tuple(upper)
+    lower, upper = ((slice(None),) * axis + (part,) for part in (slice(-1), slice(1, None)))
     alike = geoms[upper] == geoms[lower]
     slopes = [np.zeros_like(plane) for plane in planes]
     for plane, slope in zip(planes, slopes, strict=True):
