@@ -11,7 +11,7 @@ import pytest
 
 from app import cli
 from ddgrasp import artifacts, contract
-from ddgrasp.config import Config, WorldConfig
+from ddgrasp.config import Config, PictureConfig, StudentConfig, WorldConfig
 from ddgrasp.progress import Progress
 from evaluation import teacher_trials
 from evaluation.report.run_page import render_html
@@ -124,7 +124,8 @@ def test_moments_by_hand():
 def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     result, pictures = measured
     directory = tmp_path / "teacher"
-    config = Config(preset="mine", world=replace(WORLD, objects=("cube",)))
+    student = StudentConfig(picture=PictureConfig(height_px=56, width_px=72))
+    config = Config(preset="mine", world=replace(WORLD, objects=("cube",)), student=student)
     artifact = artifacts.finish(directory, "teacher", config, seconds=1.0, metrics={})
     summary = teacher_trials.summarise(result, artifact.hash, WORLD, seed=3)
     teacher_trials.save(directory, summary, pictures, MOMENTS)
