@@ -8,14 +8,14 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 12
+VERSION = 13
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
 edges. 6: demos are trained on from their beginning. 7: a student leaves holes as they are. 8: a
 generator does not know where in the picture it is. 9: the policy alone acts in the loop. 10: a Franka's hand
 comes down at any speed; what was made then comes down slowly too, since no run has an arm. 11: a Franka
-gives way to nothing before it stops itself; the same."""
+gives way to nothing before it stops itself; the same. 12: formulas have one strength."""
 
 VERSION_FIELD = "manifest_version"
 
@@ -119,6 +119,7 @@ _ADDED_AFTER: dict[int, dict[str, Any]] = {
     9: {"deploy.retry": False},
     10: {"deploy.franka.approach_m_s": 0.06, "deploy.franka.approach_below_m": 0.16},
     11: {"deploy.franka.give_way": 0.5},
+    12: {"student.dextrah_scale": 1.0},
 }
 """Version -> the fields that it lacked and the next one has, with what it did (10, 11: what is done now)."""
 

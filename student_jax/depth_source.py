@@ -20,7 +20,7 @@ from ddg_jax.generate import Clip, by_frames, made_mm, noisy_episodes
 from ddg_jax.monocular import MonocularDepth
 from ddg_jax.sample import Generator, generate
 from ddg_jax.sensor import make_sensor
-from ddgrasp.config import BY_COLOUR, Config, SensorConfig
+from ddgrasp.config import BY_COLOUR, Config, DextrahConfig, SensorConfig
 from ddgrasp.depth import to_metres, to_millimetres
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
@@ -197,7 +197,8 @@ def make_source(config: Config, ddg: Path) -> DepthSource:
         return MonocularSource(MonocularDepth(config.ddg))
     if name == "rig":
         return RigSource(config)
-    sensor = SensorConfig(name=name, stereo=config.record.stereo)
+    formulas = DextrahConfig().scaled(config.student.dextrah_scale)
+    sensor = SensorConfig(name=name, stereo=config.record.stereo, dextrah=formulas)
     return SenseSource(make_sensor(sensor, config.world.profile), key, name in BY_COLOUR)
 
 

@@ -154,7 +154,7 @@ def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
 def test_rows_are_chosen_by_name_or_by_table():
     assert rows.chosen((), ("main",)) == TABLES["main"].rows
     assert rows.chosen(("ddg", "sim_gt", "ddg"), ("main",)) == ("ddg", "sim_gt")
-    assert set(rows.chosen((), ("main", "ripple", "filled", "grafting"))) == set(ROWS)
+    assert set(rows.chosen((), ("main", "ripple", "filled", "formulas", "grafting"))) == set(ROWS)
     with pytest.raises(UserError, match=r"--table names none, and --rows neither: give tables \(main"):
         command("--table").planned()
 

@@ -148,6 +148,26 @@ def test_dextrah_rates():
     assert np.mean((noisy > 0) & (np.abs(noisy - 0.8) > 0.03)) == pytest.approx(0.0098, abs=0.0015)
 
 
+def test_formulas_scaled_are_as_noisy_in_a_larger_picture_of_the_same_wall():
+    strengths, wide = DextrahConfig(dropout=0.0, random_value=0.0), D455.scaled(0.25)
+
+    def noisy(config, profile):
+        wall = jnp.full((8, profile.height_px, profile.width_px), 0.8)
+        return np.asarray(procedural.dextrah(config, profile)(jax.random.key(0), wall, None))
+
+    def deviation(noisy):
+        return noisy[np.abs(noisy - 0.8) < 0.03].std()
+
+    small, unscaled = (noisy(strengths, profile) for profile in (PROFILE, wide))
+    large = noisy(strengths.scaled(2.0), wide)
+    assert deviation(large) == pytest.approx(deviation(small), rel=0.05)
+    assert deviation(unscaled) == pytest.approx(deviation(small) / 2, rel=0.05)
+    # As much of a picture is covered by sticks.
+    covered = [np.mean(np.abs(seen - 0.8) > 0.03) for seen in (small, large)]
+    assert covered[1] == pytest.approx(covered[0], rel=0.25) and covered[0] > 0.002
+    assert strengths.scaled(1.0) == strengths
+
+
 def test_sticks_have_the_expected_number_and_one_depth_each():
     config = DextrahConfig(stick=0.001, random_near_m=3.0, random_far_m=4.0)
     pictures = [

@@ -157,6 +157,19 @@ def test_dextrah_loses_and_replaces_the_expected_shares(demos, tmp_path):
     assert np.mean(seen != clean) > 0.3
 
 
+def test_a_student_s_formulas_take_its_scale(demos):
+    def deviation(settings):
+        numbers = np.arange(6)
+        clean = demos.steps("depth_mm")[:6]
+        seen = make_source(settings, Path()).frames(clean, None, numbers, numbers)
+        off = seen.astype(int) - clean
+        return off[(seen > 0) & (np.abs(off) < 60)].std()
+
+    once = with_source("dextrah")
+    twice = replace(once, student=replace(once.student, dextrah_scale=2.0))
+    assert deviation(twice) == pytest.approx(2 * deviation(once), rel=0.2)
+
+
 def test_the_clean_share_keeps_clean_depth_whatever_the_source(demos, tmp_path):
     settings = with_source("dextrah", clean_share=1.0)
     seen = training_depth(settings, make_source(settings, tmp_path), demos, tmp_path)

@@ -128,6 +128,13 @@ class DextrahConfig(Section, name="sensor.dextrah"):
         if self.random_near_m > self.random_far_m:
             raise self.error("random_near_m", f"at most random_far_m, {self.random_far_m}")
 
+    def scaled(self, scale: float) -> "DextrahConfig":
+        """The same noise for a picture `scale` times as wide of the same scene: lengths and disparities grow
+        with it, as many sticks fall on a picture, and the same share of single pixels is lost."""
+        lengths = ("shift_px", "disparity_px", "correlation_px", "stick_length_px", "stick_width_px")
+        grown = {name: scale * getattr(self, name) for name in lengths}
+        return replace(self, stick=self.stick / scale**2, **grown)
+
 
 @dataclass(frozen=True)
 class KinectConfig(Section, name="sensor.kinect"):

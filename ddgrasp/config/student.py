@@ -251,6 +251,9 @@ class StudentConfig(Section, name="student"):
     rig's camera on the clean picture), monocular (depth from colour, by a network with weights) or rig (the
     development rig's camera before the scene, which a robot's cannot be asked for: a bound); stereo and
     monocular need demos.rgb."""
+    dextrah_scale: Annotated[float, Range(0.125, 8)] = 1.0
+    """Size of the formulas' pixel in training, in pixels of the picture, where depth_source is dextrah: their
+    numbers are of pictures 160 wide; 2 makes one of 320 as noisy as those, 1 half as noisy in depth."""
 
     def check(self) -> None:
         """See `Section.check`."""

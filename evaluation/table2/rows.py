@@ -38,11 +38,19 @@ class Row:
     """Whether the generator is the paper's: depth itself, uniform weights."""
     filled: bool = False
     """Whether its student fills holes by itself (`student.picture.fill_holes`), in training as on the rig."""
+    dextrah_scale: float = 1.0
+    """Size of the formulas' pixel (`student.dextrah_scale`)."""
 
     @property
     def student(self) -> str:
         """Name of the student that it needs, the same for rows that train alike."""
-        parts = (self.source, "paper" * self.paper_generator, "ripple" * self.ripple, "filled" * self.filled)
+        parts = (
+            self.source,
+            "paper" * self.paper_generator,
+            "ripple" * self.ripple,
+            "filled" * self.filled,
+            f"x{self.dextrah_scale:g}" * (self.dextrah_scale != 1),
+        )
         return "_".join(part for part in parts if part)
 
 
@@ -70,6 +78,7 @@ ROWS: dict[str, Row] = {
     "sim_gt_filled": Row("Sim GT, holes filled", "ideal", filled=True),
     "rand_noise_filled": Row("Rand Noise, holes filled", "dextrah", filled=True),
     "ddg_filled": Row("DDG, holes filled", "learned", filled=True),
+    "rand_noise_double": Row("Rand Noise, twice as strong", "dextrah", dextrah_scale=2.0),
     "paper_ddg_no_graft": Row(
         "Paper's generator without grafting", "learned_ungrafted", paper_generator=True
     ),
@@ -90,6 +99,11 @@ TABLES: dict[str, Table] = {
         "Holes as recorded, and filled by the student",
         "ddg_filled",
         ("sim_gt", "sim_gt_filled", "rand_noise", "rand_noise_filled", "ddg", "ddg_filled"),
+    ),
+    "formulas": Table(
+        "Formulas in pixels of the picture, and of one half as wide",
+        "ddg",
+        ("rand_noise", "rand_noise_double", "ddg"),
     ),
     "grafting": Table(
         "Grafting, with the paper's generator", "paper_ddg", ("paper_ddg_no_graft", "paper_ddg")
@@ -164,7 +178,13 @@ def row_config(shared: Config, row: Row, paper_from: str = "") -> Config:
     if not row.ripple:
         training = replace(training, **dict.fromkeys(HAND_MADE, 0.0))
     picture = replace(shared.student.picture, fill_holes=row.filled)
-    student = replace(shared.student, depth_source=row.source, training=training, picture=picture)
+    student = replace(
+        shared.student,
+        depth_source=row.source,
+        dextrah_scale=row.dextrah_scale,
+        training=training,
+        picture=picture,
+    )
     ddg = paper_generator(shared.ddg, paper_from) if row.paper_generator else shared.ddg
     return replace(shared, student=student, ddg=ddg)
 
