@@ -5,6 +5,7 @@ This module imports no JAX.
 """
 
 import contextlib
+import copy
 import dataclasses
 import hashlib
 import importlib.metadata
@@ -12,12 +13,12 @@ import json
 import platform
 import time
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ddgrasp import contract, upgrades
-from ddgrasp.config import Config, ExportConfig
+from ddgrasp.config import Config, DDGTrainingConfig, DeployConfig, ExportConfig, TeacherConfig
 from ddgrasp.errors import UserError
 from ddgrasp.files import TEMPORARY, atomic_write_json, read_json, to_json
 from ddgrasp.stages import config_fields, get_stage
@@ -25,9 +26,14 @@ from ddgrasp.stages import config_fields, get_stage
 MANIFEST = "manifest.json"
 STARTED = "started.json"
 
-_BOUNDS = {"export": {"max_abs_diff": ExportConfig.max_abs_diff}}
-"""Section -> fields that decide whether a result is accepted, not what it is. They count as these values when
-configurations are compared, so that a stage that missed its bound goes on with another one."""
+_INDIFFERENT = {
+    "export.max_abs_diff": ExportConfig.max_abs_diff,
+    "deploy.workers": DeployConfig.workers,
+    "teacher.checkpoint_every": TeacherConfig.checkpoint_every,
+    "ddg.training.checkpoint_every": DDGTrainingConfig.checkpoint_every,
+}
+"""Fields that decide whether or how a result comes about, not what it is. They count as these values when
+configurations are compared, so that a stage that missed its bound, or took too much memory, goes on."""
 _LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
 
 
@@ -341,13 +347,19 @@ def library_versions() -> dict[str, str]:
 
 
 def _relevant(config: Mapping[str, Any], stage: str) -> dict[str, Any]:
-    fields = config_fields(get_stage(stage))
-    return {name: _without_bounds(name, config.get(name)) for name in fields}
+    compared = copy.deepcopy(dict(config))
+    for name, value in _INDIFFERENT.items():
+        *sections, field = name.split(".")
+        if isinstance(section := _at(compared, sections), dict):
+            section[field] = value
+    return {name: _at(compared, name.split(".")) for name in config_fields(get_stage(stage))}
 
 
-def _without_bounds(section: str, value: Any) -> Any:
-    bounds = _BOUNDS.get(section, {})
-    return {**value, **bounds} if bounds and isinstance(value, Mapping) else value
+def _at(config: Any, path: Sequence[str]) -> Any:
+    """What lies there, None where nothing does."""
+    for name in path:
+        config = config.get(name) if isinstance(config, Mapping) else None
+    return config
 
 
 def _hash(value: Any) -> str:

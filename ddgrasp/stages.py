@@ -20,23 +20,27 @@ class Stage:
     parents: tuple[str, ...]
     """Stages it is made from."""
     sections: tuple[str, ...]
-    """Fields of `Config` that it reads itself; its parents' count as well (`config_fields`)."""
+    """What it reads of `Config` itself, sections or fields in them (`deploy.noise`); its parents' count as
+    well (`config_fields`)."""
     makes: str
     """What it leaves behind, for people."""
 
 
 STAGES = (
-    Stage("teacher", "ppo.stage", (), ("seed", "world", "teacher"), "PPO policy on the privileged state"),
+    Stage(
+        "teacher", "ppo.stage", (), ("seed", "world", "teacher", "evaluation.teacher_trials"),
+        "PPO policy on the privileged state",
+    ),
     Stage("demos", "demos.stage", ("teacher",), ("demos",), "successful teacher episodes with clean depth"),
     Stage("record", "rig.stage", ("teacher",), ("record",), "RGB-D recordings from the pseudo-real rig"),
     Stage("ddg", "ddg_jax.stage", ("record",), ("ddg",), "diffusion model of the camera's errors"),
     Stage(
-        "student", "student_jax.stage", ("teacher", "demos", "ddg"), ("student",),
-        "depth-only diffusion policy",
+        "student", "student_jax.stage", ("teacher", "demos", "ddg"),
+        ("student", "deploy.noise", "evaluation.student_trials"), "depth-only diffusion policy",
     ),
     Stage("export", "export.stage", ("student",), ("export",), "one ONNX file, checked against JAX"),
     Stage(
-        "deploy", "deploy.stage", ("export",), ("deploy", "evaluation"),
+        "deploy", "deploy.stage", ("export",), ("deploy", "evaluation.rig_trials"),
         "the exported student in the pseudo-real rig at 10 Hz",
     ),
 )  # fmt: skip
@@ -74,7 +78,7 @@ def get_stage(name: str) -> Stage:
 
 
 def config_fields(stage: Stage, known: Sequence[Stage] = tuple(_BY_NAME.values())) -> tuple[str, ...]:
-    """Fields of `Config` that the stage's result depends on: its parents' and its own, each once."""
+    """What of `Config` the stage's result depends on: its parents' and its own `sections`, each once."""
     by_name = {other.name: other for other in known}
     inherited = (field for name in stage.parents for field in config_fields(by_name[name], known))
     return tuple(dict.fromkeys((*inherited, *stage.sections)))

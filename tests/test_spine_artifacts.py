@@ -16,6 +16,7 @@ from ddgrasp.config import Config, ExportConfig, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path, atomic_write_bytes, atomic_write_json, new_folder, read_json, to_json
 from ddgrasp.presets import PRESETS
+from ddgrasp.stages import get_stage
 
 CONFIG = Config(preset="debug")
 
@@ -116,6 +117,46 @@ def test_an_accepted_difference_is_no_part_of_what_a_stage_is(tmp_path):
     artifacts.begin(tmp_path, "deploy", looser)
     _finish(tmp_path / "export")
     artifacts.require(tmp_path, "export", looser)
+
+
+def _changed(name: str, value: object) -> Config:
+    """`CONFIG` with the field of that dotted name at `value`."""
+
+    def change(section, path):
+        here = getattr(section, path[0])
+        return dataclasses.replace(section, **{path[0]: change(here, path[1:]) if len(path) > 1 else value})
+
+    return change(CONFIG, name.split("."))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "stage"),
+    [
+        ("evaluation.teacher_trials", 7, "teacher"),  # decides which policy is kept
+        ("evaluation.student_trials", 7, "student"),
+        ("deploy.noise", "normal", "student"),  # how the student acts in DAgger
+        ("evaluation.rig_trials", 7, "deploy"),
+    ],
+)
+def test_what_a_stage_reads_of_another_section_is_part_of_what_it_is(name, value, stage):
+    changed = _changed(name, value)
+    assert artifacts.config_hash(changed, stage) != artifacts.config_hash(CONFIG, stage)
+    before = get_stage(stage).parents
+    assert all(artifacts.config_hash(changed, p) == artifacts.config_hash(CONFIG, p) for p in before)
+
+
+@pytest.mark.parametrize(
+    ("name", "stage"),
+    [
+        ("deploy.workers", "deploy"),
+        ("teacher.checkpoint_every", "deploy"),
+        ("ddg.training.checkpoint_every", "ddg"),
+    ],
+)
+def test_how_a_result_comes_about_may_change_on_resume(name, stage, tmp_path):
+    artifacts.begin(tmp_path, stage, CONFIG)
+    (tmp_path / "work").touch()
+    artifacts.check_place(tmp_path, stage, _changed(name, 3))
 
 
 def test_an_artifact_of_another_config_is_refused_naming_both_values(tmp_path):

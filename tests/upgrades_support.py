@@ -1,7 +1,7 @@
 """Configurations of this version as earlier ones wrote them."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ddgrasp import artifacts, upgrades
@@ -9,9 +9,10 @@ from ddgrasp.config import Config
 from ddgrasp.files import to_json
 
 
-def config_hash_of_version(version: int, config: Config, stage: str) -> str:
-    """`artifacts.config_hash` as an earlier version of the fields had it."""
-    return artifacts._hash(artifacts._relevant(downgraded(to_json(config), version), stage))
+def config_hash_of_version(version: int, config: Config, sections: Sequence[str]) -> str:
+    """`artifacts.config_hash` as an earlier version of the fields had it for a stage that read `sections`."""
+    value = downgraded(to_json(config), version)
+    return artifacts._hash({name: value[name] for name in sections})
 
 
 def _flatten(made: dict[str, Any]) -> None:
