@@ -74,8 +74,9 @@ class Frames:
 
 
 def frames_bytes(config: DDGConfig, count: int) -> int:
-    """Bytes of the arrays of `Frames` with `count` frames."""
-    return count * config.depth.height_px * config.depth.width_px * (4 + 4 + 2)
+    """Bytes of the arrays of `Frames` with `count` frames, and of the priors a second time as they are put
+    together."""
+    return count * config.depth.height_px * config.depth.width_px * (4 + 4 + 2 + 2)
 
 
 def load_frames(
@@ -122,6 +123,7 @@ def load_frames(
     if skipped or refused:
         progress.note(f"left out {skipped} frame(s), and {len(refused)} of {len(folders)} recording(s)")
     noisy = np.concatenate(depth)
+    depth.clear()  # as large as all that follows
     return Frames(
         noisy,
         surfaces(noisy, config.depth.surface, progress),
@@ -138,11 +140,14 @@ def surfaces(
     """Recorded depth (N, H, W) metres -> the same with holes filled and noise smoothed away, frame by frame;
     `kind` as in `ddg.depth.surface`.
     """
-    frames = depth_m if progress is None else progress.track(depth_m, "surfaces")
-    if kind == PIECEWISE:
-        return np.stack([invert(piecewise_smooth(invert(frame))) for frame in frames])
-    smooth = (smooth_surface(fill_from_background(invert(frame))) for frame in frames)
-    return np.stack([invert(frame) for frame in (map(on_planes, smooth) if kind == PLANES else smooth)])
+    made = np.empty(depth_m.shape, np.float32)  # a list of them would take as much again
+    for i, frame in enumerate(depth_m if progress is None else progress.track(depth_m, "surfaces")):
+        if kind == PIECEWISE:
+            smooth = piecewise_smooth(invert(frame))
+        else:
+            smooth = smooth_surface(fill_from_background(invert(frame)))
+        made[i] = invert(on_planes(smooth) if kind == PLANES else smooth)
+    return made
 
 
 def _folders(root: Path) -> list[Path]:

@@ -26,6 +26,7 @@ from ddg_jax.train import (
     step_keys,
 )
 from ddgrasp.config import DDGConfig
+from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import diffusion
 from learning.convolutions import compiler_options
@@ -51,6 +52,20 @@ def rounds(config: DDGConfig) -> list[int]:
     while 2 * counts[-1] < config.training.distil_from:
         counts.append(2 * counts[-1])
     return counts[::-1]
+
+
+def check(config: DDGConfig) -> None:
+    """UserError if a round's steps are not every second one of those that its teacher takes."""
+    steps, spacing = config.diffusion.steps, config.sampling.spacing
+    for count in rounds(config):
+        if not np.array_equal(
+            diffusion.timesteps(steps, 2 * count, spacing)[::2], diffusion.timesteps(steps, count, spacing)
+        ):
+            raise UserError(
+                f"ddg.training.distil_from is {config.training.distil_from}: of {steps} diffusion steps, "
+                f"spacing {spacing}, {2 * count} evaluations cannot be halved step by step; take fewer of "
+                "those, or more ddg.diffusion.steps."
+            )
 
 
 def distil(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ddg_jax import data, start
+from ddg_jax.distil import check as check_halving
 from ddg_jax.distil import distil
 from ddg_jax.inverse_depth import invert
 from ddg_jax.prior import Prior, make_prior
@@ -81,6 +82,8 @@ def fitted_generator(
     """A generator fitted on all of `frames`, or the one that `config.init_from` names; distilled if its
     sampler is. Parameters and checkpoints go to `directory`, whence it continues.
     """
+    if config.sampling.sampler == PROGRESSIVE:
+        check_halving(config)
     fitted = _loaded(config) if config.init_from else fit(config, frames, directory, seed, progress)
     generator = Generator(config, fitted, prior)
     generator.save(directory)

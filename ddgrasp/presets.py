@@ -254,9 +254,9 @@ student: sees relief over the table instead of depth, its holes filled from arou
     privileged losses and DAgger, which the paper has not: perception to 5 mm is what decides whether it
     grasps (docs/student_log.md).
 crops: shifted by up to 12 pixels around the window's place, since the camera's place is known here.
-teacher: networks, number of environments and steps are not in the paper; ours for its 95 %. Half of the
-    episodes begin above the object and a fifth with it in the hand, and the reward is ours; the paper's own
-    five terms are those of preset `ppo_paper` (docs/teacher.md has both, learnt from nothing).
+teacher: networks, number of environments and steps are not in the paper; ours for its 95 %. A fifth of the
+    episodes begin with the object in the hand and half of the others above it, and the reward is ours; the
+    paper's own five terms are those of preset `ppo_paper` (docs/teacher.md has both, learnt from nothing).
 """
 
 PRESETS = {

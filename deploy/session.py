@@ -41,7 +41,6 @@ def deploy(
     Raises UserError for an unknown name, a combination that cannot work, or a device that is absent.
     """
     _check(options)
-    options.out.mkdir(parents=True, exist_ok=True)  # before an arm moves that could not be recorded
     with terminable():
         return _run(for_devices(config, options), policy_path, options, _survived(say))
 
@@ -55,6 +54,7 @@ def _run(
         seed=config.seed,
         execute_steps=config.deploy.execute_steps or None,
     )
+    options.out.mkdir(parents=True, exist_ok=True)  # before an arm moves that could not be recorded
     if options.robot == "franka" and not (options.yes or options.dry_run or sys.stdin.isatty()):
         raise UserError("robot 'franka' asks before it moves, and nobody can be asked here: give --yes.")
     place = standing(config, options)

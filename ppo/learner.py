@@ -123,15 +123,10 @@ def network_params(policy: Any, value: Any) -> ppo_losses.PPONetworkParams:
     return ppo_losses.PPONetworkParams(policy, value)  # pyright: ignore[reportCallIssue]
 
 
-def iterations(config: TeacherConfig) -> int:
-    """Number of iterations in `config.total_steps` control steps."""
-    return max(1, round(config.total_steps / (config.num_envs * config.unroll_steps)))
-
-
 def make_optimizer(config: TeacherConfig) -> optax.GradientTransformation:
     """Adam with clipped gradients, for actor and critic apart; step sizes decay linearly, or the actor's is a
     part of the state that `steered` sets."""
-    total, per_iteration = iterations(config), config.epochs * config.minibatches
+    total, per_iteration = config.iterations, config.epochs * config.minibatches
 
     def clipped(adam: optax.GradientTransformation) -> optax.GradientTransformation:
         return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
@@ -276,7 +271,7 @@ def _unroll(env, env_state, policy, key, length):
 
 def settling(config: TeacherConfig, iteration: jax.Array) -> jax.Array:
     """() how much of the time that `settle_from` leaves for settling is over: 0 before, 1 at the end."""
-    total = iterations(config)
+    total = config.iterations
     start = round(config.settle_from * total)
     return jnp.clip((iteration + 1 - start) / max(1, total - start), 0.0, 1.0)
 
@@ -295,6 +290,12 @@ def steered(
     return opt_state._replace(
         inner_states=opt_state.inner_states | {"policy": actor._replace(inner_state=chain)}
     )
+
+
+def least_rate(config: TeacherConfig) -> float:
+    """Least step size that steering goes down to before settling: one that begins below `STEERED_RATE_MIN`
+    would be raised to it by its first large divergence."""
+    return min(STEERED_RATE_MIN, config.learning_rate)
 
 
 def _held_back(learns, waiting, opt_state):
@@ -329,7 +330,8 @@ def _improve(config, networks, normalizer, data, key, state, mesh):
         waiting = opt_state.inner_states["policy"]
         updates, opt_state = optimizer.update(grads, opt_state, params)
         if config.target_kl:
-            opt_state = steered(opt_state, terms["kl_mean"], calm * config.target_kl, calm * STEERED_RATE_MIN)
+            limits = (calm * config.target_kl, calm * least_rate(config))
+            opt_state = steered(opt_state, terms["kl_mean"], *limits)
         opt_state = _held_back(learns, waiting, opt_state)
         params = cast(ppo_losses.PPONetworkParams, optax.apply_updates(params, updates))
         return (params, opt_state), terms

@@ -47,7 +47,7 @@ def _train(
 ) -> learner.LearnerState:
     teacher = config.teacher
     test_env = GraspEnv(config.world)
-    total = learner.iterations(teacher)
+    total = teacher.iterations
     iterate = compile_iteration(config, env)
     state = _start(config, env, saved, progress)
     best = _Best(directory)
@@ -57,6 +57,9 @@ def _train(
         task.start_at(int(state.iteration))
         clock = _Clock(teacher.num_envs * teacher.unroll_steps)
         for i in range(int(state.iteration) + 1, total + 1):
+            if int(state.good_evaluations) >= 2:  # before any work: a checkpoint may hold this already
+                progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
+                break
             state, metrics, watched = iterate(state)
             health.check(i, watched, saved.latest, directory)
             if i % LOG_EVERY == 0 or i == total:
@@ -68,9 +71,6 @@ def _train(
                 state = learner.with_evaluation(state, rate >= teacher.stop_at)
             if i % teacher.checkpoint_every == 0 or i == total:
                 saved.save(i, state)
-            if int(state.good_evaluations) >= 2:
-                progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
-                break
     return state
 
 

@@ -46,7 +46,7 @@ def clone_guide(
     fit = jax.jit(partial(_fit, optimizer))
     with progress.task("cloning the guide", config.clone_rounds) as task:
         for i in range(config.clone_rounds):
-            share = 0.5**i if i < config.clone_rounds - 1 else 0.0
+            share = guide_share(i, config.clone_rounds)
             numbers = jax.tree.map(np.asarray, (normalizer, policy))
             seen, label = collect(from_learner(*numbers), _SEED + 1000 * seed + i, share)
             observations.append(seen)
@@ -65,6 +65,12 @@ def clone_guide(
             progress.scalars(i, clone_loss=float(loss))
             task.advance(loss=float(loss))
     return policy, normalizer
+
+
+def guide_share(number: int, rounds: int) -> float:
+    """Share of the actions that the guide takes in round `number`, from 0: all, a half, a quarter, and none
+    in the last, unless that is the only one, of which a policy that has seen nothing would make nothing."""
+    return 0.5**number if number < max(1, rounds - 1) else 0.0
 
 
 class Collector:

@@ -40,6 +40,7 @@ LOG_EVERY = 20
 _POINTS_PER_PHASE = 100_000
 """A phase's curves begin at its number times this."""
 _DAGGER_SEED = 40_000
+_LAST_PHASE = "head"
 
 
 class Trainer:
@@ -66,6 +67,8 @@ class Trainer:
         """Every phase that is not finished; `params` is then the student."""
         check_demos(self._source, demos)
         self._restore()
+        if _LAST_PHASE in self._done:  # stopped after that: what it was trained on may be gone
+            return
         self._phase("poses", self._fit_on_poses)
         frames_io.add_noisy_demos(
             demos, self._store, self._source, self._config, self._progress, self._window
@@ -73,11 +76,13 @@ class Trainer:
         self._phase("demos", lambda: self._fit("demos", self._student.training.steps))
         for i in range(1, self._student.dagger.rounds + 1):
             self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))
-        self._phase("head", self._fit_on_perception)
+        self._phase(_LAST_PHASE, self._fit_on_perception)
 
     @property
     def frame_count(self) -> int:
         """Pictures trained on."""
+        if _LAST_PHASE in self._done:
+            return self.history[-1]["frames"]
         return int(self._store.ends[-1]) if len(self._store) else 0
 
     def _frames(self) -> Frames:

@@ -22,10 +22,9 @@ from student_jax.device_frames import DepthOnDevice
 
 CACHE = "frames.zarr"
 _COLUMNS = ("state", "action", "observation", "held")
-_FIELDS = ("depth_mm", *_COLUMNS)
 _DRAWN = "drawn"
 LEAD_IN = contract.DEPTH_FRAMES - 1
-"""Steps before a stretch's first that its stack of pictures shows."""
+"""Steps before a sample that its stack of pictures shows."""
 _STRETCH_SEED = 47_000
 
 
@@ -35,9 +34,10 @@ def add_noisy_demos(
 ) -> None:  # fmt: skip
     """Copies the demos into `frames` with the source's artefacts on their depth, going on from what is there.
 
-    A share of `config.student.training.clean_share` keeps clean depth. Steps long after the grasp are left
-    out, those beside a demo's stretch if one is configured, and what lies outside of the `window` if one is
-    given. The demos must have what the source needs (`depth_source.check_demos`).
+    A share of `config.student.training.clean_share` keeps clean depth. Steps long after the grasp are no
+    samples, nor those beside a demo's stretch if one is configured; of them are kept what samples need, as
+    pictures before and, without a picture, as actions after them. What lies outside of the `window` is left
+    out if one is given. The demos must have what the source needs (`depth_source.check_demos`).
     """
     training = config.student.training
     begins = [0, *demos.ends.tolist()]
@@ -45,11 +45,13 @@ def add_noisy_demos(
         useful_steps(held, training.demo_held_steps) for held in np.split(demos.steps("held"), begins[1:-1])
     ]
     stretches = [stretch(n, training.demo_stretch_steps, (config.seed, i)) for i, n in enumerate(useful)]
+    pictured = [range(max(0, steps.start - LEAD_IN), steps.stop) for steps in stretches]
     keep_clean = np.random.default_rng(config.seed).random(len(demos)) < training.clean_share
     chosen = np.flatnonzero(~keep_clean)
 
-    def rows_of(i: int) -> tuple[int, int]:
-        return begins[i] + stretches[i].start, begins[i] + stretches[i].stop
+    def rows_of(i: int, behind: int = 0) -> tuple[int, int]:
+        stop = min(begins[i] + pictured[i].stop + behind, begins[i + 1])
+        return begins[i] + pictured[i].start, stop
 
     def read(i: int) -> Clip:
         rows = rows_of(chosen[i])
@@ -58,17 +60,18 @@ def add_noisy_demos(
         return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb, views)
 
     done = int(np.sum(~keep_clean[: len(frames)]))
-    noisy = source.episodes([len(stretches[i]) for i in chosen], read, done)
+    noisy = source.episodes([len(pictured[i]) for i in chosen], read, done)
     with progress.task("artefacts on the demos", len(demos)) as task:
         task.start_at(len(frames))
         for i in range(len(frames), len(demos)):
-            steps = {name: demos.steps(name, *rows_of(i)) for name in _FIELDS}
-            count = len(stretches[i])
-            steps[_DRAWN] = np.arange(count) >= count - (training.demo_stretch_steps or count)
-            if not keep_clean[i]:
-                steps["depth_mm"] = next(noisy)
-            if window is not None:
-                steps["depth_mm"] = window.cut(steps["depth_mm"])
+            rows = rows_of(i, behind=config.student.head.chunk - 1)
+            steps = {name: demos.steps(name, *rows) for name in _COLUMNS}
+            number = np.arange(pictured[i].start, pictured[i].start + rows[1] - rows[0])
+            steps[_DRAWN] = (number >= stretches[i].start) & (number < stretches[i].stop)
+            depth = demos.steps("depth_mm", *rows_of(i)) if keep_clean[i] else next(noisy)
+            depth = depth if window is None else window.cut(depth)
+            unseen = np.zeros((len(number) - len(depth), *depth.shape[1:]), depth.dtype)
+            steps["depth_mm"] = np.concatenate([depth, unseen])
             frames.append(steps, {"from_demo": np.bool_(True)})
             task.advance()
 
@@ -87,12 +90,11 @@ def useful_steps(held: Bool[np.ndarray, " T"], held_steps: int) -> int:
 
 
 def stretch(useful: int, steps: int, seed: Sequence[int]) -> range:
-    """The steps kept of a demo's `useful` first ones: `steps` in a row from a random one on, and up to
-    `LEAD_IN` before them for their pictures; all for 0."""
+    """The samples among a demo's `useful` first steps: `steps` in a row from a random one on; all for 0."""
     if not 0 < steps < useful:
         return range(useful)
     first = int(np.random.default_rng([*seed, _STRETCH_SEED]).integers(useful - steps + 1))
-    return range(first - min(first, LEAD_IN), first + steps)
+    return range(first, first + steps)
 
 
 def add_rollouts(frames: EpisodeStore, episodes: Episodes, seen: Spool, window: Window) -> None:

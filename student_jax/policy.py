@@ -49,7 +49,7 @@ class Aux(NamedTuple):
     """Privileged predictions, supervised in simulation only."""
 
     position: Float[Numbers, "B 3"]
-    """Object position in network units; see `position_from_world` and `position_to_world`."""
+    """Grasp position in network units; see `position_from_world` and `position_to_world`."""
     yaw: Float[Numbers, "B 2"]
     """Cosine and sine of twice the grasp yaw (`data.YAW_MULTIPLE`)."""
     held_logit: Float[Numbers, " B"]

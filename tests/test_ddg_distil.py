@@ -99,6 +99,20 @@ def test_steps_that_are_no_halves_of_others_are_not_distilled(spacing):
         dataclasses.replace(DISTILLED, sampling=dataclasses.replace(DISTILLED.sampling, spacing=spacing))
 
 
+def test_a_round_whose_steps_are_not_halves_of_its_teacher_s_is_refused_before_the_fit():
+    distil.check(DISTILLED)
+    many = dataclasses.replace(
+        DISTILLED,
+        training=dataclasses.replace(DISTILLED.training, distil_from=128),
+        sampling=dataclasses.replace(DISTILLED.sampling, steps=4, spacing="quadratic"),
+        diffusion=dataclasses.replace(DISTILLED.diffusion, steps=1000),
+    )
+    with pytest.raises(
+        UserError, match="distil_from is 128: of 1000 diffusion steps, spacing quadratic, 128 "
+    ):
+        distil.check(many)
+
+
 def test_one_step_to_the_target_ends_where_the_teacher_does():
     made = diffusion.make_schedule("cosine", 1000)
     x_k, x_end = jax.random.normal(jax.random.key(0), (2, 3, 4, 5))

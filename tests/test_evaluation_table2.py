@@ -151,6 +151,13 @@ def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
         shared(student("later", init_from="pretrained/student"))
 
 
+def test_help_names_every_row_and_table(capsys):
+    with pytest.raises(SystemExit):
+        parse("study table2", ["--help"])
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert all(f" {name}" in told for name in (*ROWS, *TABLES))
+
+
 def test_rows_are_chosen_by_name_or_by_table():
     assert rows.chosen((), ("main",)) == TABLES["main"].rows
     assert rows.chosen(("ddg", "sim_gt", "ddg"), ("main",)) == ("ddg", "sim_gt")

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 from app.cli import main
+from app.commands import parse
 from ddg_jax import prior, sensor
 from ddgrasp.config import (
     Config,
     DDGConfig,
+    DDGDiffusionConfig,
     DDGTrainingConfig,
     DepthFeatureConfig,
     DextrahConfig,
@@ -173,6 +175,53 @@ def test_stages_that_do_not_fit_each_other_are_refused():
     training = dataclasses.replace(config.student.training, crop_shift_px=40)
     with pytest.raises(UserError, match="crop_shift_px is 40; expected 0 to 34"):
         dataclasses.replace(config, student=dataclasses.replace(config.student, training=training))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ("training.aux_weight=0", "aux_weight and action_weight are both 0"),
+        (
+            "head.aux_to_head=no head.features_to_head=yes training.action_weight=1",
+            "rounds is 8, and student",
+        ),
+        ("head.features_to_head=yes", "action_weight 0: the head would act before it has learnt"),
+        ("poses.rounds=0", "nothing would have trained the action head before it acts"),
+        ("poses.rounds=0 dagger.rounds=0 head.train_steps=0", "nothing would have trained the action head"),
+        ("head.batch_size=1", "student.head.batch_size is 1; expected at least 2"),
+    ],
+)
+def test_a_student_that_nothing_would_train_is_refused(values, expected):
+    arguments = [word for value in values.split() for word in _option("student", value)]
+    with pytest.raises(UserError, match=expected):
+        parse("run", ["--preset", "laptop", *arguments])
+
+
+def _option(section: str, value: str) -> list[str]:
+    name, _, given = value.replace("_", "-").partition("=")
+    *groups, field = name.split(".")
+    if given in ("yes", "no"):
+        return [f"--{'.'.join([section, *groups, 'no-' * (given == 'no') + field])}"]
+    return [f"--{section}.{name}", given]
+
+
+def test_a_teacher_whose_actor_would_never_learn_is_refused():
+    with pytest.raises(UserError, match=r"critic_warmup is 10, .*100000 makes 10 iteration\(s\)"):
+        parse("run", ["--preset", "demo", "--teacher.total-steps", "100000"])
+    parse("run", ["--preset", "demo", "--scale", "0.001"])
+
+
+@pytest.mark.parametrize("name", ["linear", "cosine"])
+def test_schedules_that_configurations_take_have_noise_at_both_ends(name):
+    for steps in (2, 50, 499, 500, 1000, 5000, 5001, 100_000):
+        for shift in (-10.0, 0.0, 1.0, 3.0, 5.0, 10.0):
+            try:
+                config = DDGDiffusionConfig(steps, name, shift)
+            except UserError:
+                continue
+            alpha_bars = diffusion.make_schedule(name, config.steps, config.log_snr_shift).alpha_bars
+            assert np.all(alpha_bars > 0) and np.all(1 - alpha_bars > 0)
+            assert alpha_bars[-1] < 0.01 * np.exp(max(0, shift)), (steps, shift)
 
 
 def test_choices_are_those_that_the_code_knows():

@@ -121,7 +121,7 @@ def test_ideal_depth_is_the_demos(demos, tmp_path):
 
 def test_a_stretch_s_samples_are_those_of_the_whole_demo(demos, tmp_path):
     whole_settings = with_source("ideal")
-    training = replace(whole_settings.student.training, demo_stretch_steps=4)
+    training = replace(whole_settings.student.training, demo_stretch_steps=4, demo_held_steps=9)
     cut_settings = replace(whole_settings, student=replace(whole_settings.student, training=training))
     loaded = {}
     for name, settings in (("whole", whole_settings), ("cut", cut_settings)):
@@ -136,14 +136,16 @@ def test_a_stretch_s_samples_are_those_of_the_whole_demo(demos, tmp_path):
     same = np.array([of_step[tuple(row)] for row in cut.observation[at]])
     np.testing.assert_array_equal(cut.depth_stack(at), whole.depth_stack(same))
     np.testing.assert_array_equal(cut.state[at], whole.state[same])
+    chunk = CONFIG.student.head.chunk
+    np.testing.assert_array_equal(cut.action_chunks(at, chunk), whole.action_chunks(same, chunk))
     assert np.all(np.diff(same[cut.episode[at] == 1]) == 1)
 
 
-def test_a_stretch_begins_anywhere_and_brings_the_frames_before_it():
+def test_a_stretch_begins_anywhere():
     assert frames_io.stretch(9, 0, (0, 0)) == frames_io.stretch(9, 9, (0, 0)) == range(9)
     kept = [frames_io.stretch(9, 3, (0, number)) for number in range(200)]
     assert {steps.stop for steps in kept} == {3, 4, 5, 6, 7, 8, 9}
-    assert all(steps.start == max(0, steps.stop - 3 - frames_io.LEAD_IN) for steps in kept)
+    assert all(len(steps) == 3 for steps in kept)
 
 
 def test_dextrah_loses_and_replaces_the_expected_shares(demos, tmp_path):

@@ -24,14 +24,17 @@ from ddgrasp.gripper import WidthChange
 from ddgrasp.layout import OBSERVATION, closes
 from ddgrasp.progress import Progress
 from demos.rollout import Scene
+from demos.store import EpisodeStore
+from learning.params import save_params
 from mjx_envs.camera import nominal_camera
 from student_jax import train
 from student_jax.act import StudentActor, keep_clean
 from student_jax.augment import disparity_noise, unseen_objects
-from student_jax.dagger import ACTED, CHECKPOINTS, Trainer
+from student_jax.dagger import ACTED, CHECKPOINTS, PLAN, Trainer
 from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gripper, with_change
+from student_jax.depth_source import make_source
 from student_jax.frames_io import useful_steps
-from student_jax.policy import Aux, init_params, position_to_world
+from student_jax.policy import PARAMS_FILE, Aux, init_params, position_to_world
 from student_jax.preprocess import table_depth
 from student_jax.privileged import PoseActor, noisy_seen
 
@@ -204,6 +207,20 @@ def test_a_round_interrupted_after_its_episodes_keeps_their_success(tmp_path):
     atomic_write_json(tmp_path / ACTED, {"round": 1, "rollout_success": 0.25})
     assert trainer._dagger(1, 1) == {"rollout_success": 0.25}
     assert trainer._dagger(2, 0) == {}
+
+
+def test_a_student_stopped_after_its_last_phase_needs_its_frames_no_more(tmp_path):
+    """Its stage deletes them before the manifest that says it is finished."""
+    config = Config("test", student=dataclasses.replace(CONFIG, depth_source="ideal"))
+    done = ["poses", "demos", "dagger-1", "head"]
+    history = [{"phase": name, "frames": 12} for name in done]
+    atomic_write_json(tmp_path / PLAN, {"done": done, "history": history})
+    save_params(tmp_path / PARAMS_FILE, {"a": np.ones(3)})
+    source, demos = make_source(config, tmp_path), EpisodeStore(tmp_path / "demos", create=True)
+    trainer = Trainer(config, cast(Any, None), source, tmp_path, Progress(quiet=True))
+    trainer.run(demos)
+    assert trainer.frame_count == 12 and len(trainer._store) == 0
+    np.testing.assert_array_equal(trainer.params["a"], np.ones(3))
 
 
 def test_the_head_learns_actions_from_poses():

@@ -37,7 +37,7 @@ def test_ppo_from_nothing_learns_to_lift_and_hold():
 
     before = successes()
     after, metrics = 0, {}
-    for iteration in range(1, learner.iterations(TEACHER) + 1):
+    for iteration in range(1, TEACHER.iterations + 1):
         state, metrics, _ = iterate(state)
         if iteration % 10 == 0 and (after := successes()) > 0.95 * TRIALS:
             break  # the bound is of its steps; most of the test's time is physics

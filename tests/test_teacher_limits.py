@@ -16,6 +16,7 @@ from learning.checkpoints import Checkpoints
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import health, memory, stage
 from ppo import train as ppo_train
+from ppo.warmup import guide_share
 
 TEACHER = TeacherConfig(
     total_steps=6 * 8 * 2, num_envs=8, unroll_steps=2, minibatches=2, epochs=1, hidden=(16,), eval_every=100,
@@ -28,6 +29,12 @@ CONFIG = Config(
 
 def _checkpoints(directory) -> Checkpoints:
     return Checkpoints(directory / ppo_train.CHECKPOINTS)
+
+
+def test_the_guide_acts_first_and_not_at_last_unless_there_is_one_round():
+    assert [[guide_share(i, rounds) for i in range(rounds)] for rounds in (1, 2, 4)] == [
+        [1.0], [1.0, 0.0], [1.0, 0.5, 0.25, 0.0],
+    ]  # fmt: skip
 
 
 def test_an_absurd_learning_rate_stops_before_the_broken_state_is_saved(tmp_path):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ddgrasp import artifacts
-from ddgrasp.config import Config, ScoreConfig, StudentConfig, WorldConfig
+from ddgrasp.config import Config, ScoreConfig, WorldConfig
 from ddgrasp.config.checks import Range, check_value, kinds
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import PRETRAINED, holding, shipped
@@ -85,6 +85,8 @@ def check_score(score: ScoreConfig) -> None:
             store.read_manifest(store.WEIGHTS_DIR / name)
     if score.monocular_weights:
         store.read_manifest(Path(score.monocular_weights))
+    elif set(score.columns) == {"monocular"}:  # among others it is left out, and that is said
+        store.read_manifest(store.WEIGHTS_DIR / f"{score.monocular}_small")
 
 
 def check_data(option: str, path: Path) -> None:
@@ -159,7 +161,6 @@ def check_networks(config: Config, run_dir: Path, stages: Collection[str] = ON_P
     if "student" in left:
         if config.student.depth_source in LEARNED:
             check_aspect((config.world.profile.height_px, config.world.profile.width_px), config.ddg)
-        _check_head(config.student)
         start.check(config)
     need_of = {"demos": demos_memory.need, "ddg": ddg_memory.need, "student": student_memory.need}
     needs = []
@@ -173,15 +174,6 @@ def tell_needs(config: Config, run_dir: Path, stages: Collection[str] = ON_PICTU
     """`check_networks`, its lines on standard error."""
     for need in check_networks(config, run_dir, stages):
         print(need, file=sys.stderr, flush=True)
-
-
-def _check_head(student: StudentConfig) -> None:
-    """UserError where the head would be trained on poses that do not reach it."""
-    if student.poses.rounds and not student.head.aux_to_head:
-        raise UserError(
-            f"student.poses.rounds is {student.poses.rounds} with student.head.aux_to_head off: poses reach "
-            "the head through what perception reports; --student.poses.rounds 0, or turn it on."
-        )
 
 
 def check_start(stage: str, option: str, folder: str, others: str = "") -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from app.commands.checks import check_file
 from ddgrasp import contract
 from ddgrasp.config.checks import Range
 from ddgrasp.errors import UserError
@@ -159,6 +160,7 @@ class ObjectsSheet:
 
     def run(self) -> None:
         """Writes the picture and prints where it is."""
+        check_file("--out", self.out)
         atomic_write_bytes(self.out, self._mesh_sheet() if self.meshes else self._sheet())
         print(self.out)
 

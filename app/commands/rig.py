@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
+from app.commands.checks import check_file
 from ddgrasp.config.checks import Range, Seed
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
@@ -56,6 +57,7 @@ class RigPictures:
 
     def run(self) -> None:
         """Writes the picture and prints where it is."""
+        check_file("--out", self.out)
         if find_spec("franky_sim") is None:
             raise UserError(f"pictures of the FR3 rig need franky-sim: {pip_install('fr3')}.")
         from evaluation.rig_sheet import draw

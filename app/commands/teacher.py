@@ -7,13 +7,13 @@ import tyro
 
 from app import pipeline
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config
-from app.commands.checks import check_config_values, check_devices, check_objects
+from app.commands.checks import check_config_values, check_devices, check_objects, stage_folder
 from ddgrasp import artifacts
 from ddgrasp.config import Backend, HostsConfig, WorldConfig
 from ddgrasp.config.checks import Count, Seed
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
-from ddgrasp.shipped import PRETRAINED
+from ddgrasp.shipped import PRETRAINED, holding
 from ddgrasp.stages import get_stage
 
 
@@ -61,7 +61,7 @@ class TeacherEval:
     def run(self) -> None:
         """Runs the trials, prints a row per object, keeps figures and pictures."""
         check_objects(self.world)
-        directory = self.run_dir / "teacher"
+        directory = stage_folder("RUN-DIR", self.run_dir, "teacher")
         if self.out is None:
             _check_own(directory, "give --out FOLDER")
         teacher = artifacts.read_artifact(directory).hash
@@ -96,14 +96,14 @@ class TeacherCompare:
 
     def run(self) -> None:
         """Measures every backend, printing and keeping each result as it comes."""
+        config = load_config(self.run_dir, "teacher")
+        directory, results = self.run_dir / "teacher", {}
+        _check_own(directory, "copy it and name the copy")
         from evaluation import backends as measured
         from evaluation import wilson
         from ppo.backends import evaluate_backends
         from ppo.policy import load_policy
 
-        config = load_config(self.run_dir, "teacher")
-        directory, results = self.run_dir / "teacher", {}
-        _check_own(directory, "copy it and name the copy")
         policy = load_policy(directory)
         for name, result in evaluate_backends(config.world, policy, self.backends, self.trials, self.seed):
             success = wilson.success(result["success"]["successes"], result["success"]["n"])
@@ -122,6 +122,10 @@ def _check_own(directory: Path, remedy: str) -> None:
 def with_world_of(run_dir: Path | None) -> TeacherEval:
     """The command with the world of the run in `run_dir`, where there is one."""
     run_dir = run_dir or Path("runs") / DEFAULT_PRESET
-    there = artifacts.is_finished(run_dir / "teacher")
-    config = load_config(run_dir, "teacher") if there else get_preset(DEFAULT_PRESET)
+    found = holding(run_dir, artifacts.MANIFEST, "teacher")
+    config = (
+        artifacts.config_from_json(artifacts.read_manifest(found).config)
+        if found
+        else get_preset(DEFAULT_PRESET)
+    )
     return TeacherEval(run_dir=run_dir, world=config.world)

@@ -164,7 +164,7 @@ def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
 
 def _check_tuple(name: str, value: Any, kinds_of_items: tuple[Any, ...]) -> None:
     if not isinstance(value, tuple):
-        raise UserError(f"{name} is {value!r}; expected a tuple.")
+        raise UserError(f"{name} is {value!r}; expected a list.")
     if kinds_of_items[-1] is Ellipsis:
         if not value:
             raise UserError(f"{name} is empty; expected at least one{_of(kinds_of_items[0])}.")

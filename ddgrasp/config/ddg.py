@@ -1,5 +1,6 @@
 """The depth generator: a diffusion model of what a real depth camera does to depth."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
 
@@ -104,13 +105,14 @@ class PriorConfig(Section, name="ddg.prior"):
     dtype: DType = "float32"
     """The network's arithmetic: float32 or bfloat16."""
     blur_px: Annotated[float, Range(0, 100)] = 1.0
-    """Gaussian blur of c in pixels: hides where a recording's holes were filled."""
+    """Gaussian blur of c in pixels: hides where a recording's holes were filled (built-in sources only)."""
     noise: Annotated[float, Range(0, 10)] = 0.03
     """Standard deviation of noise added to c in training and sampling, for the same reason."""
     jitter: Share = 0.1
     """Relative scale and shift of c varied in training, so that it need not match to the last percent."""
     decoy_holes: Share = 0.5
-    """Share of recorded frames whose prior is filled under another frame's holes as well."""
+    """Share of recorded frames whose prior is filled under another frame's holes as well (built-in sources
+    only)."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,21 @@ class UNetConfig(Section, name="ddg.unet"):
         return self.space_to_depth * 2 ** (len(self.widths) - 1)
 
 
+_LINEAR_STEPS = (500, 5000)
+"""Steps of a linear schedule after which alpha_bar is below 0.01 and far above float32's least number."""
+_FIRST_LINEAR_BETA, _COSINE_OFFSET = 1e-4, 0.008
+"""See `learning.diffusion`."""
+_LEAST_NOISE = 4 * 2.0**-24
+"""Least 1 - alpha_bar: four times what float32 can tell from 0 beside 1."""
+
+
+def _first_cosine_beta(steps: int) -> float:
+    start, end = (
+        math.cos((u + _COSINE_OFFSET) / (1 + _COSINE_OFFSET) * math.pi / 2) ** 2 for u in (0, 1 / steps)
+    )
+    return 1 - end / start
+
+
 @dataclass(frozen=True)
 class DDGDiffusionConfig(Section, name="ddg.diffusion"):
     """The forward process (learning/diffusion.py)."""
@@ -154,9 +171,24 @@ class DDGDiffusionConfig(Section, name="ddg.diffusion"):
     steps: Annotated[int, Range(2, 100_000)] = 1000
     """Steps K of the forward process."""
     schedule: NoiseSchedule = "cosine"
-    """Noise schedule: cosine or linear."""
-    log_snr_shift: Annotated[float, Range(-20, 20)] = 0.0
+    """Noise schedule: cosine or linear, whose betas are those of 1000 steps (Ho et al. 2020)."""
+    log_snr_shift: Annotated[float, Range(-10, 10)] = 0.0
     """Moves the schedule's log signal-to-noise ratio; negative is noisier."""
+
+    def check(self) -> None:
+        """See `Section.check`."""
+        least, most = _LINEAR_STEPS
+        if self.schedule == "linear" and not least <= self.steps <= most:
+            raise self.error(
+                "steps",
+                f"{least} to {most} with schedule linear: fewer do not end in noise",
+            )
+        first = _FIRST_LINEAR_BETA if self.schedule == "linear" else _first_cosine_beta(self.steps)
+        if (highest := math.log(first / _LEAST_NOISE)) < self.log_snr_shift:
+            limit = f"at most {highest:.1f} with {self.steps} steps"
+            raise self.error(
+                "log_snr_shift", f"{limit}: the first one would add less noise than float32 tells"
+            )
 
 
 @dataclass(frozen=True)
@@ -178,8 +210,9 @@ class DDGTrainingConfig(Section, name="ddg.training"):
     """Weight of a diffusion step's error: uniform (the paper's) or truncated (more weight on noisy steps,
     which few-step sampling needs)."""
     snr_limits: tuple[_Snr, _Snr] = (1.0, 25.0)
-    """Least and greatest weight of an error in the clean map (truncated only). The upper one counts in slight
-    noise, where single pixels and roughness are decided; the layout of holes is decided in strong noise."""
+    """Least and greatest weight of an error in the clean map (loss_weight truncated, and distillation). The
+    upper one counts in slight noise, where single pixels and roughness are decided; the layout of holes is
+    decided in strong noise."""
     ema_decay: Decay = 0.995
     """Decay of the averaged parameters, which are the ones used."""
     checkpoint_every: Count = 250

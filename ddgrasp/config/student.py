@@ -145,8 +145,8 @@ class HeadConfig(Section, name="student.head"):
     """Denoising iterations when acting."""
     train_steps: StepsOrNone = 4000
     """Optimiser steps of the action head alone at the end, on cached features."""
-    batch_size: Batch = 512
-    """Samples per step of the head alone."""
+    batch_size: Annotated[int, Range(2, 65_536)] = 512
+    """Samples per step of the head alone: half of them on pictures, if there are poses besides."""
 
     def check(self) -> None:
         """See `Section.check`."""
@@ -192,7 +192,7 @@ class StudentTrainingConfig(Section, name="student.training"):
     """Steps in a row kept of each demo, from a random one on; 0 keeps all. A demo is one placement of object
     and camera: with short stretches as many pictures for the generator show more of them."""
     clean_share: Share = 0.2
-    """Share of the episodes that keep clean depth."""
+    """Share of the demos that keep clean depth."""
     crop_shift_px: Annotated[int, Range(0, 1000)] = 6
     """Random shift of the crop window in training, pixels of the scaled picture, each way."""
     disparity_noise_px: Annotated[float, Range(0, 100)] = 0.25
@@ -270,6 +270,36 @@ class StudentConfig(Section, name="student"):
         if self.encoder.weights and self.init_from:
             raise UserError(
                 "student.init_from and student.encoder.weights both say where to start: give one."
+            )
+        self._check_losses()
+
+    def _check_losses(self) -> None:
+        """What is trained must be told something, and what acts must have been trained."""
+        head, training = self.head, self.training
+        on_pictures = training.steps > 0 or self.dagger.rounds * self.dagger.steps > 0
+        if on_pictures and not (training.aux_weight or training.action_weight):
+            raise UserError(
+                "student.training.aux_weight and action_weight are both 0: training on pictures would change "
+                "nothing; give one of them a weight."
+            )
+        if self.poses.rounds and not head.aux_to_head:
+            raise UserError(
+                f"student.poses.rounds is {self.poses.rounds}, and student.head.aux_to_head off: on poses "
+                "without pictures the head would see nothing; take 0 rounds."
+            )
+        if training.action_weight:
+            return
+        if head.features_to_head and (self.poses.rounds or self.dagger.rounds):
+            raise UserError(
+                "student.head.features_to_head with student.training.action_weight 0: the head would act "
+                "before it has learnt what the features mean; give action_weight, or 0 poses.rounds and "
+                "dagger.rounds."
+            )
+        acts_untrained = self.dagger.rounds or not head.train_steps
+        if acts_untrained and not (self.poses.rounds or self.init_from):
+            raise UserError(
+                "student.poses.rounds, student.training.action_weight and student.init_from are all empty: "
+                "nothing would have trained the action head before it acts; give one of them."
             )
 
 

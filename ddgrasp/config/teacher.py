@@ -10,7 +10,7 @@ from ddgrasp.config.checks import (
     Range,
     Section,
     Share,
-    StepsOrNone,
+    Steps,
     Text,
     Width,
 )
@@ -68,7 +68,8 @@ class TeacherConfig(Section, name="teacher"):
     hidden: tuple[Width, ...] = (256, 128)
     """Layers of policy and value networks."""
     pregrasp_share: Share = 0.2
-    """Share of training episodes that start with the hand above the object (exploring starts)."""
+    """Share of the training episodes not begun by held_share that start with the hand above the object
+    (exploring starts)."""
     pregrasp_turn_rad: Annotated[float, Range(0, 1.5)] = 0.0
     """The hand's yaw there, off the grasp's by up to this: how to turn to either side is found near the
     object."""
@@ -81,7 +82,7 @@ class TeacherConfig(Section, name="teacher"):
     """DAgger rounds in which the policy network learns the guide before PPO; for start guide alone."""
     clone_envs: Count = 192
     """Episodes per such round."""
-    clone_steps: StepsOrNone = 500
+    clone_steps: Steps = 500
     """Optimiser steps per such round."""
     critic_warmup: CountOrNone = 10
     """Iterations in which the critic alone learns, so that it does not mislead a cloned policy."""
@@ -91,6 +92,11 @@ class TeacherConfig(Section, name="teacher"):
     """Updates between whole-state checkpoints."""
     stop_at: Share = 1.0
     """End early once two evaluations in a row reach this success rate."""
+
+    @property
+    def iterations(self) -> int:
+        """Number of iterations in `total_steps` control steps."""
+        return max(1, round(self.total_steps / (self.num_envs * self.unroll_steps)))
 
     @property
     def starts_from_file(self) -> bool:

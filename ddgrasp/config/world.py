@@ -127,6 +127,8 @@ class WorldConfig(Section, name="world"):
 
     def check(self) -> None:
         """See `Section.check`."""
+        if len(set(self.objects)) < len(self.objects):
+            raise self.error("objects", "each of them once")
         substeps = contract.CONTROL_DT_S / self.sim_dt_s
         if abs(substeps - round(substeps)) > 1e-6:
             raise self.error(

@@ -25,9 +25,9 @@ SETTING = (
 )
 
 _FEWEST_BLOCKS = 2
+"""On either side: resampling needs two."""
 _FEW_BLOCKS = 10
 """With fewer, drawing them again says little of other frames."""
-"""On either side: resampling needs two."""
 
 
 def real_config(config: Config, root: Path) -> Config:
