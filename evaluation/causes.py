@@ -165,7 +165,8 @@ def table(out: Path) -> list[dict[str, Any]]:
     """A row each of those that were tried.
 
     Keys: row, cause, change; success with its Wilson interval; objects; faults; seconds_per_trial; against
-    and the pairs (`evaluation.paired.compared`), None for the reference; p_holm, corrected for all rows.
+    and the pairs (`evaluation.paired.compared`), None without a common trial; p_holm, corrected for all that
+    have any.
     """
     tried = {name: {r.index: r.success for r in _known(out / name)} for name in ROWS}
     rows = [_row(out, name, tried) for name in ROWS if tried[name]]
@@ -178,7 +179,7 @@ def table(out: Path) -> list[dict[str, Any]]:
 def _row(out: Path, name: str, tried: Mapping[str, Mapping[int, bool]]) -> dict[str, Any]:
     row, counts = ROWS[name], rig_trials.tabulate(_known(out / name))
     times = out / name / TIMES_FILE
-    reference = tried[row.against] if name != REFERENCE else {}
+    pairs = paired.compared(tried[row.against] if name != REFERENCE else {}, tried[name])
     return {
         "row": name,
         "cause": row.cause,
@@ -187,8 +188,8 @@ def _row(out: Path, name: str, tried: Mapping[str, Mapping[int, bool]]) -> dict[
         "objects": counts["objects"],
         "faults": counts["faults"],
         "seconds_per_trial": read_json(times)["seconds_per_trial"] if times.exists() else None,
-        "against": row.against if reference else None,
-        "pairs": paired.compared(reference, tried[name]) if reference else None,
+        "against": row.against if pairs["n"] else None,
+        "pairs": pairs if pairs["n"] else None,
     }
 
 

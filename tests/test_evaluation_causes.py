@@ -108,6 +108,11 @@ def test_pairs_and_holm_are_those_of_the_outcomes(tmp_path, policy):
     pairs = ideal["pairs"]
     assert (pairs["only_reference"], pairs["only_row"], pairs["difference"]) == (2, 0, 1.0)
     assert pairs["p"] == pairs["p_holm"] == 0.5  # 2 of 2 one way: 2 / 2^2
+    header, *trials = log.read_text().splitlines(keepends=True)
+    other = [json.dumps({**json.loads(trial), "index": 99}) + "\n" for trial in trials[:1]]
+    log.write_text("".join([header, *other]))  # no trial in common
+    _, ideal = causes.table(tmp_path)
+    assert ideal["pairs"] is None and ideal["against"] is None
 
 
 def test_a_trial_of_the_fr3_is_the_development_rig_s(policy, tmp_path):
