@@ -14,8 +14,8 @@ from student_jax import train
 from student_jax.data import Window
 from student_jax.policy import Aux, param_shapes
 
-_ROW_BYTES = 4 * (8 + 8 + 40 + 1) + 16
-"""A training step beside its picture: state, action, observation, held, episode and step."""
+_ROW_BYTES = 4 * (9 + 8 + 40 + 1) + 17
+"""A training step beside its picture: state, action, observation, held, episode, step and drawn."""
 
 
 def need(config: Config) -> Need:

@@ -201,11 +201,6 @@ def param_shapes(config: StudentConfig, profile: CameraProfile) -> dict:
     return jax.eval_shape(lambda key: init_params(key, config, profile), jax.random.key(0))
 
 
-def count_params(params: dict) -> int:
-    """Number of scalars."""
-    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(params))
-
-
 def sample_from_seen(
     params: dict,
     seen: Seen,
