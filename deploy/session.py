@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
+from ddgrasp.install import pip_install
 from deploy import dry_run
 from deploy.calibration.standing import standing
 from deploy.clock import RealClock, RobotClock
@@ -224,5 +226,7 @@ def _check(options: SessionOptions) -> None:
             raise UserError(
                 f"{option} is {value}, and robot 'sim' has none: drop it, or choose --robot franka."
             )
+    if options.dry_run and find_spec("matplotlib") is None:  # of the arm's extra, and needed at the end
+        raise UserError(f"--dry-run ends with a drawing of what was not sent: {pip_install('franka')}.")
     if not options.seconds > 0:
         raise UserError(f"--seconds is {options.seconds:g}: choose more than 0, or inf to run until Ctrl-C.")

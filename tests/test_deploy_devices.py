@@ -431,6 +431,13 @@ def test_wrong_combination_gets_one_line(options, message):
         deploy(get_preset("debug"), Path("absent.onnx"), options)
 
 
+def test_a_drawing_that_cannot_be_made_is_told_before_the_loop(monkeypatch):
+    there = session.find_spec
+    monkeypatch.setattr(session, "find_spec", lambda name: None if name == "matplotlib" else there(name))
+    with pytest.raises(UserError, match="--dry-run ends with a drawing of what was not sent: .*franka"):
+        deploy(get_preset("debug"), Path("absent.onnx"), SessionOptions(dry_run=True))
+
+
 def test_the_rig_s_camera_never_goes_with_the_configured_arm():
     config = get_preset("debug")
     arm = config.deploy.franka.host
