@@ -5,7 +5,8 @@ last step, `meta/<field>` one row per episode. An episode counts once `episode_e
 is written last: what a crash left behind it is cut off at the next opening.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from demos.row_reader import RowReader
 _CODEC = BloscCodec(cname="zstd", clevel=3)
 STORE = "episodes.zarr"
 """In the folder of stage `demos`."""
+_ENDS = "episode_ends"
 _IMAGE_CHUNK = 16
 _ROW_CHUNK = 4096
 
@@ -48,10 +50,16 @@ class EpisodeStore:
 
     @property
     def ends(self) -> np.ndarray:
-        """(E,) index behind each episode's last step."""
-        if "episode_ends" not in self._meta:
-            return np.zeros(0, np.int64)
-        ends = np.asarray(_array(self._meta, "episode_ends")[:])
+        """(E,) index behind each episode's last step. Raises UserError if they are damaged."""
+        with self._readable(f"meta/{_ENDS}"):
+            if _ENDS not in self._meta:
+                if any(_array(self._meta, name).shape[0] > 1 for name in self._meta.array_keys()):
+                    raise ValueError("it is missing")
+                return np.zeros(0, np.int64)
+            rows = _array(self._meta, _ENDS)
+            if rows.shape[0] > 1:  # who is killed in the first append leaves a row without its file
+                _check_chunks(self.path / "meta" / _ENDS, rows, 0, rows.shape[0])
+            ends = np.asarray(rows[:])
         # The array grows before its row is written: who is killed in between leaves a zero.
         return ends[: np.count_nonzero(np.logical_and.accumulate(ends > 0))]
 
@@ -74,18 +82,24 @@ class EpisodeStore:
         return self._read("meta", field, 0, len(self))
 
     def reader(self, field: str) -> RowReader:
-        """Rows of a per-step array at random; holds none of them."""
-        return RowReader(self.path / "data" / field, _array(self._data, field))
+        """Rows of a per-step array at random; holds none of them. Raises UserError if it is damaged."""
+        with self._readable(f"data/{field}"):
+            return RowReader(self.path / "data" / field, _array(self._data, field))
 
     def _read(self, group: str, field: str, first: int, last: int) -> np.ndarray:
-        try:
+        with self._readable(f"{group}/{field}"):
             rows = _array(_group(self._root, group), field)
             _check_chunks(self.path / group / field, rows, first, last)
             return np.asarray(rows[first:last])
+
+    @contextmanager
+    def _readable(self, what: str) -> Iterator[None]:
+        """UserError for what Zarr raises of damaged files."""
+        try:
+            yield
         except (KeyError, ValueError, OSError, RuntimeError) as error:
             raise UserError(
-                f"{self.path}: {group}/{field} cannot be read ({error}). Delete {self.path.parent} and make "
-                "it again."
+                f"{self.path}: {what} cannot be read ({error}). Delete {self.path.parent} and make it again."
             ) from None
 
     def append(self, steps: Mapping[str, np.ndarray], episode: Mapping[str, ArrayLike]) -> None:
@@ -102,7 +116,7 @@ class EpisodeStore:
             _put(self._data, name, start, value)
         for name, value in episode.items():
             _put(self._meta, name, len(ends), np.asarray(value)[None])
-        _put(self._meta, "episode_ends", len(ends), np.array([start + length], np.int64))
+        _put(self._meta, _ENDS, len(ends), np.array([start + length], np.int64))
 
     def _check(self, steps: Mapping[str, np.ndarray]) -> None:
         if len(self) and steps.keys() != set(self.fields):

@@ -7,10 +7,11 @@ from jaxtyping import Float, UInt16
 from ddgrasp import contract
 from ddgrasp.config import StereoConfig
 from deploy.clock import SimClock
-from deploy.devices.fr3_camera import pinhole, stream_stereo
+from deploy.devices.fr3_camera import pinhole
 from deploy.devices.realsense_camera import RealSenseCamera
 from mjx_envs.camera import Camera
 from rig.camera import RigCamera
+from sensors.models.active_stereo import of_scale
 
 Pose = Float[np.ndarray, "4 4"]
 
@@ -22,7 +23,7 @@ class FullSizeCamera(RigCamera):
         """`profile` is the policy's picture."""
         super().__init__(model, config, profile)
         self._profile = profile
-        self.stereo = stream_stereo(config, contract.D455_STREAM)
+        self.stereo = of_scale(config, contract.D455_STREAM)
         self._driver = RealSenseCamera(SimClock(), profile, stream=contract.D455_STREAM)
 
     def depth_mm(

@@ -69,7 +69,7 @@ def start_qpos(
     rest_height_m: Float[AnyArray, ""] | float,
     xp: ModuleType = np,
 ) -> Float[AnyArray, "16"]:
-    """(16,) joints around home, gripper open, object at rest on the table.
+    """(16,) joints around home within their limits, gripper open, object at rest on the table.
 
     Args:
       joints: (7,) in [-1, 1].
@@ -77,7 +77,8 @@ def start_qpos(
       yaw_rad: () of the object.
       rest_height_m: () of its origin.
     """
-    q_arm = xp.asarray(scene.HOME_RAD) + config.joint_rad * joints
+    limits = xp.asarray(contract.JOINT_LOWER_RAD), xp.asarray(contract.JOINT_UPPER_RAD)
+    q_arm = xp.clip(xp.asarray(scene.HOME_RAD) + config.joint_rad * joints, *limits)
     half = xp.asarray(contract.WORKSPACE_SIZE_M) / 2
     place = xp.asarray(contract.WORKSPACE_CENTER_M) + half * xy
     fingers = xp.full(2, contract.GRIPPER_MAX_WIDTH_M / 2)

@@ -130,14 +130,16 @@ class GraspEnv(MjxEnv):
 
     @exact
     def step(self, state: State, action: Float[jax.Array, "8"]) -> State:
-        """One control step with `action` (8,)."""
+        """One control step with `action` (8,); an episode whose action or state is not finite is over."""
+        sound = jnp.all(jnp.isfinite(action))
+        action = jnp.where(sound, action, 0.0)  # the C engine would drive every joint to 0 by a NaN
         old: physics.PhysicsState = state.data
         episode: Episode = state.info["episode"]
         controls, latency = self._delayed(
             episode.latency, grasp_math.controls(old.qpos[QPOS.arm], action, jnp)
         )
         new = self.physics.step(episode.params, old, controls)
-        finite = jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel))
+        finite = sound & jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel))
         new = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
 
         distances = self._distances(new.qpos, episode.variant, episode.branch)

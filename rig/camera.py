@@ -13,7 +13,7 @@ from mjx_envs import draws, kinematics
 from mjx_envs.camera import Buffers, Camera, look_at, nominal_camera
 from mjx_envs.render.raycast_numpy import render, render_depth
 from rig.world import RigWorld
-from sensors.models.active_stereo import ActiveStereo
+from sensors.models.active_stereo import of_scale
 from sensors.models.materials import rig_materials
 
 FAR_M = 10.0
@@ -32,7 +32,7 @@ class RigCamera:
     ):
         """`ideal` depth is as rendered."""
         self.model, self._ideal = model, ideal
-        self.stereo = ActiveStereo(config, profile)
+        self.stereo = of_scale(config, profile)
 
     def depth_mm(
         self,

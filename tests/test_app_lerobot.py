@@ -102,9 +102,12 @@ def test_deployments_that_are_no_episodes_are_named(tmp_path):
     (picture, *_) = sorted((tmp_path / "blind" / "depth").iterdir())
     cv2.imwrite(str(picture), np.zeros_like(depth_mm[0]))
     write_deployment(tmp_path / "thin", frames=1)
+    write_deployment(tmp_path / "torn")
+    steps = tmp_path / "torn" / "steps.jsonl"
+    steps.write_text(steps.read_text()[:-20])
     source = open_source(tmp_path)
     assert [read().name for read in source.episodes] == ["judged"]
-    assert sorted(line.split(":")[0] for line in source.left_out) == ["blind", "open", "thin"]
+    assert sorted(line.split(":")[0] for line in source.left_out) == ["blind", "open", "thin", "torn"]
     assert "left out 1 of 4 frames" in " ".join(source.left_out)
     assert "1 pictures for 4 steps" in " ".join(source.left_out)
     assert open_source(tmp_path / "judged").episodes[0]().task == "grasp the object and lift it"

@@ -1,5 +1,7 @@
 """Episodes on disk survive interruption; what is whole stays readable."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -86,6 +88,34 @@ def test_a_lost_chunk_is_refused_not_read_as_zeros(tmp_path, field):
     group, name = field.split("/")[:2]
     with pytest.raises(UserError, match=f"{group}/{name} cannot be read .*is missing.* make it again"):
         again.steps(name) if group == "data" else again.episodes(name)
+
+
+@pytest.mark.parametrize("damage", ["c/0", "zarr.json", "."])
+def test_lost_ends_are_refused_and_nothing_is_written_over(tmp_path, damage):
+    """Read as no episode they would have the next append cut off all that is there."""
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    for i in range(3):
+        store.append(*episode(16, i))
+    lost = tmp_path / "s.zarr" / "meta" / "episode_ends" / damage
+    shutil.rmtree(lost) if lost.is_dir() else lost.unlink()
+    again = EpisodeStore(tmp_path / "s.zarr", create=True)
+    with pytest.raises(UserError, match=r"meta/episode_ends cannot be read .* make it again"):
+        again.append(*episode(16, 4))
+    assert again._data["action"].shape[0] == 48
+
+
+@pytest.mark.parametrize(
+    "name", ["meta/episode_ends/zarr.json", "meta/episode_ends/c/0", "data/action/zarr.json"]
+)
+def test_cut_files_of_a_store_are_one_line(tmp_path, name):
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    for i in range(3):
+        store.append(*episode(16, i))
+    file = tmp_path / "s.zarr" / name
+    file.write_bytes(file.read_bytes()[:10])
+    again = EpisodeStore(tmp_path / "s.zarr")
+    with pytest.raises(UserError, match="/".join(name.split("/")[:2])):
+        again.ends, again.reader("action")
 
 
 def test_no_store_there(tmp_path):

@@ -11,11 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from ddgrasp import contract
 from ddgrasp.config import RecordConfig, StereoConfig, WorldConfig
 from ddgrasp.errors import UserError
 from mjx_envs.camera import Buffers, Camera, nominal_camera
 from rig.camera import RigCamera, jittered_pose
-from sensors.models.active_stereo import ActiveStereo
+from sensors.models.active_stereo import ActiveStereo, of_scale
 from sensors.models.matching import flatten
 from sensors.models.materials import Material
 from sensors.statistics import curves, figures, stats
@@ -50,6 +51,13 @@ def wall(range_m: float, square_range_m: float = 0.0, half_m: float = 0.1):
 def sense(render, seed: int = 0, materials=GREY, **config) -> np.ndarray:
     camera = ActiveStereo(replace(StereoConfig(), **config), PROFILE)
     return camera.sense(render, T_WORLD_CAM, np.random.default_rng(seed), materials)
+
+
+def test_windows_cover_as_much_of_a_surface_in_larger_pictures():
+    configured = StereoConfig()
+    for scale, larger in ((0.125, 1.0), (0.25, 1.0), (0.5, 2.0), (1.0, 4.0)):
+        made = of_scale(configured, contract.D455.scaled(scale)).config
+        assert made == (configured if larger == 1 else configured.finer(larger)), scale
 
 
 @pytest.mark.parametrize("range_m", [0.5, 0.8, 1.2])

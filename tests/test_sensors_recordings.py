@@ -209,6 +209,17 @@ def test_undeclared_unit_is_refused(tmp_path, value):
         Recording.open(path)
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [{"fx_px": "382.7"}, {"fx_px": -382.7}, {"baseline_m": True}, {"consecutive_frames": "false"}, {"hz": 0}],
+)
+def test_fields_of_another_kind_are_refused(tmp_path, fields):
+    path = _write(tmp_path / "a")
+    _set_meta(path, **fields)
+    with pytest.raises(UserError, match=f"meta.json: {next(iter(fields))} is "):
+        Recording.open(path)
+
+
 def test_find_recordings_errors_name_the_folder(tmp_path):
     with pytest.raises(UserError, match="no such folder"):
         find_recordings(tmp_path / "missing")

@@ -166,6 +166,7 @@ def test_formulas_scaled_are_as_noisy_in_a_larger_picture_of_the_same_wall():
     covered = [np.mean(np.abs(seen - 0.8) > 0.03) for seen in (small, large)]
     assert covered[1] == pytest.approx(covered[0], rel=0.25) and covered[0] > 0.002
     assert strengths.scaled(1.0) == strengths
+    assert strengths.scaled(0.125).stick_width_px == 1.0
 
 
 def test_sticks_have_the_expected_number_and_one_depth_each():

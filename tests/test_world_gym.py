@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode  # noqa: E402
 
 from ddgrasp.config import WorldConfig  # noqa: E402
 from ddgrasp.errors import UserError  # noqa: E402
+from mjx_envs.gym.spaces import action_space, check_shape  # noqa: E402
 from ppo import policy  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
@@ -87,6 +88,25 @@ def test_an_object_knocked_off_the_table_ends_the_episode():
     env._scenes = env._scenes.replace(state=state.replace(data=away))
     *_, terminated, truncated, info = env.step(np.zeros(8, np.float32))
     assert (terminated, truncated, info["success"]) == (True, False, False)
+
+
+def test_an_action_that_is_not_finite_ends_the_episode_where_it_stands():
+    """The C engine takes a NaN for 0 on every joint and swings the arm there."""
+    env = gymnasium.make(ID, world=WORLD).unwrapped
+    env.reset(seed=0)
+    before = np.asarray(env._scenes.state.data.qpos)
+    action = np.zeros(8, np.float32)
+    action[3] = np.nan
+    _, reward, terminated, truncated, _ = env.step(action)
+    assert np.isfinite(reward) and (terminated, truncated) == (True, False)
+    np.testing.assert_array_equal(np.asarray(env._scenes.state.data.qpos), before)
+
+
+def test_an_action_of_another_length_is_refused():
+    for shape, space in (((7,), action_space()), ((2, 8), action_space())):
+        with pytest.raises(ValueError, match=r"the action has shape .*; expected \(8,\)"):
+            check_shape(np.zeros(shape, np.float32), space)
+    check_shape(np.zeros(8), action_space())
 
 
 def test_without_autoreset_chosen_environments_begin_anew():

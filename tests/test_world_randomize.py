@@ -10,7 +10,7 @@ import pytest
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig, WorldConfig
 from ddgrasp.layout import OBSERVATION, QPOS, QVEL
-from mjx_envs import grasp_math, kinematics, randomize, scene
+from mjx_envs import draws, grasp_math, kinematics, randomize, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from mjx_envs.objects import OBJECTS
@@ -132,6 +132,14 @@ def test_ranges_are_drawn_independently(sampler):
     columns = np.concatenate([draws[name].reshape(COUNT, -1) for name in names], axis=1)
     correlation = np.corrcoef(columns.T) - np.eye(columns.shape[1])
     assert np.abs(correlation).max() < 0.25  # 5 standard deviations at 400 draws
+
+
+def test_an_arm_starts_within_its_limits_however_far_from_home():
+    config = RandomConfig(joint_rad=1.0)
+    qpos = draws.start_qpos(config, -np.ones(7), np.zeros(2), np.zeros(()), 0.02)
+    home, limits = np.array(scene.HOME_RAD), np.array(contract.JOINT_LOWER_RAD)
+    np.testing.assert_allclose(qpos[:7], np.maximum(home - 1.0, limits))
+    assert (qpos[:7] > home - 1.0).any()
 
 
 def test_the_pose_covers_the_workspace_and_all_yaws():

@@ -18,6 +18,7 @@ from sensors.recordings.recording import Recording, is_recording
 
 OBJECT = "object"
 """Where a report names what was to be grasped."""
+_NEEDED = ("q_rad", "width_m", "action")
 OPEN = -1.0
 """The gripper's command before the first action: the hand starts open."""
 
@@ -35,12 +36,14 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
     usable, left_out = {}, []
     for deployment in found:
         try:
-            usable[deployment.folder] = deployment, _pictures(deployment)
+            recording = _pictures(deployment)
+            usable[deployment.folder] = deployment, _read(deployment, recording)
         except UserError as error:
             left_out.append(f"{deployment.folder.name}: {error}")
     if not usable:
         raise UserError(f"{found[0].folder.parent}: no episode can be used ({'; '.join(left_out)}).")
     taken = [deployment for deployment, _ in usable.values()]
+    episodes = [partial(_as_it_is, episode) for _, episode in usable.values()]
     about = {
         "Robot": f"Franka arm; driver or rig: {_each(taken, 'robot')}.",
         "Camera": f"{_each(taken, 'camera')}, across the table; its depth is raw, with its holes and noise.",
@@ -48,9 +51,11 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
         "it asked for, before the safety filter, or what a slow arm lacked of that. Success is what the rig "
         "knows or a person answered.",
     }
-    return Source(
-        "deployments", "franka", about, [partial(_read, *each) for each in usable.values()], left_out
-    )
+    return Source("deployments", "franka", about, episodes, left_out)
+
+
+def _as_it_is(episode: Episode) -> Episode:
+    return episode
 
 
 def _each(deployments: Sequence[Deployment], key: str) -> str:
@@ -100,9 +105,12 @@ def _read(deployment: Deployment, recording: Recording) -> Episode:
 def _steps(path: Path) -> list[dict[str, Any]]:
     """The lines of a steps.jsonl. Raises UserError for a damaged one."""
     try:
-        return [json.loads(line) for line in path.read_text().splitlines()]
-    except ValueError as error:
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        if lacking := next((name for row in rows for name in _NEEDED if name not in row), ""):
+            raise ValueError(f"a step lacks {lacking}")
+    except (ValueError, OSError, TypeError) as error:
         raise UserError(f"{path} is damaged ({error}): move its folder elsewhere.") from None
+    return rows
 
 
 def actions(rows: Sequence[Mapping[str, Any]]) -> np.ndarray:

@@ -76,7 +76,7 @@ class StereoConfig(Section, name="record.stereo"):
     """Window of that residual."""
     refine_window_px: _Window = 9
     """Window of the sub-pixel step."""
-    flat_window_px: _Window = 9
+    flat_window_px: Annotated[int, Range(3, 255)] = 9
     """Window of the filter that smooths flat surfaces after it."""
     flat_noise_px: Annotated[float, Range(0, 10)] = 0.08
     """Disparity noise that filter takes away, standard deviation: larger relief stays. 0 switches it off."""
@@ -130,9 +130,12 @@ class DextrahConfig(Section, name="sensor.dextrah"):
 
     def scaled(self, scale: float) -> "DextrahConfig":
         """The same noise for a picture `scale` times as wide of the same scene: lengths and disparities grow
-        with it, as many sticks fall on a picture, and the same share of single pixels is lost."""
-        lengths = ("shift_px", "disparity_px", "correlation_px", "stick_length_px", "stick_width_px")
+        with it, as many sticks fall on a picture, of a pixel at least, and the same share of single pixels is
+        lost."""
+        lengths = ("shift_px", "disparity_px", "correlation_px")
         grown = {name: scale * getattr(self, name) for name in lengths}
+        sticks = ("stick_length_px", "stick_width_px")
+        grown |= {name: max(1.0, scale * getattr(self, name)) for name in sticks}
         return replace(self, stick=self.stick / scale**2, **grown)
 
 

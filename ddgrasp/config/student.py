@@ -48,7 +48,7 @@ class PictureConfig(Section, name="student.picture"):
     """Columns of the picture given to the encoder, a multiple of 4."""
     channels: tuple[Channel, ...] = ("relief", "valid")
     """Per frame: relief (height over the empty table along the ray), valid (0 or 1), depth (metres)."""
-    min_depth_m: _Metres = 0.1
+    min_depth_m: Annotated[float, Range(0, 100, above=True)] = 0.1
     """Nearer readings are treated as invalid."""
     max_depth_m: _Metres = 2.5
     """Farther readings are treated as invalid."""

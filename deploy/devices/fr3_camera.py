@@ -19,11 +19,8 @@ if TYPE_CHECKING:
 
     from rig.fr3.channel import Channel
     from rig.fr3.picture import ScenePicture
-    from sensors.models.active_stereo import ActiveStereo
 
 Pose = Float[np.ndarray, "4 4"]
-RIG_SCALE = 0.25
-"""`world.camera_scale` at which the configuration's windows were chosen, by the development rig."""
 Sense = Callable[["ScenePicture", Pose, str], Depth]
 """From the scene as it stands, where the camera is, and the object's name: (H, W) uint16 millimetres."""
 
@@ -51,22 +48,16 @@ def stereo(
 
     `profile` is the policy's picture.
     """
+    from sensors.models.active_stereo import of_scale
     from sensors.models.materials import rig_materials
 
-    camera, driver = stream_stereo(config, stream), RealSenseCamera(clock, profile, stream=stream)
+    camera, driver = of_scale(config, stream), RealSenseCamera(clock, profile, stream=stream)
 
     def sense(picture: "ScenePicture", T_world_cam: Pose, name: str) -> Depth:
         materials = rig_materials(picture.model, name)
         return driver.convert(camera.sense(picture.buffers, T_world_cam, rng, materials, picture.depth_m))
 
     return sense
-
-
-def stream_stereo(config: StereoConfig, stream: contract.CameraProfile) -> "ActiveStereo":
-    """The matcher for pictures of `stream`: its windows cover as much of a surface as at `RIG_SCALE`."""
-    from sensors.models.active_stereo import ActiveStereo
-
-    return ActiveStereo(config, stream, stream.fx_px / contract.D455.scaled(RIG_SCALE).fx_px)
 
 
 def ideal(profile: contract.CameraProfile) -> Sense:

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from ddgrasp import contract
 from ddgrasp.config import WorldConfig
 from mjx_envs.gym.simulator import Scenes, draw_keys, simulator
-from mjx_envs.gym.spaces import action_space
+from mjx_envs.gym.spaces import action_space, check_shape
 
 
 class PickEnv(gymnasium.Env):
@@ -42,7 +42,11 @@ class PickEnv(gymnasium.Env):
         return self._observation(self._scenes), self._info(self._scenes)
 
     def step(self, action: Float[np.ndarray, "8"]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One control step with `action` (8,): (observation, reward, terminated, truncated, info)."""
+        """One control step with `action` (8,): (observation, reward, terminated, truncated, info).
+
+        Raises ValueError for an action of another shape.
+        """
+        check_shape(action, self.action_space)
         scenes = self._simulator.step(self._begun(), np.asarray(action, np.float32)[None])
         self._scenes, state = scenes, scenes.state
         reward, over, truncated = (

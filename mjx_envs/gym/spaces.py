@@ -1,5 +1,7 @@
 """Spaces of the grasping task, with bounds that hold: what lies beyond them is put onto them."""
 
+from typing import Any
+
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float
@@ -20,6 +22,13 @@ BOUNDS = {
 }  # fmt: skip
 """Part of `OBSERVATION` or `STATE` -> its bounds: rad, m, rad/s, m/s. No joint or place gets there, and
 speeds do so in collisions alone."""
+
+
+def check_shape(action: Any, space: spaces.Space) -> None:
+    """ValueError for an action that is no member of `space` by its shape: too short a one would drive the
+    gripper by a joint's number."""
+    if np.shape(action) != space.shape:
+        raise ValueError(f"the action has shape {np.shape(action)}; expected {space.shape}")
 
 
 def action_space() -> spaces.Box:

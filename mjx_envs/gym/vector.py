@@ -19,7 +19,7 @@ from ddgrasp.config import WorldConfig
 from ddgrasp.errors import UserError
 from mjx_envs.gym.env import PickEnv
 from mjx_envs.gym.simulator import Scenes, draw_keys, simulator
-from mjx_envs.gym.spaces import action_space
+from mjx_envs.gym.spaces import action_space, check_shape
 
 Seeds = SupportsIndex | Sequence[SupportsIndex | None] | np.ndarray | None
 Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
@@ -87,7 +87,8 @@ class PickVectorEnv(VectorEnv):
         return self._observations(self._scenes), self._infos(self._scenes)
 
     def step(self, actions: Float[np.ndarray, "n 8"]) -> Step:
-        """One control step with `actions` (N, 8)."""
+        """One control step with `actions` (N, 8). Raises ValueError for actions of another shape."""
+        check_shape(actions, self.action_space)
         if self._scenes is None:
             raise error.ResetNeeded("call reset() before step()")
         begin = self._over if self._mode is AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, bool)

@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32, UInt8, UInt16
 
 from ddgrasp.config import StereoConfig
 from ddgrasp.config.sensors import odd
-from ddgrasp.contract import CameraProfile
+from ddgrasp.contract import D455, CameraProfile
 from ddgrasp.depth import to_millimetres
 from mjx_envs.camera import Buffers, Camera
 from sensors.models import matching
@@ -59,10 +59,19 @@ CONTRAST_WINDOW_PX = 9
 """The pictures are compared less their mean over this window."""
 TEXTURE_WINDOW_PX = 7
 """Contrast is measured over this window: small enough for a dark object on a bright table."""
+CONFIG_SCALE = 0.25
+"""`world.camera_scale` at which `StereoConfig`'s windows, and those above, were chosen."""
+
+
+def of_scale(config: StereoConfig, profile: CameraProfile) -> "ActiveStereo":
+    """The camera for pictures of `profile`: windows cover as much of a surface as at `CONFIG_SCALE`, for
+    which `config` counts pixels. In smaller pictures they are as many pixels as there."""
+    larger = profile.fx_px / D455.scaled(CONFIG_SCALE).fx_px
+    return ActiveStereo(config, profile, max(1.0, larger))
 
 
 class ActiveStereo:
-    """Depth as an active-stereo camera reports it, at any scale of a camera profile.
+    """Depth as an active-stereo camera reports it.
 
     The pattern and the matcher are made once; frames differ by the generator given to `sense`.
     """

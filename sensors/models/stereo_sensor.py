@@ -19,7 +19,7 @@ from ddgrasp.contract import CameraProfile
 from ddgrasp.depth import to_metres
 from ddgrasp.errors import UserError
 from mjx_envs.camera import nominal_camera
-from sensors.models.active_stereo import ActiveStereo, albedo_texture
+from sensors.models.active_stereo import albedo_texture, of_scale
 from sensors.models.materials import TABLE_TEXTURE
 from sensors.models.reprojection import from_beside
 from sensors.models.sense import Key, Sense, batched
@@ -30,7 +30,7 @@ GREY = 0.5
 
 def stereo(config: StereoConfig, profile: CameraProfile) -> Sense:
     """The rig's camera on clean depth of `profile`'s size; the light is that of the nominal extrinsics."""
-    camera = ActiveStereo(config, profile)
+    camera = of_scale(config, profile)
     T_world_cam = nominal_camera(profile).T_world_cam
     texture = albedo_texture(config.pattern_seed, profile.height_px, profile.width_px)
     wear = 1.0 + TABLE_TEXTURE * texture[..., None]

@@ -24,6 +24,7 @@ from sensors.recordings.recording import (
     NEAREST_MEDIAN_M,
     UNIT_CHECK_FRAMES,
     RecordingWriter,
+    check_fields,
 )
 from sensors.recordings.sources import RawFrame, Source, in_time
 
@@ -249,6 +250,7 @@ def _own_meta(file: Path) -> dict[str, Any]:
     unit = meta.get("depth_unit_m", DEPTH_UNIT_M)
     if isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit <= 1:
         raise UserError(f"{file}: depth_unit_m is {unit!r}; expected metres per unit of depth, up to 1.")
+    check_fields(file, meta)
     return meta
 
 

@@ -7,9 +7,10 @@ whose depth cannot be what it claims (unit, type, size) is refused. NumPy and Op
 
 import hashlib
 import json
+import math
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, SupportsIndex
@@ -355,7 +356,22 @@ def _read_meta(path: Path) -> dict[str, Any]:
             f"{file}: written with contract version {version!r}, this code has {CONTRACT_VERSION}: record or "
             "import it again, or use the release that made it."
         )
+    check_fields(file, meta)
     return meta
+
+
+def check_fields(file: Path, meta: Mapping[str, Any]) -> None:
+    """UserError for a field of a meta.json, as people write them by hand, that is of another kind."""
+    for name in ("fx_px", "baseline_m", "hz"):
+        if (value := meta.get(name)) is not None and not _is_positive(value):
+            raise UserError(f"{file}: {name} is {value!r}; expected a number above 0, or null.")
+    for name in ("consecutive_frames", "color_aligned_to_depth"):
+        if not isinstance(value := meta.get(name, False), bool):
+            raise UserError(f"{file}: {name} is {value!r}; expected true or false.")
+
+
+def _is_positive(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, int | float) and 0 < value < math.inf
 
 
 def _check_unit(recording: Recording) -> None:
