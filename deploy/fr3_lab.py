@@ -24,6 +24,8 @@ AWAY_M = (1.05, 0.0)
 SETTLE_S = 0.3
 """From when the object is put down to the first step."""
 ATTEMPTS = 3
+OF_THE_MACHINE = (LOST, NO_FRANKA, "does not answer", "did not end in", "is not at its start pose")
+"""What an error says that a busy machine makes, and a trial does not."""
 
 
 class Fr3Lab:
@@ -64,7 +66,7 @@ class Fr3Lab:
                 lost = "the FR3 rig has gone"
             except (ChannelLost, CameraError, RobotError, UserError) as error:
                 lost = str(error)
-                if self._is_up() and not any(sign in lost for sign in (LOST, NO_FRANKA)):
+                if self._is_up() and not any(sign in lost for sign in OF_THE_MACHINE):
                     raise
             self.close()
         raise UserError(f"{lost} ({ATTEMPTS} times): use fewer --workers, or end what else runs here.")

@@ -3,6 +3,7 @@
 All timestamps are seconds on the clock's own monotonic scale, so that ages can be told.
 """
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -185,6 +186,24 @@ class Staged(Protocol):
 
     def scene(self) -> "tuple[mujoco.MjModel, mujoco.MjData]":
         """What is simulated; both change in place as it goes on."""
+        ...
+
+
+@runtime_checkable
+class Pausing(Protocol):
+    """A camera before a simulation that keeps its own time: what is done with a frame must not cost any."""
+
+    def time_held(self) -> AbstractContextManager[None]:
+        """That time nearly stands still meanwhile."""
+        ...
+
+
+@runtime_checkable
+class KnowsObject(Protocol):
+    """A camera before a rig, which knows what lies there."""
+
+    def object_name(self) -> str:
+        """Its name, once the camera has started."""
         ...
 
 

@@ -234,7 +234,11 @@ class ControlLoop:
 
     def _or_retry(self, state: RobotState, action: np.ndarray) -> np.ndarray:
         """(8,) `action`, or what a hand does that tries again, after which the policy begins anew."""
-        instead = None if self._retry is None else self._retry(state.vector(), bool(state.met), state.felt_nm)
+        instead = (
+            None
+            if self._retry is None
+            else self._retry(state.vector(), bool(state.met), state.felt_nm, self._closed)
+        )
         if instead is None:
             return action
         assert self._retry is not None

@@ -19,6 +19,8 @@ from deploy.interfaces import Depth
 POLICY_FILE = "policy.onnx"
 """As the stage `export` names it."""
 NOISES = ("zero", "normal")
+LEAST_VALID = 0.02
+"""Share of a frame's pixels: with fewer something is over the lens, or nearer than the camera sees."""
 PLAUSIBLE_MEDIAN_M = (0.05, 20.0)
 """A scene's median depth outside this is another unit, not another scene."""
 
@@ -121,7 +123,7 @@ class OnnxPolicy:
         return f"wrong depth: median {median:g} cannot be {self.depth_input.unit}"
 
     def check_frame(self, depth: np.ndarray) -> str:
-        """Why this one frame cannot be used, empty if it can: type, size, finiteness, any valid pixel."""
+        """Why this one frame cannot be used, empty if it can: type, size, finiteness, valid pixels."""
         problem = self.check_fit(depth)
         if problem:
             return problem
@@ -129,6 +131,8 @@ class OnnxPolicy:
             return f"non-finite depth: {int((~np.isfinite(depth)).sum())} pixels"
         if not (depth > 0).any():
             return "all-invalid depth: no pixel above 0"
+        if (share := float(np.mean(depth > 0))) < LEAST_VALID:
+            return f"almost all-invalid depth: {100 * share:.2g} % of the pixels are above 0"
         return ""
 
     def act(self, depth: Depth, state: Float[np.ndarray, " _"]) -> Float32[np.ndarray, "8"]:

@@ -20,6 +20,7 @@ from ddgrasp import contract
 from ddgrasp.depth import to_millimetres
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from deploy.interfaces import Camera, Filmed, Judge
+from deploy.interrupts import unbroken
 from deploy.loop import Step
 from rig.film import Film, contact_sheet
 
@@ -60,8 +61,9 @@ class DeploymentRecord:
         try:
             yield
         finally:
-            self._queue.put(None)
-            thread.join()
+            with unbroken():  # a thread that is left behind would put its frames over the report
+                self._queue.put(None)
+                thread.join()
 
     def look(self, step: Step) -> None:
         """What the loop's `on_step` is called with."""

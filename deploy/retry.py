@@ -33,7 +33,7 @@ STILL_SHARE, REACH_M = 0.5, 0.4
 """The same of an arm that may not go faster: share of the way that it may make, and how far a hand is at
 least from the joint that moves it."""
 OPEN_WIDTH_M = 0.07
-"""Fingers are open that are farther apart."""
+"""Fingers are open that are farther apart and were not told to close: an apple may be wider."""
 LOW_M = 0.20
 """Only below this height of the grip does standing still mean that it is at something."""
 CLOSING_STEPS = 10
@@ -95,6 +95,8 @@ class _Now:
     grip_m: Float[np.ndarray, "3"]
     """Where the grip is, by them."""
     met: bool
+    closed: bool
+    """What the fingers were told last."""
     pressed_m: Float[np.ndarray, "2"]
     """`aside.pressed_at`."""
     landed: bool
@@ -128,28 +130,34 @@ class Retry:
 
     def reset(self) -> None:
         """Start of an episode: what was before does not count."""
+        self._doing = self._lifting = None
         self.held()
         self._lifted_steps = 0
         self._stay_rad: np.ndarray | None = None
 
     def held(self) -> None:
-        """The arm was held: what was before does not count, except that something is lifted."""
+        """The arm was held: what was before does not count, except that something is lifted, or being it."""
         self.begun = ""
         """Why it took over in the last call, empty if it did not."""
         self.done = False
         """Whether that was because nothing is left to do."""
-        self._end()
+        self._end(then=self._lifting if self._doing is self._lifting else None)
         self._closed_once = False
 
     def __call__(
-        self, state: Float[np.ndarray, "8"], met: bool = False, felt_nm: Float[np.ndarray, "7"] | None = None
+        self,
+        state: Float[np.ndarray, "8"],
+        met: bool = False,
+        felt_nm: Float[np.ndarray, "7"] | None = None,
+        closed: bool = False,
     ) -> Float[np.ndarray, "8"] | None:
         """(8,) action for the state (8,), None where the policy is to act.
 
-        `met`: the arm gave way; `felt_nm`: (7,) what pressed on it, see `RobotState`.
+        `met`: the arm gave way; `felt_nm`: (7,) what pressed on it, see `RobotState`; `closed`: what the
+        fingers were told last.
         """
         self.begun, self.done = "", False
-        self._now = self._observed(state, met, felt_nm)
+        self._now = self._observed(state, met, felt_nm, closed)
         if (stay := self._stay()) is not None:
             return stay
         if self._doing is None:
@@ -157,7 +165,7 @@ class Retry:
         return None if self._doing is None else next(self._doing)
 
     def _observed(
-        self, state: Float[np.ndarray, "8"], met: bool, felt_nm: Float[np.ndarray, "7"] | None
+        self, state: Float[np.ndarray, "8"], met: bool, felt_nm: Float[np.ndarray, "7"] | None, closed: bool
     ) -> _Now:
         q_rad = state[STATE.arm].astype(np.float64)
         grip_m = grip_position(q_rad)
@@ -165,7 +173,7 @@ class Retry:
         self._widths.append(float(state[STATE.width][0]))
         pressed_m = pressed_at(q_rad, self._tared(grip_m, felt_nm))
         landed = self._landing(float(grip_m[2]), pressed_m)
-        return _Now(state, q_rad, grip_m, met, pressed_m, landed)
+        return _Now(state, q_rad, grip_m, met, closed, pressed_m, landed)
 
     def _tared(
         self, grip_m: Float[np.ndarray, "3"], felt_nm: Float[np.ndarray, "7"] | None
@@ -203,7 +211,7 @@ class Retry:
             return None
         if self._keeps():
             self.begun = f"it has held something for {_SECONDS:.0f} s; lifts it"
-            return self._lift()
+            return self._begin_lift()
         if not self._stands():
             return None
         reason = f"the open hand has stood still for {_SECONDS:.0f} s"
@@ -234,10 +242,14 @@ class Retry:
         for left in reversed(range(CLOSING_STEPS)):
             if self._grips():
                 self.begun, self._closed_once = "it holds something; lifts it", False
-                self._end(then=self._lift())
+                self._end(then=self._begin_lift())
             elif not left:
                 self._end()
             yield _still(CLOSE)
+
+    def _begin_lift(self) -> Iterator[np.ndarray]:
+        self._lifting = self._lift()
+        return self._lifting
 
     def _lift(self) -> Iterator[np.ndarray]:
         """Straight up, then to where objects are lifted to."""
@@ -270,20 +282,21 @@ class Retry:
 
     def _may_step_aside(self) -> bool:
         low = LOWEST_M < self._now.grip_m[2] < LOW_M
-        return bool(low and self._asides_left and self._widths[-1] > OPEN_WIDTH_M)
+        return bool(low and self._asides_left and self._widths[-1] > OPEN_WIDTH_M and not self._now.closed)
 
     def _stands(self) -> bool:
         """Whether the open hand stands still."""
         moved_m = float(np.linalg.norm(self._places[0] - self._now.grip_m))
         still = moved_m < self._still_m and self._now.grip_m[2] < LOW_M
-        return bool(still and min(self._widths) > OPEN_WIDTH_M)
+        return bool(still and min(self._widths) > OPEN_WIDTH_M and not self._now.closed)
 
     def _keeps(self) -> bool:
         """Whether the fingers stand on something, and the hand stays low with it."""
         height_m = float(self._now.grip_m[2])
         same = max(self._widths) - min(self._widths) < SAME_WIDTH_M
         stays = height_m - float(self._places[0][2]) < self._still_m and height_m < LOW_M
-        return stays and same and EMPTY_WIDTH_M < self._widths[-1] < OPEN_WIDTH_M
+        widest_m = WIDEST_HELD_M if self._now.closed else OPEN_WIDTH_M
+        return stays and same and EMPTY_WIDTH_M < self._widths[-1] < widest_m
 
     def _holds(self) -> bool:
         return EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M

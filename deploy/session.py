@@ -21,7 +21,7 @@ from deploy.clock import RealClock, RobotClock
 from deploy.devices.options import RIG_CAMERAS, RIG_HOST, SessionOptions, Setup
 from deploy.devices.registry import check_devices, make_devices
 from deploy.dry_run import DryRun
-from deploy.interfaces import Clock, Robot, TimedRobot
+from deploy.interfaces import Camera, Clock, KnowsObject, Robot, TimedRobot
 from deploy.interrupts import terminable, unbroken
 from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
@@ -76,9 +76,9 @@ def _run(
     profile = contract.D455.scaled(policy.info.depth_width / contract.D455.width_px)
     kept = DeploymentRecord(camera, profile, f"{options.camera}, D455 profile", config.deploy.film_every)
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
-    if name := options.object_name or (config.world.objects[0] if options.robot == "sim" else ""):
-        about["object"] = name
+    name = options.object_name or (config.world.objects[0] if options.robot == "sim" else "")
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
+    ending = contextlib.ExitStack()
     try:
         with kept.into(folder):
             report = loop.run(steps, kept.look)
@@ -86,17 +86,21 @@ def _run(
             unattended = options.yes or report.interrupted or bool(report.fault)
             finished = not (options.dry_run or report.interrupted)
             success = verdict(camera, _unasked if unattended else ask_success) if finished else None
+            ending.enter_context(unbroken())
     except BaseException as error:
         if not loop.report.steps:
             with contextlib.suppress(OSError):
                 folder.rmdir()
         else:  # a device that fails in a way of its own costs nothing of what was recorded
             fault = loop.report.fault or f"{type(error).__name__}: {error}"
-            with contextlib.suppress(OSError, ValueError):
-                kept.finish(folder, {**loop.report.as_dict(), "fault": fault}, None, about)
+            with unbroken(), contextlib.suppress(OSError, ValueError):
+                kept.finish(
+                    folder, {**loop.report.as_dict(), "fault": fault}, None, about | _object(camera, name)
+                )
+        ending.close()
         raise
-    with unbroken():
-        kept.finish(folder, report.as_dict(), success, about)
+    with ending:
+        kept.finish(folder, report.as_dict(), success, about | _object(camera, name))
     if success is not None:
         say(f"verdict: {ENDED[success]}")
     say(f"report: {folder / REPORT_FILE}")
@@ -105,6 +109,13 @@ def _run(
         atomic_write_bytes(path, dry_run.draw(driven.sent, safety.limits, 1.0 / policy.info.control_hz))
         say(f"drawn: {path}")
     return report
+
+
+def _object(camera: Camera, named: str) -> dict[str, str]:
+    """For the report: what lies before the arm, as its rig knows it, else as it was `named`; nothing if
+    neither says."""
+    there = camera.object_name() if isinstance(camera, KnowsObject) else ""
+    return {"object": there or named} if there or named else {}
 
 
 def _survived(say: Callable[[str], None]) -> Callable[[str], None]:
@@ -228,5 +239,8 @@ def _check(options: SessionOptions) -> None:
             )
     if options.dry_run and find_spec("matplotlib") is None:  # of the arm's extra, and needed at the end
         raise UserError(f"--dry-run ends with a drawing of what was not sent: {pip_install('franka')}.")
-    if not options.seconds > 0:
-        raise UserError(f"--seconds is {options.seconds:g}: choose more than 0, or inf to run until Ctrl-C.")
+    if not options.seconds >= contract.CONTROL_DT_S:
+        raise UserError(
+            f"--seconds is {options.seconds:g}: choose {contract.CONTROL_DT_S:g}, a control step, or more; "
+            "inf runs until Ctrl-C."
+        )

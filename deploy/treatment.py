@@ -1,6 +1,7 @@
 """What may be done to recorded depth on its way to the policy: a camera that hands out treated frames."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -8,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from ddgrasp.errors import UserError
-from deploy.interfaces import Camera, CameraError, Depth, Filmed, Frame, Simulated
+from deploy.interfaces import Camera, CameraError, Depth, Filmed, Frame, Pausing, Simulated
 from sensors.inpainting import RADIUS_PX, inpainted
 
 CleanDepth = Callable[[], UInt16[np.ndarray, "H W"]]
@@ -77,7 +78,9 @@ class TreatedCamera:
         """See Camera: the newest frame, treated. Raises CameraError."""
         taken = self._camera.read()
         if self._frame is None or taken is not self._taken:
-            self._taken, self._frame = taken, replace(taken, depth=self._treat(taken))
+            pausing = self._camera.time_held() if isinstance(self._camera, Pausing) else nullcontext()
+            with pausing:
+                self._taken, self._frame = taken, replace(taken, depth=self._treat(taken))
         return self._frame
 
     def stop(self) -> None:

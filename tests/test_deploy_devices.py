@@ -247,9 +247,13 @@ class Homing:
     """A hand that homes, or does not; a future of franky's too."""
 
     def __init__(self, homed: bool | None):
-        self._homed, self.stopped = homed, False
+        self._homed, self.stopped, self.opened = homed, False, False
 
     def homing_async(self) -> "Homing":
+        return self
+
+    def open_async(self, speed_m_s: float) -> "Homing":
+        self.opened = True
         return self
 
     def wait(self, timeout: float) -> bool:
@@ -265,7 +269,9 @@ class Homing:
 def test_a_hand_that_does_not_home_ends_the_start(monkeypatch):
     monkeypatch.setattr(franka_robot, "HOMING_S", 0.05)
     robot = FrankaRobot(FrankaConfig(host="127.0.0.9"), SimClock(), None)
-    robot._home(Homing(True))
+    homed = Homing(True)
+    robot._home(homed)
+    assert homed.opened
     with pytest.raises(HandError, match="homing failed: take away what is between its fingers"):
         robot._home(Homing(False))
     never = Homing(None)
@@ -421,9 +427,10 @@ def test_drivers_that_never_started_can_be_stopped():
         (SessionOptions(host="10.0.0.7"), "--host is 10.0.0.7, and robot 'sim' has none: drop it, or choose"),
         (SessionOptions("sim", "replay", Path("r"), host="10.0.0.7"), "--host is 10.0.0.7, and robot 'sim'"),
         (SessionOptions(calibration=Path("c.json")), "--calibration is c.json, and robot 'sim' has none"),
-        (SessionOptions(seconds=-1.0), "--seconds is -1: choose more than 0"),
-        (SessionOptions(seconds=0.0), "--seconds is 0: choose more than 0"),
-        (SessionOptions(seconds=float("nan")), "--seconds is nan: choose more than 0"),
+        (SessionOptions(seconds=-1.0), "--seconds is -1: choose 0.1, a control step, or more"),
+        (SessionOptions(seconds=0.0), "--seconds is 0: choose 0.1"),
+        (SessionOptions(seconds=0.04), "--seconds is 0.04: choose 0.1, a control step"),
+        (SessionOptions(seconds=float("nan")), "--seconds is nan: choose 0.1"),
     ],
 )
 def test_wrong_combination_gets_one_line(options, message):

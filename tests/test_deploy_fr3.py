@@ -416,6 +416,11 @@ def test_start_asks_first_then_homes_and_moves_slowly_to_the_start_pose():
         robot.stop()
         np.testing.assert_allclose(rig.channel.ask("state")["q_rad"], away, atol=2e-3)
         assert "and move to the start pose (0.03 rad away) at 5% of its speed" in asked[0]
+        import franky
+
+        gripper = franky.Gripper(rig.host)
+        gripper.move(0.03, 0.1)
+        del gripper  # it takes one client
         robot, clock = connect(config, asked.append)
         before_s = rig.channel.ask("state")["time_s"]
         robot.start()
@@ -423,6 +428,7 @@ def test_start_asks_first_then_homes_and_moves_slowly_to_the_start_pose():
         np.testing.assert_allclose(state["q_rad"], HOME_RAD, atol=AT_START_RAD)
         fastest_s = 0.03 / (config.franka.start_dynamics * min(contract.PANDA.joint_velocity_rad_s))
         assert state["time_s"] - before_s > fastest_s
+        assert robot.read_state().width_m > 0.078, "as wide as it goes, however wide it was before"
         robot.stop()
 
 

@@ -126,6 +126,10 @@ def test_metres_go_in_as_metres(tmp_path):
         (depth_mm().astype(np.float32), "wrong depth: type float32"),
         (depth_mm()[:-1], "wrong depth: size"),
         (np.zeros(SHAPE, np.uint16), "all-invalid depth"),
+        (
+            np.pad(depth_mm()[:1, :1], ((0, SHAPE[0] - 1), (0, SHAPE[1] - 1))),
+            "almost all-invalid depth: 0.69 %",
+        ),
     ],
 )
 def test_frames_in_millimetres_are_checked(tmp_path, depth, problem):

@@ -3,6 +3,8 @@
 import json
 import os
 import signal
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +19,7 @@ from deploy.interfaces import Frame
 from deploy_support import KinematicRobot, constant_bias, describe, write_policy
 from evaluation.report import deployments
 from sensors.recordings import recording as recording_files
-from sensors.recordings.recording import Recording, find_recordings
+from sensors.recordings.recording import Recording, RecordingWriter, find_recordings
 
 DEPTH_MM = np.full((180, 320), 700, np.uint16)
 DEPTH_MM[:20] = 0
@@ -238,6 +240,35 @@ def test_nor_does_the_first_where_the_time_is_over(run, number, hang_ups_count):
     assert stopped and report.steps == len(Recording.open(folder)) == 5
     assert not report.interrupted and not report.fault
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_nor_is_the_report_cut_short_while_frames_go_to_the_disk(run, monkeypatch, hang_ups_count):
+    add = RecordingWriter.add
+
+    def slowly(self, rgb, depth_mm):
+        time.sleep(0.3)
+        add(self, rgb, depth_mm)
+
+    def judged(camera, ask):
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()  # the disk is at it then
+        return True
+
+    monkeypatch.setattr(RecordingWriter, "add", slowly)
+    monkeypatch.setattr(session, "verdict", judged)
+    report, folder = run()
+    kept = json.loads((folder / "report.json").read_text())
+    assert report.steps == len(Recording.open(folder)) == 5
+    assert kept["success"] is True and not kept["fault"] and kept["frames"] == 5
+
+
+def test_a_rig_knows_what_lies_there(run):
+    class Rig(ColourCamera):
+        def object_name(self):
+            return "cube"
+
+    for camera, expected in ((Rig, "cube"), (ColourCamera, "apple")):
+        _, folder = run(camera, object_name="apple")
+        assert json.loads((folder / "report.json").read_text())["object"] == expected
 
 
 def test_a_camera_of_a_rig_that_gives_colour_with_every_frame_is_kept_as_often(run):

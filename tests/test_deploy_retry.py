@@ -214,6 +214,29 @@ def test_a_step_without_a_frame_gives_nothing_that_is_lifted_back_to_the_policy(
     assert retry(state(lifted, OPEN)) is None
 
 
+def test_a_step_without_a_frame_does_not_end_a_lift():
+    retry = Retry()
+    told(retry, LOW, HOLDING, STILL_STEPS + 2)
+    retry.held()
+    action = retry(state(LOW, HOLDING))
+    assert action is not None and closes(action) and not retry.begun
+    assert retry(state(LOW, SHUT)) is not None, "the last step of a lift whose object is lost"
+    assert told(retry, LOW, OPEN, 1) == [None], "and then the policy's"
+    retry.reset()
+    assert retry(state(LOW, HOLDING)) is None
+
+
+def test_what_is_nearly_as_wide_as_the_open_hand_is_held_and_not_let_go():
+    wide = 0.072
+    retry = Retry()
+    steps = [retry(state(LOW, wide), closed=True) for _ in range(STILL_STEPS + 1)]
+    assert steps[:-1] == [None] * STILL_STEPS and steps[-1] is not None and closes(steps[-1])
+    assert retry.begun == "it has held something for 1 s; lifts it"
+    retry = Retry()
+    told(retry, LOW, wide, STILL_STEPS)
+    assert retry(state(LOW, wide)) is not None and "open hand" in retry.begun, "so wide and told to open"
+
+
 def test_what_was_before_a_reset_does_not_count():
     retry = Retry()
     told(retry, LOW, OPEN, STILL_STEPS)

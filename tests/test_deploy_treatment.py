@@ -1,5 +1,7 @@
 """Treatments of recorded depth: what the policy sees instead, and which frames are treated."""
 
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 
@@ -78,6 +80,29 @@ def test_a_treated_camera_treats_every_frame_once_and_keeps_its_time():
     assert treated(camera, None) is camera
     seen.stop()
     assert not camera.running
+
+
+def test_a_rig_s_time_stands_still_while_a_frame_is_treated():
+    class Rig(Still):
+        held = False
+
+        @contextmanager
+        def time_held(self):
+            self.held = True
+            yield
+            self.held = False
+
+    camera, seen = Rig(frame(plane())), []
+
+    class Watching(AddRed):
+        needs_rgb = False
+
+        def __call__(self, depth, rgb):
+            seen.append(camera.held)
+            return depth
+
+    TreatedCamera(camera, Watching()).read()
+    assert seen == [True] and not camera.held
 
 
 def test_colour_comes_with_the_frame_or_is_asked_for():

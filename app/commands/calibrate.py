@@ -61,16 +61,20 @@ class Calibrate:
     """Connect and look, print the poses, move nothing."""
     yes: bool = False
     """Move without asking first."""
-    out: Path = Path("runs/calibration/calibration.json")
-    """What deploy reads; a picture lies beside it."""
+    out: Path | None = None
+    """What deploy reads; a picture lies beside it. By default runs/calibration/calibration.json, unless that
+    is another camera's."""
 
     def run(self) -> None:
         """Drives the poses, prints the errors, writes the calibration."""
+        from deploy.calibration import standing
         from deploy.calibration.session import CalibrationOptions, run
 
+        if self.out is None and not self.dry_run:
+            standing.check_own(standing.DEFAULT_FILE, self.camera)
         run(self.config, CalibrationOptions(
             self.camera, self.host, self.board.made(), self.poses, self.speed,
-            dry_run=self.dry_run, yes=self.yes, out=self.out,
+            dry_run=self.dry_run, yes=self.yes, out=self.out or standing.DEFAULT_FILE,
         ))  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from deploy.clock import RealClock, RobotClock
 from deploy.devices.options import SessionOptions, Setup
 from deploy.devices.registry import IMAGERS, ROBOTS
 from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, Robot, RobotError
-from deploy.interrupts import terminable
+from deploy.interrupts import terminable, unbroken
 from deploy.session import ask_person, for_devices, keep_time_of
 from deploy.setup import safety_filter
 from sensors.charuco_board import CharucoBoard, Corners
@@ -150,8 +150,8 @@ def _take(
     taken = Taken()
     confirm(
         "Hold the board between the fingers by the middle of its upper margin, its printed face to the "
-        "robot's right, and clear the table of everything else: the hand closes, then the arm moves through "
-        f"{len(ways)} poses. Ready?"
+        "robot's right, its plate no more than 10 mm beyond the pattern below and beside it, and clear the "
+        f"table of everything else: the hand closes, then the arm moves through {len(ways)} poses. Ready?"
     )
     number, stood = 0, np.array(HOME_RAD)
     try:
@@ -324,10 +324,11 @@ def _started(imager: Imager, robot: Robot, say: Callable[[str], None]):
         imager.start()
         yield start_robot
     finally:
-        try:
-            if begun:
-                robot.stop()
-        except RobotError as error:
-            say(f"the arm did not stop as it should: {error}")
-        finally:
-            imager.stop()
+        with unbroken():
+            try:
+                if begun:
+                    robot.stop()
+            except RobotError as error:
+                say(f"the arm did not stop as it should: {error}")
+            finally:
+                imager.stop()

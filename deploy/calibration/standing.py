@@ -170,6 +170,19 @@ def load(path: Path) -> Calibration:
         raise UserError(f"{path} is no calibration ({error}): `ddgrasp calibrate` writes one.") from None
 
 
+def check_own(path: Path, camera: str) -> None:
+    """UserError if `path` is the calibration of another camera than `camera`, which is not to be lost."""
+    try:
+        there = load(path) if path.exists() else None
+    except UserError:
+        return
+    if there is not None and there.camera != camera:
+        raise UserError(
+            f"{path} is of camera {there.camera!r} at {there.host!r}: name another file for camera "
+            f"{camera!r}, --out FILE, and give it to deploy as --calibration."
+        )
+
+
 def now() -> str:
     """ISO 8601, local time, seconds."""
     return time.strftime("%Y-%m-%dT%H:%M:%S%z")

@@ -1,6 +1,7 @@
 """The FR3 rig's cameras as camera drivers: a D455 as it is run, and one that makes no errors."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -117,6 +118,15 @@ class Fr3Camera:
             self._picture.pose(np.array(state["qpos"]))
             depth = self._sense(self._picture, self._T_world_cam, self._object)
             return Frame(depth, asked_s, self._colour() if self._in_colour else None)
+
+    def object_name(self) -> str:
+        """See KnowsObject."""
+        return self._object
+
+    def time_held(self) -> AbstractContextManager[None]:
+        """See Pausing."""
+        assert self._channel is not None
+        return self._channel.time_held()
 
     def stop(self) -> None:
         """Disconnect."""

@@ -21,7 +21,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.install import pip_install
 from deploy import kinematics
 from deploy.devices import franka_faults
-from deploy.devices.franka_hand import FrankaHand, HandError
+from deploy.devices.franka_hand import SPEED_M_S, FrankaHand, HandError
 from deploy.devices.franka_probe import check_arm, check_hand
 from deploy.devices.franka_spring import FrankaSpring, priority_kept, touched
 from deploy.devices.options import Setup
@@ -218,21 +218,26 @@ class FrankaRobot:
             self._wait_at_start()
 
     def _home(self, gripper: Any) -> None:
+        """Homed and open: where homing leaves the fingers is the hand's affair. Raises HandError."""
+        self._awaited(gripper, "homing", gripper.homing_async)
+        self._awaited(gripper, "opening", lambda: gripper.open_async(SPEED_M_S))
+
+    def _awaited(self, gripper: Any, what: str, begin: Callable[[], Any]) -> None:
         """Raises HandError."""
         try:
-            homing, end_s = gripper.homing_async(), time.monotonic() + HOMING_S
+            command, end_s = begin(), time.monotonic() + HOMING_S
             try:
-                while not homing.wait(_POLL_S):  # in parts, so that Ctrl-C is heard
+                while not command.wait(_POLL_S):  # in parts, so that Ctrl-C is heard
                     if time.monotonic() > end_s:
-                        raise HandError(f"homing did not end in {HOMING_S:g} s: see what holds its fingers")
+                        raise HandError(f"{what} did not end in {HOMING_S:g} s: see what holds its fingers")
             except (HandError, KeyboardInterrupt):
                 gripper.stop()
                 raise
-            homed = homing.get()
+            succeeded = command.get()
         except self._errors as error:
             raise HandError(str(error)) from error
-        if not homed:
-            raise HandError("homing failed: take away what is between its fingers, try again")
+        if not succeeded:
+            raise HandError(f"{what} failed: take away what is between its fingers, try again")
 
     def _wait_at_start(self) -> None:
         """Until the joints are there. Raises UserError if they are not in `START_S` of the arm's time."""
