@@ -33,7 +33,8 @@ STILL_SHARE, REACH_M = 0.5, 0.4
 """The same of an arm that may not go faster: share of the way that it may make, and how far a hand is at
 least from the joint that moves it."""
 OPEN_WIDTH_M = 0.07
-"""Fingers are open that are farther apart and were not told to close: an apple may be wider."""
+"""Fingers are open that are farther apart, those that were told to close `WIDEST_HELD_M`: an apple may be as
+wide as this."""
 LOW_M = 0.20
 """Only below this height of the grip does standing still mean that it is at something."""
 CLOSING_STEPS = 10
@@ -282,21 +283,24 @@ class Retry:
 
     def _may_step_aside(self) -> bool:
         low = LOWEST_M < self._now.grip_m[2] < LOW_M
-        return bool(low and self._asides_left and self._widths[-1] > OPEN_WIDTH_M and not self._now.closed)
+        return bool(low and self._asides_left and self._widths[-1] > self._open_m())
 
     def _stands(self) -> bool:
         """Whether the open hand stands still."""
         moved_m = float(np.linalg.norm(self._places[0] - self._now.grip_m))
         still = moved_m < self._still_m and self._now.grip_m[2] < LOW_M
-        return bool(still and min(self._widths) > OPEN_WIDTH_M and not self._now.closed)
+        return bool(still and min(self._widths) > self._open_m())
 
     def _keeps(self) -> bool:
         """Whether the fingers stand on something, and the hand stays low with it."""
         height_m = float(self._now.grip_m[2])
         same = max(self._widths) - min(self._widths) < SAME_WIDTH_M
         stays = height_m - float(self._places[0][2]) < self._still_m and height_m < LOW_M
-        widest_m = WIDEST_HELD_M if self._now.closed else OPEN_WIDTH_M
-        return stays and same and EMPTY_WIDTH_M < self._widths[-1] < widest_m
+        return stays and same and EMPTY_WIDTH_M < self._widths[-1] < self._open_m()
+
+    def _open_m(self) -> float:
+        """Width above which the hand is open, and holds nothing that it could lift."""
+        return WIDEST_HELD_M if self._now.closed else OPEN_WIDTH_M
 
     def _holds(self) -> bool:
         return EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M

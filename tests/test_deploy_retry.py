@@ -235,6 +235,9 @@ def test_what_is_nearly_as_wide_as_the_open_hand_is_held_and_not_let_go():
     retry = Retry()
     told(retry, LOW, wide, STILL_STEPS)
     assert retry(state(LOW, wide)) is not None and "open hand" in retry.begun, "so wide and told to open"
+    retry = Retry()
+    steps = [retry(state(LOW, OPEN), closed=True) for _ in range(STILL_STEPS + 1)]
+    assert steps[-1] is not None and "open hand" in retry.begun, "fingers that cannot close hold nothing"
 
 
 def test_what_was_before_a_reset_does_not_count():
