@@ -63,7 +63,7 @@ def _dispatch(argv: list[str]) -> int:
         raise unknown_name("command", group, {name.split()[0] for name in COMMANDS})
     if len(words) > 1:
         raise unknown_name("command", " ".join(words[:2]), [n for n in COMMANDS if n.startswith(f"{group} ")])
-    if not words and argv and argv[0] not in ("--help", "-h"):
+    if not words and argv and argv[0] not in ("--help", "-h", "--help-all"):
         raise UserError(f"{argv[0]} is no option of ddgrasp by itself: give a command, see ddgrasp --help.")
     print(describe_commands(group))
     return 0 if "--help" in argv or "-h" in argv or not argv else 2

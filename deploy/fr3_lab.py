@@ -24,7 +24,7 @@ AWAY_M = (1.05, 0.0)
 SETTLE_S = 0.3
 """From when the object is put down to the first step."""
 ATTEMPTS = 3
-OF_THE_MACHINE = (LOST, NO_FRANKA, "does not answer", "did not end in", "is not at its start pose")
+OF_THE_MACHINE = (LOST, NO_FRANKA, "does not answer", "did not end in")
 """What an error says that a busy machine makes, and a trial does not."""
 
 

@@ -172,17 +172,17 @@ class Retry:
         grip_m = grip_position(q_rad)
         self._places.append(grip_m)
         self._widths.append(float(state[STATE.width][0]))
-        pressed_m = pressed_at(q_rad, self._tared(grip_m, felt_nm))
+        pressed_m = pressed_at(q_rad, self._tared(grip_m, felt_nm, closed))
         landed = self._landing(float(grip_m[2]), pressed_m)
         return _Now(state, q_rad, grip_m, met, closed, pressed_m, landed)
 
     def _tared(
-        self, grip_m: Float[np.ndarray, "3"], felt_nm: Float[np.ndarray, "7"] | None
+        self, grip_m: Float[np.ndarray, "3"], felt_nm: Float[np.ndarray, "7"] | None, closed: bool
     ) -> Float[np.ndarray, "7"] | None:
         """(7,) `felt_nm` without what the arm felt where it touches nothing."""
         if felt_nm is None:
             return None
-        if grip_m[2] > LOW_M and self._widths[-1] > OPEN_WIDTH_M:
+        if grip_m[2] > LOW_M and self._widths[-1] > _open_m(closed):
             self._free_nm.append(felt_nm)
         return felt_nm - np.mean(self._free_nm, axis=0) if self._free_nm else felt_nm
 
@@ -283,24 +283,20 @@ class Retry:
 
     def _may_step_aside(self) -> bool:
         low = LOWEST_M < self._now.grip_m[2] < LOW_M
-        return bool(low and self._asides_left and self._widths[-1] > self._open_m())
+        return bool(low and self._asides_left and self._widths[-1] > _open_m(self._now.closed))
 
     def _stands(self) -> bool:
         """Whether the open hand stands still."""
         moved_m = float(np.linalg.norm(self._places[0] - self._now.grip_m))
         still = moved_m < self._still_m and self._now.grip_m[2] < LOW_M
-        return bool(still and min(self._widths) > self._open_m())
+        return bool(still and min(self._widths) > _open_m(self._now.closed))
 
     def _keeps(self) -> bool:
         """Whether the fingers stand on something, and the hand stays low with it."""
         height_m = float(self._now.grip_m[2])
         same = max(self._widths) - min(self._widths) < SAME_WIDTH_M
         stays = height_m - float(self._places[0][2]) < self._still_m and height_m < LOW_M
-        return stays and same and EMPTY_WIDTH_M < self._widths[-1] < self._open_m()
-
-    def _open_m(self) -> float:
-        """Width above which the hand is open, and holds nothing that it could lift."""
-        return WIDEST_HELD_M if self._now.closed else OPEN_WIDTH_M
+        return stays and same and EMPTY_WIDTH_M < self._widths[-1] < _open_m(self._now.closed)
 
     def _holds(self) -> bool:
         return EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M
@@ -311,6 +307,11 @@ class Retry:
         came = max(widths_m) - widths_m[-1] > SAME_WIDTH_M
         stand = max(widths_m[-STAND_STEPS:]) - min(widths_m[-STAND_STEPS:]) < SAME_WIDTH_M
         return came and stand and self._holds()
+
+
+def _open_m(closed: bool) -> float:
+    """Width above which the hand is open, and holds nothing that it could lift; `closed`: as it was told."""
+    return WIDEST_HELD_M if closed else OPEN_WIDTH_M
 
 
 def _still(gripper: float) -> Float[np.ndarray, "8"]:

@@ -80,7 +80,7 @@ class Trainer:
 
     @property
     def frame_count(self) -> int:
-        """Pictures trained on."""
+        """Steps kept: samples, and those beside them that samples need."""
         if _LAST_PHASE in self._done:
             return self.history[-1]["frames"]
         return int(self._store.ends[-1]) if len(self._store) else 0

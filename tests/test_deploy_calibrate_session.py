@@ -405,9 +405,9 @@ def test_a_calibration_of_another_robot_is_not_taken(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = standing.Calibration("2026-11-23T10:00:00", "rig", "127.0.0.9", nominal_pose(), 0.1)
     standing.save(standing.DEFAULT_FILE, made)
-    with pytest.raises(UserError, match="is of camera 'rig' at '127.0.0.9': name another file"):
+    with pytest.raises(UserError, match="is of camera 'rig' and the robot at '127.0.0.9': name"):
         parse("calibrate", ["--host", "127.0.0.9", "--yes"]).run()
-    standing.check_own(standing.DEFAULT_FILE, "rig")
+    standing.check_own(standing.DEFAULT_FILE, "rig", "127.0.0.9")
     place = standing.standing(CONFIG, SessionOptions("franka", "realsense"))
     assert "is of camera 'rig' and the robot at 127.0.0.9): assumes the camera at" in place.line
     named = SessionOptions("franka", "realsense", calibration=standing.DEFAULT_FILE)

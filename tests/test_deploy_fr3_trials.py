@@ -174,7 +174,6 @@ def test_the_rules_of_trying_again_are_the_configuration_s_or_left_out(tmp_path)
         no_connection(franky, "127.0.0.2", "fr3", RuntimeError("UDP receive: Timeout")),
         "the control unit at '127.0.0.2' does not answer within 5 s: end other programs",
         "on the way to the start pose the gripper failed: homing did not end in 60 s: see what holds",
-        "the arm is not at its start pose after 120 s: see what holds it.",
     ],
 )
 def test_a_connection_lost_at_the_start_is_made_again(said):

@@ -1,13 +1,12 @@
 """Treatments of recorded depth: what the policy sees instead, and which frames are treated."""
 
-from contextlib import contextmanager
-
 import numpy as np
 import pytest
 
 from ddgrasp.errors import UserError
 from deploy.interfaces import Camera, Frame
 from deploy.treatment import Inpaint, TreatedCamera, treated
+from rig.fr3.channel import Channel
 from sensors.inpainting import inpainted
 
 
@@ -82,27 +81,38 @@ def test_a_treated_camera_treats_every_frame_once_and_keeps_its_time():
     assert not camera.running
 
 
-def test_a_rig_s_time_stands_still_while_a_frame_is_treated():
-    class Rig(Still):
-        held = False
+@pytest.mark.parametrize("colour", [False, True])
+def test_a_rig_s_time_stands_still_while_a_frame_is_treated(colour):
+    """A rig's colour is drawn with its time held too, which must not let it go on before the treatment."""
+    told: list[bool] = []
 
-        @contextmanager
+    class Line(Channel):
+        def __init__(self):
+            self._holding = 0
+
+        def ask(self, what, **values):
+            told.append(values["on"])
+            return {}
+
+    class Rig(Coloured):
+        line = Line()
+
         def time_held(self):
-            self.held = True
-            yield
-            self.held = False
+            return self.line.time_held()
 
-    camera, seen = Rig(frame(plane())), []
+        def picture(self):
+            with self.time_held():
+                return super().picture()
 
     class Watching(AddRed):
-        needs_rgb = False
+        needs_rgb = colour
 
         def __call__(self, depth, rgb):
-            seen.append(camera.held)
+            assert told == [True]
             return depth
 
-    TreatedCamera(camera, Watching()).read()
-    assert seen == [True] and not camera.held
+    TreatedCamera(Rig(frame(plane())), Watching()).read()
+    assert told == [True, False]
 
 
 def test_colour_comes_with_the_frame_or_is_asked_for():

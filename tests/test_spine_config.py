@@ -14,6 +14,7 @@ import pytest
 
 from app.cli import main
 from app.commands import parse
+from app.commands.checks import check_config_values
 from ddg_jax import prior, sensor
 from ddgrasp.config import (
     Config,
@@ -40,6 +41,7 @@ from ddgrasp.config.checks import FreeText, Range, kinds
 from ddgrasp.config.score import Monocular
 from ddgrasp.config.sensors import SENSORS
 from ddgrasp.errors import UserError
+from ddgrasp.learnable import check_learnable
 from ddgrasp.presets import PRESETS
 from foundation import catalog
 from learning import diffusion
@@ -194,7 +196,7 @@ def test_stages_that_do_not_fit_each_other_are_refused():
 def test_a_student_that_nothing_would_train_is_refused(values, expected):
     arguments = [word for value in values.split() for word in _option("student", value)]
     with pytest.raises(UserError, match=expected):
-        parse("run", ["--preset", "laptop", *arguments])
+        check_config_values(parse("run", ["--preset", "laptop", *arguments]).config)
 
 
 def _option(section: str, value: str) -> list[str]:
@@ -207,8 +209,10 @@ def _option(section: str, value: str) -> list[str]:
 
 def test_a_teacher_whose_actor_would_never_learn_is_refused():
     with pytest.raises(UserError, match=r"critic_warmup is 10, .*100000 makes 10 iteration\(s\)"):
-        parse("run", ["--preset", "demo", "--teacher.total-steps", "100000"])
-    parse("run", ["--preset", "demo", "--scale", "0.001"])
+        check_config_values(parse("run", ["--preset", "demo", "--teacher.total-steps", "100000"]).config)
+    check_config_values(parse("run", ["--preset", "demo", "--scale", "0.001"]).config)
+    for preset in PRESETS.values():
+        check_learnable(preset)
 
 
 @pytest.mark.parametrize("name", ["linear", "cosine"])

@@ -63,18 +63,15 @@ class Calibrate:
     """Move without asking first."""
     out: Path | None = None
     """What deploy reads; a picture lies beside it. By default runs/calibration/calibration.json, unless that
-    is another camera's."""
+    is of another camera or robot."""
 
     def run(self) -> None:
         """Drives the poses, prints the errors, writes the calibration."""
-        from deploy.calibration import standing
         from deploy.calibration.session import CalibrationOptions, run
 
-        if self.out is None and not self.dry_run:
-            standing.check_own(standing.DEFAULT_FILE, self.camera)
         run(self.config, CalibrationOptions(
             self.camera, self.host, self.board.made(), self.poses, self.speed,
-            dry_run=self.dry_run, yes=self.yes, out=self.out or standing.DEFAULT_FILE,
+            dry_run=self.dry_run, yes=self.yes, out=self.out,
         ))  # fmt: skip
 
 

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ddgrasp import artifacts
-from ddgrasp.config import Config, ScoreConfig, WorldConfig
+from ddgrasp.config import PROGRESSIVE, Config, ScoreConfig, WorldConfig
 from ddgrasp.config.checks import Range, check_value, kinds
 from ddgrasp.errors import UserError
+from ddgrasp.learnable import check_learnable
 from ddgrasp.shipped import PRETRAINED, holding, shipped
 
 CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
@@ -46,6 +47,7 @@ def check_config_values(config: Config) -> Config:
     from student_jax.source_check import check_source
 
     check_objects(config.world)
+    check_learnable(config)
     for stage in ("ddg", "student"):
         check_start(stage, f"{stage}.init_from", getattr(config, stage).init_from)
     if config.ddg.init_from:
@@ -143,13 +145,15 @@ ON_PICTURES = ("demos", "ddg", "student")
 
 def check_networks(config: Config, run_dir: Path, stages: Collection[str] = ON_PICTURES) -> list[str]:
     """What each unfinished of the `stages` will take, a line for each; UserError if it is too much, if the
-    student would start from another network, or if simulated depth has another shape than the generator's.
+    student would start from another network, if simulated depth has another shape than the generator's, or
+    its evaluations cannot be halved.
 
     Traces a step of each, which the stages do as well.
     """
     left = [name for name in ON_PICTURES if name in stages and not artifacts.is_finished(run_dir / name)]
     if not left:
         return []
+    from ddg_jax import distil
     from ddg_jax import memory as ddg_memory
     from ddg_jax.sample import check_aspect
     from demos import memory as demos_memory
@@ -162,6 +166,8 @@ def check_networks(config: Config, run_dir: Path, stages: Collection[str] = ON_P
         if config.student.depth_source in LEARNED:
             check_aspect((config.world.profile.height_px, config.world.profile.width_px), config.ddg)
         start.check(config)
+    if "ddg" in left and config.ddg.sampling.sampler == PROGRESSIVE:
+        distil.check(config.ddg)
     need_of = {"demos": demos_memory.need, "ddg": ddg_memory.need, "student": student_memory.need}
     needs = []
     for name in left:

@@ -125,7 +125,6 @@ class Config(Section):
         """See `Section.check`."""
         self._check_picture()
         self._check_exploring_starts()
-        self._check_warmup()
         head = self.student.head
         if self.export.ddim_steps > head.diffusion_steps:
             raise self.export.error(
@@ -141,16 +140,6 @@ class Config(Section):
                 raise self.world.random.error(
                     name, f"0 in a run: only training has exploring starts, by teacher.{name}"
                 )
-
-    def _check_warmup(self) -> None:
-        """A trial run (`scale`) has too few iterations for anything."""
-        teacher = self.teacher
-        if teacher.total_steps and self.scale == 1 and teacher.critic_warmup >= teacher.iterations:
-            raise UserError(
-                f"teacher.critic_warmup is {teacher.critic_warmup}, and teacher.total_steps "
-                f"{teacher.total_steps} makes {teacher.iterations} iteration(s), in all of which the critic "
-                "alone would learn: take fewer of those, or more steps."
-            )
 
     def _check_picture(self) -> None:
         """The student's picture is cut out of the camera's crop window, never enlarged."""

@@ -271,36 +271,6 @@ class StudentConfig(Section, name="student"):
             raise UserError(
                 "student.init_from and student.encoder.weights both say where to start: give one."
             )
-        self._check_losses()
-
-    def _check_losses(self) -> None:
-        """What is trained must be told something, and what acts must have been trained."""
-        head, training = self.head, self.training
-        on_pictures = training.steps > 0 or self.dagger.rounds * self.dagger.steps > 0
-        if on_pictures and not (training.aux_weight or training.action_weight):
-            raise UserError(
-                "student.training.aux_weight and action_weight are both 0: training on pictures would change "
-                "nothing; give one of them a weight."
-            )
-        if self.poses.rounds and not head.aux_to_head:
-            raise UserError(
-                f"student.poses.rounds is {self.poses.rounds}, and student.head.aux_to_head off: on poses "
-                "without pictures the head would see nothing; take 0 rounds."
-            )
-        if training.action_weight:
-            return
-        if head.features_to_head and (self.poses.rounds or self.dagger.rounds):
-            raise UserError(
-                "student.head.features_to_head with student.training.action_weight 0: the head would act "
-                "before it has learnt what the features mean; give action_weight, or 0 poses.rounds and "
-                "dagger.rounds."
-            )
-        acts_untrained = self.dagger.rounds or not head.train_steps
-        if acts_untrained and not (self.poses.rounds or self.init_from):
-            raise UserError(
-                "student.poses.rounds, student.training.action_weight and student.init_from are all empty: "
-                "nothing would have trained the action head before it acts; give one of them."
-            )
 
 
 def _need(channels: tuple[str, ...], name: str, who: str) -> None:

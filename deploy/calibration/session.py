@@ -53,7 +53,13 @@ class CalibrationOptions:
     """Connect and look, say where the arm would go, move nothing."""
     yes: bool = False
     """Move without asking first."""
-    out: Path = standing.DEFAULT_FILE
+    out: Path | None = None
+    """None is `standing.DEFAULT_FILE`, unless that is of another camera or robot."""
+
+    @property
+    def file(self) -> Path:
+        """Where the calibration goes."""
+        return self.out or standing.DEFAULT_FILE
 
 
 @dataclass
@@ -73,7 +79,7 @@ class Taken:
 def run(
     config: Config, options: CalibrationOptions, say: Callable[[str], None] = print
 ) -> Calibration | None:
-    """Drives the poses, solves, writes `options.out` and a picture beside it; None after a dry run.
+    """Drives the poses, solves, writes `options.file` and a picture beside it; None after a dry run.
 
     Raises UserError: a device is absent, nobody agrees, the board is not seen, the views do not suffice.
     """
@@ -82,8 +88,8 @@ def run(
     )
     if options.camera not in IMAGERS:
         raise unknown_name("camera", options.camera, IMAGERS)
-    _check_out(options.out)
     config = for_devices(config, session)
+    _check_out(options, config.deploy.franka.host)
     info = policy_metadata.describe(config.student, config.export, config.world.profile)
     clock: Clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
     confirm = (lambda question: None) if options.yes else ask_person
@@ -174,7 +180,7 @@ def _take(
     if not taken.views:
         raise UserError(f"none of {len(ways)} poses gave a picture; what happened is said above.")
     if not taken.seen:
-        path = options.out.with_name("not-seen.png")
+        path = options.file.with_name("not-seen.png")
         atomic_write_bytes(path, picture.encode(taken.pictures[-1]))
         say(f"the last picture: {path}")
     return taken
@@ -233,7 +239,7 @@ def _look_once(
     except CameraError as error:
         raise UserError(f"camera {options.camera!r} gives no picture: {error}.") from error
     corners: Corners = options.board.find(gray)
-    path = options.out.with_name("dry-run.png")
+    path = options.file.with_name("dry-run.png")
     atomic_write_bytes(path, picture.encode(gray))
     say(f"nothing moved; {len(corners.ids)} of {options.board.corner_count} corners in view now: {path}")
 
@@ -252,11 +258,11 @@ def _solved(
     details = _details(taken, found, lens, options.board, truth)
     host = config.deploy.franka.host
     result = Calibration(standing.now(), options.camera, host, found.T_base_cam, found.rms_px, details)
-    sheet = options.out.with_suffix(".png")
+    sheet = options.file.with_suffix(".png")
     atomic_write_bytes(sheet, picture.sheet(taken.pictures, taken.views, found, lens, options.board))
     _check_fit(found.rms_px, 1e3 * options.board.square_m, sheet, say)
-    standing.save(options.out, result)
-    say(f"{options.out}, {sheet}: `ddgrasp deploy` reads the first, look at the second")
+    standing.save(options.file, result)
+    say(f"{options.file}, {sheet}: `ddgrasp deploy` reads the first, look at the second")
     away = standing.offset(found.T_base_cam, standing.nominal_pose())
     say(standing.describe(away, config.world.random))
     return result
@@ -303,8 +309,12 @@ def _truth(imager: Imager) -> np.ndarray | None:
     return np.asarray(imager.truth(), float) if isinstance(imager, KnowsItsPlace) else None
 
 
-def _check_out(out: Path) -> None:
-    """UserError, before anything moves, unless a calibration and a picture beside it can be written."""
+def _check_out(options: CalibrationOptions, host: str) -> None:
+    """UserError, before anything moves, unless a calibration and a picture beside it can be written, over
+    none of another camera or robot."""
+    if options.out is None and not options.dry_run:
+        standing.check_own(standing.DEFAULT_FILE, options.camera, host)
+    out = options.file
     if out.is_dir() or out.suffix == ".png":
         raise UserError(f"--out is {out}; expected the name of a file, for example calibration.json.")
     out.parent.mkdir(parents=True, exist_ok=True)

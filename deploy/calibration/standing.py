@@ -170,16 +170,16 @@ def load(path: Path) -> Calibration:
         raise UserError(f"{path} is no calibration ({error}): `ddgrasp calibrate` writes one.") from None
 
 
-def check_own(path: Path, camera: str) -> None:
-    """UserError if `path` is the calibration of another camera than `camera`, which is not to be lost."""
+def check_own(path: Path, camera: str, host: str) -> None:
+    """UserError if `path` is of another camera or robot, whose calibration is not to be lost."""
     try:
         there = load(path) if path.exists() else None
     except UserError:
         return
-    if there is not None and there.camera != camera:
+    if there is not None and (there.camera, there.host) != (camera, host):
         raise UserError(
-            f"{path} is of camera {there.camera!r} at {there.host!r}: name another file for camera "
-            f"{camera!r}, --out FILE, and give it to deploy as --calibration."
+            f"{path} is of camera {there.camera!r} and the robot at {there.host!r}: name another file for "
+            f"{camera!r} and {host!r}, --out FILE, and give it to deploy as --calibration."
         )
 
 

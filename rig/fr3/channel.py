@@ -34,6 +34,7 @@ class Channel:
             ) from error
         self._socket.settimeout(ANSWER_S)
         self._file = self._socket.makefile("rw")
+        self._holding = 0
 
     def ask(self, what: str, **values: Any) -> dict[str, Any]:
         """The answer to one request; see `rig.fr3.serve.Rig.answer`. Raises ChannelLost."""
@@ -56,15 +57,19 @@ class Channel:
     def time_held(self) -> Iterator[None]:
         """The rig's time nearly stands still meanwhile: a picture takes long, which is not the arm's doing.
 
-        That the rig is gone, whoever asks for something next hears.
+        One within another ends with that. That the rig is gone, whoever asks for something next hears.
         """
+        self._holding += 1
         try:
-            with contextlib.suppress(ChannelLost):
-                self.ask("slow", on=True)
+            if self._holding == 1:
+                with contextlib.suppress(ChannelLost):
+                    self.ask("slow", on=True)
             yield
         finally:
-            with contextlib.suppress(ChannelLost):
-                self.ask("slow", on=False)
+            self._holding -= 1
+            if not self._holding:
+                with contextlib.suppress(ChannelLost):
+                    self.ask("slow", on=False)
 
     def close(self) -> None:
         """Ends the connection."""

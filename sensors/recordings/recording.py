@@ -366,8 +366,8 @@ def check_fields(file: Path, meta: Mapping[str, Any]) -> None:
         if (value := meta.get(name)) is not None and not _is_positive(value):
             raise UserError(f"{file}: {name} is {value!r}; expected a number above 0, or null.")
     for name in ("consecutive_frames", "color_aligned_to_depth"):
-        if not isinstance(value := meta.get(name, False), bool):
-            raise UserError(f"{file}: {name} is {value!r}; expected true or false.")
+        if not isinstance(value := meta.get(name), bool | None):
+            raise UserError(f"{file}: {name} is {value!r}; expected true or false, or null.")
 
 
 def _is_positive(value: Any) -> bool:

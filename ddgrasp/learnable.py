@@ -1,0 +1,57 @@
+"""Whether anything would be learnt by a configuration: asked of what is to be made.
+
+What was made by such a one is read as ever, so that these are no checks of the configuration's own.
+"""
+
+from ddgrasp.config import Config, StudentConfig, TeacherConfig
+from ddgrasp.errors import UserError
+
+
+def check_learnable(config: Config) -> None:
+    """UserError for settings with which teacher or student would learn nothing, or act before they have."""
+    if config.scale == 1:  # a trial run has too few iterations for anything
+        _check_actor(config.teacher)
+    _check_losses(config.student)
+    _check_head(config.student)
+
+
+def _check_actor(teacher: TeacherConfig) -> None:
+    if teacher.total_steps and teacher.critic_warmup >= teacher.iterations:
+        raise UserError(
+            f"teacher.critic_warmup is {teacher.critic_warmup}, and teacher.total_steps "
+            f"{teacher.total_steps} makes {teacher.iterations} iteration(s), in all of which the critic alone "
+            "would learn: take fewer of those, or more steps."
+        )
+
+
+def _check_losses(student: StudentConfig) -> None:
+    training, rounds = student.training, student.poses.rounds
+    on_pictures = training.steps > 0 or student.dagger.rounds * student.dagger.steps > 0
+    if on_pictures and not (training.aux_weight or training.action_weight):
+        raise UserError(
+            "student.training.aux_weight and action_weight are both 0: training on pictures would change "
+            "nothing; give one of them a weight."
+        )
+    if rounds and not student.head.aux_to_head:
+        raise UserError(
+            f"student.poses.rounds is {rounds}, and student.head.aux_to_head off: on poses without pictures "
+            "the head would see nothing; take 0 rounds."
+        )
+
+
+def _check_head(student: StudentConfig) -> None:
+    """What acts must have been trained, which the action loss on pictures does by itself."""
+    head, begun = student.head, bool(student.init_from)
+    if student.training.action_weight:
+        return
+    if head.features_to_head and (student.poses.rounds or (student.dagger.rounds and not begun)):
+        raise UserError(
+            "student.head.features_to_head with student.training.action_weight 0: the head would act before "
+            "it has learnt what the features mean; give action_weight, or 0 poses.rounds and dagger.rounds."
+        )
+    acts_untrained = student.dagger.rounds or not head.train_steps
+    if acts_untrained and not (student.poses.rounds or begun):
+        raise UserError(
+            "student.poses.rounds, student.training.action_weight and student.init_from are all empty: "
+            "nothing would have trained the action head before it acts; give one of them."
+        )
