@@ -19,8 +19,8 @@ def _check_actor(teacher: TeacherConfig) -> None:
     if teacher.total_steps and teacher.critic_warmup >= teacher.iterations:
         raise UserError(
             f"teacher.critic_warmup is {teacher.critic_warmup}, and teacher.total_steps "
-            f"{teacher.total_steps} makes {teacher.iterations} iteration(s), in all of which the critic alone "
-            "would learn: take fewer of those, or more steps."
+            f"{teacher.total_steps} makes {teacher.iterations} iteration(s), in all of which the critic "
+            "alone would learn: take fewer of those, or more steps."
         )
 
 
