@@ -213,7 +213,7 @@ def test_no_frame_behind_the_first_ones_is_read_for_those_that_cannot_be_used(tm
 
 
 def test_more_recordings_than_memory_are_refused_before_any_is_read(recordings, monkeypatch):
-    needed = 6 * 18 * 32 * (4 + 4 + 2)
+    needed = 6 * 18 * 32 * (4 + 4 + 2 + 2)
     assert data.frames_bytes(WIDE, 6) == needed
     monkeypatch.setattr(memory, "host_bytes", lambda: needed)
     assert len(load(recordings)[0]) == 6

@@ -33,7 +33,7 @@ CONFIG = Config(
     ddg=DDGConfig(
         depth=DDGDepthConfig(height_px=16, width_px=24),
         unet=UNetConfig(widths=(8, 8), blocks=(0, 1), attention_heads=1),
-        diffusion=DDGDiffusionConfig(steps=50),
+        diffusion=DDGDiffusionConfig(steps=100),
         training=DDGTrainingConfig(steps=10, batch_size=4, holdout_fraction=0.25),
         sampling=SamplingConfig(steps=2, batch_size=4),
         graft=GraftConfig(noise_threshold=0.0),
