@@ -22,10 +22,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Float32, Float64, Int, Int32
 
 from ddgrasp.config import SPACINGS
+from ddgrasp.config.ddg import COSINE_OFFSET, FIRST_LINEAR_BETA
 from ddgrasp.errors import UserError, unknown_name
 
-COSINE_OFFSET = 0.008
-"""s of Nichol & Dhariwal, eq. 17."""
 MAX_BETA = 0.999
 VARIANCE_FLOOR = 1e-20
 PREDICTED, CONSISTENT = "predicted", "consistent"
@@ -44,7 +43,9 @@ class Schedule(NamedTuple):
         return len(self.betas)
 
 
-def linear_betas(steps: int, first: float = 1e-4, last: float = 0.02) -> Float64[np.ndarray, " {steps}"]:
+def linear_betas(
+    steps: int, first: float = FIRST_LINEAR_BETA, last: float = 0.02
+) -> Float64[np.ndarray, " {steps}"]:
     """beta_k from `first` to `last` in equal steps, (K,) float64 (Ho et al. 2020, section 4)."""
     return np.linspace(first, last, steps)
 

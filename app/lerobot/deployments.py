@@ -33,17 +33,15 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
         if unknown := next((name for name in objects if name not in noted), None):
             raise unknown_name("object", unknown, noted)
         found = [deployment for deployment in found if deployment.report.get(OBJECT) in objects]
-    usable, left_out = {}, []
+    taken, episodes, left_out = [], [], []
     for deployment in found:
         try:
-            recording = _pictures(deployment)
-            usable[deployment.folder] = deployment, _read(deployment, recording)
+            episodes.append(partial(_as_it_is, _read(deployment, _pictures(deployment))))
+            taken.append(deployment)
         except UserError as error:
             left_out.append(f"{deployment.folder.name}: {error}")
-    if not usable:
+    if not taken:
         raise UserError(f"{found[0].folder.parent}: no episode can be used ({'; '.join(left_out)}).")
-    taken = [deployment for deployment, _ in usable.values()]
-    episodes = [partial(_as_it_is, episode) for _, episode in usable.values()]
     about = {
         "Robot": f"Franka arm; driver or rig: {_each(taken, 'robot')}.",
         "Camera": f"{_each(taken, 'camera')}, across the table; its depth is raw, with its holes and noise.",

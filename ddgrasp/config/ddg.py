@@ -151,15 +151,15 @@ class UNetConfig(Section, name="ddg.unet"):
 
 _LINEAR_STEPS = (500, 5000)
 """Steps of a linear schedule after which alpha_bar is below 0.01 and far above float32's least number."""
-_FIRST_LINEAR_BETA, _COSINE_OFFSET = 1e-4, 0.008
-"""See `learning.diffusion`."""
+FIRST_LINEAR_BETA, COSINE_OFFSET = 1e-4, 0.008
+"""Ho et al. 2020, section 4; s of Nichol & Dhariwal 2021, eq. 17 (learning/diffusion.py)."""
 _LEAST_NOISE = 4 * 2.0**-24
 """Least 1 - alpha_bar: four times what float32 can tell from 0 beside 1."""
 
 
 def _first_cosine_beta(steps: int) -> float:
     start, end = (
-        math.cos((u + _COSINE_OFFSET) / (1 + _COSINE_OFFSET) * math.pi / 2) ** 2 for u in (0, 1 / steps)
+        math.cos((u + COSINE_OFFSET) / (1 + COSINE_OFFSET) * math.pi / 2) ** 2 for u in (0, 1 / steps)
     )
     return 1 - end / start
 
@@ -183,7 +183,7 @@ class DDGDiffusionConfig(Section, name="ddg.diffusion"):
                 "steps",
                 f"{least} to {most} with schedule linear: fewer do not end in noise",
             )
-        first = _FIRST_LINEAR_BETA if self.schedule == "linear" else _first_cosine_beta(self.steps)
+        first = FIRST_LINEAR_BETA if self.schedule == "linear" else _first_cosine_beta(self.steps)
         if (highest := math.log(first / _LEAST_NOISE)) < self.log_snr_shift:
             limit = f"at most {highest:.1f} with {self.steps} steps"
             raise self.error(
