@@ -1,6 +1,7 @@
 """Shared by all tests: one persistent JAX compilation cache, so that a second run compiles nothing."""
 
 import os
+import signal
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -57,6 +58,14 @@ def fast_prior():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(piecewise, "_minimise", optimizing(piecewise._minimise))
         yield
+
+
+@pytest.fixture
+def ctrl_c():
+    """Is KeyboardInterrupt, also where the tests run in the background and a shell has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

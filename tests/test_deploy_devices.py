@@ -514,8 +514,14 @@ def test_an_arm_s_refusal_is_told_in_its_words(text, said):
 def test_sigterm_holds_and_stops_the_robot_as_ctrl_c_does(tmp_path, monkeypatch):
     devices = []
 
+    class Terminated(ScriptedCamera):
+        def read(self):
+            if self._index == 2:
+                threading.Timer(0.05, terminate_twice).start()
+            return super().read()
+
     def kinematic(setup):
-        devices.extend([KinematicRobot(setup.clock), ScriptedCamera(setup.clock, [depth_mm()])])
+        devices.extend([KinematicRobot(setup.clock), Terminated(setup.clock, [depth_mm()])])
         return devices
 
     def terminate_twice():  # `timeout` and supervisors signal the process and its group
@@ -525,10 +531,9 @@ def test_sigterm_holds_and_stops_the_robot_as_ctrl_c_does(tmp_path, monkeypatch)
     monkeypatch.setattr("deploy.session.make_devices", kinematic)
     before, said = signal.getsignal(signal.SIGTERM), []
     path = write_policy(tmp_path / "p.onnx", describe(), bias=constant_bias(0.2))
-    threading.Timer(0.5, terminate_twice).start()
     report = deploy(get_preset("debug"), path, SessionOptions(seconds=math.inf, out=tmp_path), said.append)
     robot, camera = devices
-    assert report.interrupted and 0 < report.steps < 300
+    assert report.interrupted and 2 < report.steps < 300
     assert robot.calls[-2:] == ["hold", "stop"] and camera.stopped
     assert said[-2].endswith("stop: interrupted; the robot holds position")
     assert said[-1] == f"report: {next(tmp_path.glob('*/report.json'))}"

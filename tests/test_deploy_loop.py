@@ -223,13 +223,16 @@ def test_chunk_playback_runs_the_network_only_when_due(tmp_path):
     assert len(report.timings.act_s) == 8 and robot.calls.count("command") == 8
 
 
-def test_ctrl_c_holds_and_stops_the_robot(tmp_path):
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background
+def test_ctrl_c_holds_and_stops_the_robot(tmp_path, ctrl_c):
     clock = RealClock()
     loop, robot, camera = make_loop(tmp_path, [depth_mm()], clock, settings=LoopSettings(period_s=0.02))
-    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
-    report = loop.run(max_steps=500)
-    assert report.interrupted and 0 < report.steps < 500
+
+    def on_step(step):
+        if step.index == 3:  # while the loop waits for the next
+            threading.Timer(0.005, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    report = loop.run(max_steps=500, on_step=on_step)
+    assert report.interrupted and 3 < report.steps < 500
     assert robot.calls[-2:] == ["hold", "stop"] and camera.stopped
     assert report.events[-1].kind == "stop"
 

@@ -201,7 +201,7 @@ def test_a_camera_that_fails_as_it_stops_costs_nothing_of_what_was_recorded(run,
 
 
 @pytest.fixture
-def hang_ups_count():
+def signals_count(ctrl_c):
     """Not as under nohup."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
@@ -209,7 +209,7 @@ def hang_ups_count():
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_second_signal_does_not_cut_the_stopping_short(run, number, hang_ups_count):
+def test_a_second_signal_does_not_cut_the_stopping_short(run, number, signals_count):
     class Stopping(ColourCamera):
         def stop(self):
             os.kill(os.getpid(), signal.SIGINT)
@@ -229,7 +229,7 @@ def test_a_second_signal_does_not_cut_the_stopping_short(run, number, hang_ups_c
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_nor_does_the_first_where_the_time_is_over(run, number, hang_ups_count):
+def test_nor_does_the_first_where_the_time_is_over(run, number, signals_count):
     class Stopping(ColourCamera):
         def stop(self):
             os.kill(os.getpid(), number)
@@ -242,7 +242,7 @@ def test_nor_does_the_first_where_the_time_is_over(run, number, hang_ups_count):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_nor_is_the_report_cut_short_while_frames_go_to_the_disk(run, monkeypatch, hang_ups_count):
+def test_nor_is_the_report_cut_short_while_frames_go_to_the_disk(run, monkeypatch, signals_count):
     add = RecordingWriter.add
 
     def slowly(self, rgb, depth_mm):

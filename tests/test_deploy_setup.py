@@ -1,0 +1,85 @@
+"""What a user configures is what the filter and the loop keep to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ddgrasp import contract
+from ddgrasp.config import DeployConfig, FrankaConfig
+from ddgrasp.errors import UserError
+from deploy.clock import RealClock, RobotClock, SimClock
+from deploy.devices.options import SessionOptions
+from deploy.loop import LoopSettings
+from deploy.session import keep_time_of
+from deploy.setup import loop_settings, safety_filter
+from deploy_support import KinematicRobot, describe
+
+DEPLOY, FR3 = DeployConfig(), contract.ARMS["fr3"]
+
+
+@pytest.mark.parametrize("robot", ["sim", "franka"])
+@pytest.mark.parametrize(
+    ("field", "corner"),
+    [
+        ("workspace_lower_m", (0.3, -0.2, 0.05)),
+        ("workspace_upper_m", (0.7, 0.2, 0.5)),
+        ("arm_lower_m", (-0.4, -0.6, 0.01)),
+        ("arm_upper_m", (0.9, 0.5, 1.0)),
+    ],
+)
+def test_the_filter_keeps_to_the_configured_boxes(robot, field, corner):
+    config = replace(DEPLOY, **{field: corner})
+    assert getattr(safety_filter(config, describe(), robot).limits, field) == corner
+
+
+@pytest.mark.parametrize(("robot", "arm"), [("sim", contract.PANDA), ("franka", FR3)])
+def test_the_filter_accelerates_as_the_configured_share_of_the_arm_says(robot, arm):
+    limits = safety_filter(replace(DEPLOY, acceleration_scale=0.5), describe(), robot).limits
+    np.testing.assert_allclose(limits.acceleration_rad_s2, 0.5 * np.array(arm.joint_acceleration_rad_s2))
+
+
+def test_the_filter_goes_no_faster_than_the_driver_lets_the_arm():
+    slow = replace(DEPLOY, franka=FrankaConfig(dynamics=0.1))
+    limits = safety_filter(slow, describe(), "franka").limits
+    assert limits.velocity_rad_s == slow.franka.speed_rad_s
+    assert max(limits.velocity_rad_s) < min(safety_filter(slow, describe(), "sim").limits.velocity_rad_s)
+
+
+def test_of_arm_and_policy_the_narrower_limit_counts():
+    info = describe()
+    own = replace(
+        info,
+        joint_lower_rad=(-0.3, *info.joint_lower_rad[1:]),
+        joint_upper_rad=(9.0, *info.joint_upper_rad[1:]),
+    )
+    limits = safety_filter(DEPLOY, own, "sim").limits
+    assert limits.lower_rad[0] == -0.3 and limits.upper_rad[0] == contract.PANDA.joint_upper_rad[0]
+
+
+def test_a_real_arm_keeps_off_the_ends_of_its_range():
+    wide = replace(describe(), joint_lower_rad=(-9.0,) * 7, joint_upper_rad=(9.0,) * 7)
+    limits = safety_filter(DEPLOY, wide, "franka").limits
+    np.testing.assert_allclose(np.subtract(limits.lower_rad, FR3.joint_lower_rad), 0.02)
+    np.testing.assert_allclose(np.subtract(FR3.joint_upper_rad, limits.upper_rad), 0.02)
+
+
+def test_the_loop_has_the_policy_s_rate_and_the_configured_patience():
+    info = replace(describe(), control_hz=20)
+    for stale, retry in ((2.5, True), (1.5, False)):
+        config = replace(DEPLOY, stale_periods=stale, retry=retry)
+        assert loop_settings(config, info) == LoopSettings(0.05, stale, retry)
+    assert safety_filter(DEPLOY, info).limits.period_s == 0.05
+
+
+def test_a_clock_that_follows_a_robot_needs_one_that_tells_the_time():
+    class Timed(KinematicRobot):
+        def time_s(self):
+            return 7.5
+
+    clock = RobotClock()
+    keep_time_of(Timed(SimClock()), clock, SessionOptions())
+    assert clock.now() == 7.5
+    with pytest.raises(UserError, match="robot 'sim' has no clock of its own: set deploy.clock machine"):
+        keep_time_of(KinematicRobot(SimClock()), clock, SessionOptions("sim"))
+    keep_time_of(KinematicRobot(SimClock()), RealClock(), SessionOptions("sim"))
