@@ -1,12 +1,15 @@
 # Needs a Python >= 3.11 and make, nothing else:  make demo   make test
 # The newest Python that runs is taken; choose another with  make setup PYTHON=/path/to/python3.12
 
+VENV := .venv
+BIN := $(VENV)/bin
+VERSION := -c 'import sys; print(sys.version_info[:2])'
 ifeq ($(origin PYTHON),undefined)
 PYTHON := $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
 	$$p -c 'import sys, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && { echo $$p; break; }; done)
+else  # an environment of another version than the one that is named is made anew
+OTHER := $(shell [ ! -x $(BIN)/python ] || [ "$$($(BIN)/python $(VERSION))" = "$$($(PYTHON) $(VERSION))" ] || echo other)
 endif
-VENV := .venv
-BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= runs/demo
 WORKERS ?= 2
@@ -21,12 +24,15 @@ help:  ## list the targets
 
 setup: $(STAMP)  ## create .venv and install the locked dependencies
 
-$(STAMP): requirements.lock pyproject.toml
+$(STAMP): requirements.lock pyproject.toml $(OTHER)
 	@test -n "$(PYTHON)" || { echo "No Python >= 3.11 with venv found: install one, or name it: make setup PYTHON=/path/to/python3" >&2; exit 2; }
-	@$(BIN)/python -c '' 2>/dev/null || { echo "$(PYTHON) -> $(VENV)"; $(PYTHON) -m venv --clear $(VENV); }
+	@{ [ -z "$(OTHER)" ] && $(BIN)/python -c ''; } 2>/dev/null || { echo "$(PYTHON) -> $(VENV)"; $(PYTHON) -m venv --clear $(VENV); }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
+
+.PHONY: other
+other:
 
 LOCK := uv pip compile --universal --python-version 3.11 --fork-strategy requires-python --no-emit-index-url \
 	--no-annotate --no-header --upgrade

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from app import pipeline
-from ddgrasp import artifacts
+from ddgrasp import artifacts, machine
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text, read_json, to_json
@@ -116,7 +116,6 @@ def _try(study: Study, name: str, config: Config, exported: Artifact) -> None:
 
 def write(study: Study) -> dict[str, Any]:
     """Writes study.json, study.html and study.png from what is there; returns what study.json holds."""
-    from evaluation.report.summary import describe_machine
     from evaluation.table2 import page
 
     config = to_json(study.config)
@@ -126,7 +125,7 @@ def write(study: Study) -> dict[str, Any]:
         "seed": study.config.seed,
         "scale": study.config.scale,
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "machine": describe_machine(),
+        "machine": machine.describe(),
         "versions": artifacts.library_versions(),
         "left_out": {name: why for name, why in left_out.items() if name not in collected["rows"]},
         **collected,

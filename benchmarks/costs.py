@@ -65,7 +65,11 @@ class Cost:
 
 
 def rows(config: Config) -> Iterator[Row]:
-    """What a run of `config` consists of; episodes count as whole, every attempt at a demo as a success."""
+    """What a run of `config` consists of; episodes count as whole, every attempt at a demo as a success.
+
+    Not counted: physics of the teacher's evaluations, of poses, DAgger and the student's trials, whose
+    batches are smaller than PPO's.
+    """
     teacher, demos, ddg, student = config.teacher, config.demos, config.ddg, config.student
     length = config.world.episode_steps
     substeps = round(contract.CONTROL_DT_S / config.world.sim_dt_s)

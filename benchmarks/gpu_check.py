@@ -26,6 +26,7 @@ from typing import Any
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Backend, TeacherConfig, WorldConfig
 from ddgrasp.files import atomic_write_json, read_json
+from ddgrasp.machine import describe
 from ddgrasp.progress import Progress
 
 TOTAL_S = 1190.0
@@ -63,6 +64,8 @@ class Sizes:
     """Timed, of each."""
     slack: float
     """Deadlines are longer by this factor."""
+    on_gpu: bool = False
+    """Whether a machine without a GPU is refused, and a teacher that does not learn is an error."""
 
 
 GPU = Sizes(
@@ -78,6 +81,7 @@ GPU = Sizes(
     preset="paper",
     training_steps=50,
     slack=1.0,
+    on_gpu=True,
 )
 CPU = Sizes(
     physics=("cpu",),
@@ -116,17 +120,15 @@ def machine(sizes: Sizes, save: Save) -> Iterator[str]:
     """Devices and versions; without the GPU asked for, one line and the status NO_GPU."""
     import jax
 
-    from evaluation.report.summary import describe_machine
-
     kinds = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
-    if sizes is GPU and not any(device.platform == "gpu" for device in jax.devices()):
+    if sizes.on_gpu and not any(device.platform == "gpu" for device in jax.devices()):
         print(
             f"gpu-check needs an NVIDIA GPU; JAX sees {', '.join(kinds)}. Install the GPU's packages with "
             "pip install -e '.[cuda,warp]', or try the command itself with --device cpu.",
             file=sys.stderr,
         )
         sys.exit(NO_GPU)
-    save(devices=kinds, versions=artifacts.library_versions(), **describe_machine())
+    save(devices=kinds, versions=artifacts.library_versions(), **describe())
     yield from ()
 
 
@@ -300,7 +302,7 @@ def _teacher(sizes: Sizes, save: Save, teacher: TeacherConfig) -> Iterator[str]:
             train(config, Path(directory), Watch(name="teacher"))
         except _Reached:
             return
-    if sizes is GPU:
+    if sizes.on_gpu:
         yield f"the teacher ended below {SUCCESS_AIM:.0%}"
 
 
@@ -359,7 +361,7 @@ def run_section(name: str, sizes: Sizes, out: Path) -> int:
 def run_all(sections: Sequence[str], device: str, out: Path, backends: Sequence[str] = ()) -> int:
     """Each section in a process of its own; writes `out` after each. Returns the exit status."""
     start, slack = time.monotonic(), SIZES[device].slack
-    report: dict[str, Any] = {"device": device, "complete": False}
+    report: dict[str, Any] = {"device": device, "sections": list(sections), "complete": False}
     for name in sections:
         left = slack * TOTAL_S - (time.monotonic() - start)
         allowed = min(slack * SECTIONS[name][1], max(left, 1.0))
@@ -404,7 +406,8 @@ def _in_process(
 def _environment(device: str) -> dict[str, str]:
     """Warp allocates beside JAX, so JAX takes memory as it needs it."""
     chosen = {"JAX_PLATFORMS": "cpu"} if device == "cpu" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    return {"MUJOCO_GL": "egl"} | dict(os.environ) | chosen
+    without_display = {"MUJOCO_GL": "egl"} if sys.platform == "linux" else {}
+    return without_display | dict(os.environ) | chosen
 
 
 def _failed(what: str, error: Exception) -> str:

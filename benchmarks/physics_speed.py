@@ -16,7 +16,7 @@ from mujoco.batch import Batch
 
 from benchmarks import playground_pick
 from benchmarks.compare import Contender, Row, compare, measure
-from ddgrasp import contract, cores
+from ddgrasp import contract, machine
 from ddgrasp.config import Config
 from ddgrasp.layout import QPOS
 from mjx_envs import grasp_math
@@ -169,7 +169,7 @@ def bare_contenders(
       ctrl: (B, 9).
       substeps: physics steps in a call.
     """
-    count, threads = len(ctrl), cores.available()
+    count, threads = len(ctrl), machine.cores()
     batch = Batch(model, nsim=count, nthread=threads)
     for name, value in ModelIndex(model).fields(model, params).items():
         batch.expand(name)[:] = value

@@ -111,6 +111,7 @@ def open_gl(
     `stack` closes it: a second one next to it draws nothing. Raises what its back end raises where there is
     none, and RuntimeError if it draws other depth than the ray caster.
     """
+    model.vis.quality.offsamples = 0  # samples between pixels, which the ray casters lack too
     model.vis.global_.fovy = math.degrees(2 * math.atan(camera.height_px / 2 / camera.fy_px))
     renderer = stack.enter_context(mujoco.Renderer(model, camera.height_px, camera.width_px))
     for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):

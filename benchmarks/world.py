@@ -24,9 +24,9 @@ if tuple(int(part) for part in metadata.version("jax").split(".")[:2]) < (0, 12)
 
 from benchmarks import physics_speed, render_speed
 from benchmarks.compare import as_json, print_table
+from ddgrasp import machine
 from ddgrasp.files import atomic_write_json
 from ddgrasp.presets import LAPTOP
-from evaluation.report.summary import describe_machine
 
 
 def main() -> None:
@@ -39,14 +39,14 @@ def main() -> None:
     rows, trouble = render_speed.render_rows(LAPTOP, 3 * arguments.rounds)
     rows = physics_speed.rollout_rows(LAPTOP, arguments.rounds) + rows
     rows = physics_speed.playground_rows(LAPTOP, arguments.rounds) + rows
-    machine, loads = describe_machine(), [load, os.getloadavg()[0]]
+    here, loads = machine.describe(), [load, os.getloadavg()[0]]
     seconds = time.monotonic() - start
-    title = f"{machine['processor']}, {machine['cores']} cores, load {loads[0]:.1f} to {loads[1]:.1f}"
+    title = f"{here['processor']}, {here['cores']} cores, load {loads[0]:.1f} to {loads[1]:.1f}"
     print_table(f"{title}; {arguments.rounds} rounds, {seconds:.0f} s", rows)
     if trouble:
         print(f"No OpenGL here: {trouble}")
     if arguments.out:
-        figures = {"machine": machine, "load": loads, "seconds": seconds, "rows": as_json(rows)}
+        figures = {"machine": here, "load": loads, "seconds": seconds, "rows": as_json(rows)}
         atomic_write_json(arguments.out, figures)
         print(arguments.out)
 

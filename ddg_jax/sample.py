@@ -74,6 +74,14 @@ class Generator:
         params = load_params(file, jax.eval_shape(partial(_init_shapes, config)))
         return cls(config, params, make_prior(config))
 
+    def on_devices(self, sharding: NamedSharding) -> Params:
+        """The parameters there, brought once."""
+        placed = self.__dict__.get("_placed")
+        if placed is None or placed[0] != sharding:
+            placed = sharding, jax.device_put(self.params, sharding)
+            object.__setattr__(self, "_placed", placed)
+        return placed[1]
+
     def save(self, directory: Path | str) -> None:
         """Writes a fitted network's parameters; the manifest, written by the stage, makes them loadable."""
         save_params(Path(directory) / PARAMS_FILE, self.params)
@@ -239,9 +247,15 @@ def condition(
 def grafted(
     config: DDGConfig, depth_m: Float[np.ndarray, "B H W"], x: Float[np.ndarray, "B h w C"]
 ) -> Generated:
-    """Maps x (B, h, w, C) of `predict` on clean depth_m (B, H, W)."""
+    """Maps x (B, h, w, C) of `predict` on clean depth_m (B, H, W), in batches of one compiled size."""
     sized = np.moveaxis(resize_nearest(np.moveaxis(x, -1, 1), depth_m.shape[1:]), 1, -1)
-    return Generated(*map(np.asarray, _graft(config, np.asarray(depth_m, np.float32), sized)))
+    size = batch_size(config)
+    parts = []
+    for start in range(0, len(depth_m), size):
+        now = slice(start, start + size)
+        made = _graft(config, _filled_up(depth_m[now], size), _filled_up(sized[now], size))
+        parts.append([np.asarray(part)[: len(depth_m[now])] for part in made])
+    return Generated(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -278,8 +292,7 @@ def predict(
     number = np.asarray(episode)
     mesh = Mesh(np.array(jax.local_devices()), ("frames",))
     split, everywhere = (NamedSharding(mesh, PartitionSpec(*axes)) for axes in (("frames",), ()))
-    params = jax.device_put(generator.params, everywhere)
-    parts = []
+    params, made = generator.on_devices(everywhere), []
     for start in range(0, len(c), size):
         now = slice(start, start + size)
         x = _sample_here(
@@ -291,8 +304,10 @@ def predict(
             jax.device_put(_filled_up(frame[now], size), split),
             steps=steps or config.sampling.steps,
         )
-        parts.append(np.asarray(x)[: len(c[now])])
-    return np.concatenate(parts)
+        made.append(x)
+        if len(made) > 1:  # while the devices are at this one
+            made[-2] = np.asarray(made[-2])
+    return np.concatenate([np.asarray(x) for x in made])[: len(c)]
 
 
 def _filled_up(values: np.ndarray, size: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import contract, upgrades
+from ddgrasp import contract, machine, upgrades
 from ddgrasp.config import Config, DDGTrainingConfig, DeployConfig, ExportConfig, TeacherConfig
 from ddgrasp.errors import UserError
 from ddgrasp.files import TEMPORARY, atomic_write_json, read_json, to_json
@@ -61,6 +61,8 @@ class Manifest:
     """What the stage measured; goes into report.json. A success rate is {"successes": k, "n": n}."""
     created: str = ""
     """UTC time."""
+    machine: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """What it was made on (`machine.describe`); empty before 2026-11-28."""
     manifest_version: int = upgrades.VERSION
     """Format of the configuration's fields (ddgrasp/upgrades.py). A Manifest's are always this code's."""
 
@@ -94,7 +96,8 @@ def read_manifest(directory: Path | str) -> Manifest:
         )
     value = read_json(path)
     names = {field.name for field in dataclasses.fields(Manifest)}
-    absent = names - value.keys() - {"created", upgrades.VERSION_FIELD} if isinstance(value, dict) else names
+    later = {"created", "machine", upgrades.VERSION_FIELD}
+    absent = names - value.keys() - later if isinstance(value, dict) else names
     if absent or not _has_mappings(value, "config", "parents", "metrics"):
         raise UserError(f"{path} is no manifest of this project: delete {directory} and run the stage again.")
     if value["contract_version"] != contract.CONTRACT_VERSION:
@@ -166,6 +169,7 @@ def finish(
             origin=origin,
             metrics=to_json(metrics),
             created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            machine=machine.describe(),
         ),
     )
 

@@ -48,12 +48,31 @@ def new_folder(path: Path | str) -> Iterator[Path]:
 
     Raises OSError if `path` has come to exist and is no empty folder.
     """
+    with _folder_beside(Path(path)) as temporary:
+        yield temporary
+        os.replace(temporary, path)
+
+
+@contextlib.contextmanager
+def replaced_folder(path: Path | str) -> Iterator[Path]:
+    """As `new_folder`; a folder `path` that there is goes away once the new one stands in its place."""
     path = Path(path)
+    old = path.with_name(f"{TEMPORARY}{os.getpid()}-old-{path.name}")
+    with _folder_beside(path) as temporary:
+        yield temporary
+        if path.exists():
+            os.replace(path, old)
+        os.replace(temporary, path)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _folder_beside(path: Path) -> Iterator[Path]:
+    """A temporary name, which the caller makes a folder of and renames; it goes away on any error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
     try:
         yield temporary
-        os.replace(temporary, path)
         _fsync(path.parent)
     except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -205,7 +205,8 @@ class Rig:
         self._policy.watch = lambda depth, state: watch(depth, state, self._world.observation())
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """See Bench."""
+        self._camera.close()
 
 
 def run_trials(

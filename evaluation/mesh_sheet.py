@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from evaluation.report import figures
 from mjx_envs.object_spec import slot_layout
 from mjx_envs.objects import OBJECTS
+from rig.fr3.picture import draw_without_display
 from rig.meshes.bodies import CONTACT_GROUP, VISUAL_GROUP, MeshBody, make_body, place
 from rig.meshes.objects import MESH_OBJECTS
 
@@ -32,7 +33,11 @@ _KINDS = {
 
 
 def draw(names: Sequence[str] = tuple(MESH_OBJECTS)) -> bytes:
-    """PNG of the named objects, two a row; needs an OpenGL context (MUJOCO_GL=egl without a display)."""
+    """PNG of the named objects, two a row; needs an OpenGL context, without a display EGL.
+
+    Raises UserError where there is neither.
+    """
+    draw_without_display()
     bodies = [make_body(name) for name in names]
     model = _scene(bodies)
     rows = -(-len(bodies) // PER_ROW)

@@ -5,7 +5,6 @@ network they belong to. Reading it needs no JAX.
 """
 
 import hashlib
-import shutil
 import time
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 from ddgrasp import artifacts
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_json, read_json
+from ddgrasp.files import atomic_write_json, read_json, replaced_folder
 from foundation import catalog
 
 MANIFEST = "manifest.json"
@@ -70,9 +69,6 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float
     _check_metric(file, network, max_depth_m)
     variables = convert(network, arrays)
     name = f"{network}_metric" if max_depth_m else network
-    directory, fresh = weights_dir / name, weights_dir / f".tmp-{name}"
-    shutil.rmtree(fresh, ignore_errors=True)
-    _save(fresh / CHECKPOINT, variables)
     entry = catalog.get_entry(network)
     manifest = WeightsManifest(
         network=network,
@@ -85,10 +81,10 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float
         versions=artifacts.library_versions(),
         created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     )
-    atomic_write_json(fresh / MANIFEST, asdict(manifest))
-    shutil.rmtree(directory, ignore_errors=True)
-    fresh.rename(directory)
-    return directory
+    with replaced_folder(weights_dir / name) as folder:
+        _save(folder / CHECKPOINT, variables)
+        atomic_write_json(folder / MANIFEST, asdict(manifest))
+    return weights_dir / name
 
 
 def read_manifest(directory: Path) -> WeightsManifest:

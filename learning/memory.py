@@ -12,9 +12,8 @@ import jax
 import psutil
 from jax.extend import core
 
+from ddgrasp import machine
 from ddgrasp.errors import UserError
-
-_CGROUP = Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True)
@@ -66,18 +65,25 @@ def device_limit(device: Any) -> int | None:
 
 
 def host_bytes() -> int:
-    """Memory that this process may still take: the machine's, or what is left of the container's limit."""
-    free = psutil.virtual_memory().available
-    with contextlib.suppress(OSError, ValueError):
-        limit, used = (int((_CGROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
-        free = min(free, limit - used + _file_cache())
-    return free
+    """Memory that this process may still take: the machine's, or what is left of a container's or a job's."""
+    return min([psutil.virtual_memory().available, *_left()])
 
 
-def _file_cache() -> int:
-    """Bytes of files that the container's use counts and that it gives up when it is asked for memory."""
-    lines = (_CGROUP / "memory.stat").read_text().splitlines()
-    return sum(int(line.split()[1]) for line in lines if line.startswith("inactive_file "))
+def _left() -> Iterator[int]:
+    """Bytes left by every limit of a control group, of version 2 and 1."""
+    for folder in machine.control_groups("memory"):
+        for limit, used, cache in (
+            ("max", "current", "inactive_file "),
+            ("limit_in_bytes", "usage_in_bytes", "total_inactive_file "),
+        ):
+            with contextlib.suppress(OSError, ValueError):  # no such file; "max"
+                most, taken = (int((folder / f"memory.{name}").read_text()) for name in (limit, used))
+                yield most - taken + _counted(folder / "memory.stat", cache)
+
+
+def _counted(stat: Path, name: str) -> int:
+    """Bytes of `name`, here of files: they count as taken, and are given up when memory is asked for."""
+    return sum(int(line.split()[1]) for line in stat.read_text().splitlines() if line.startswith(name))
 
 
 def nbytes(tree: Any) -> int:

@@ -34,6 +34,9 @@ class RigCamera:
         self.model, self._ideal = model, ideal
         self.stereo = of_scale(config, profile)
 
+    def close(self) -> None:
+        """Lets go of what it draws with."""
+
     def depth_mm(
         self,
         data: mujoco.MjData,

@@ -41,6 +41,12 @@ class MeshCamera(RigCamera):
         """See RigCamera."""
         return self._posed(data).rgb(self.pinhole(T_world_cam))
 
+    def close(self) -> None:
+        """See RigCamera."""
+        if self._picture is not None:
+            self._picture.close()
+        self._picture = None
+
     def _draw(self, data: mujoco.MjData, camera: Camera) -> Buffers:
         return self._posed(data).buffers(camera)
 
@@ -49,8 +55,7 @@ class MeshCamera(RigCamera):
 
     def _posed(self, data: mujoco.MjData) -> ScenePicture:
         if self._picture is None or self._picture.model is not self.model:
-            if self._picture is not None:
-                self._picture.close()
+            self.close()
             self._picture = ScenePicture(self.model)
         self._picture.pose(data.qpos)
         return self._picture

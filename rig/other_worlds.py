@@ -21,12 +21,16 @@ DARK_RGBA = "0.2 0.15 0.1 1"
 """A table of dark wood."""
 
 
+_CLUTTER = 1
+"""Of a trial's seed, the stream that clutter is drawn from."""
+
+
 class FurnishedWorld(RigWorld):
     """The test rig's table, which ends, its wall, and clutter that differs from trial to trial."""
 
     def _put(self, seed: int, size: float, mass: float, friction: float) -> float:
         """See RigWorld; compiles a new model."""
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng([seed, _CLUTTER])  # not the draws that make the object heavy or large
         self.model = scene.build_model(SIM_DT_S, self._layout, lambda root: _furnish(root, rng))
         self.data = mujoco.MjData(self.model)
         return super()._put(seed, size, mass, friction)

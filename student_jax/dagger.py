@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ddgrasp.config import Config
+from ddgrasp.config import Config, StudentConfig
 from ddgrasp.files import atomic_write_json
 from ddgrasp.progress import Progress
 from demos.rollout import Roller
@@ -37,8 +37,6 @@ ACTED = "acted.json"
 CHECKPOINTS = "checkpoints"
 """Folder of the unfinished fit on pictures; a folder in it per phase."""
 LOG_EVERY = 20
-_POINTS_PER_PHASE = 100_000
-"""A phase's curves begin at its number times this."""
 _DAGGER_SEED = 40_000
 _LAST_PHASE = "head"
 
@@ -190,7 +188,7 @@ class Trainer:
                 self._directory / CHECKPOINTS / phase,
                 label=f"student, {phase}",
                 progress=self._progress,
-                first_point=number * _POINTS_PER_PHASE,
+                first_point=_steps_before(student, number),
                 log_every=LOG_EVERY,
                 shown=("position_error_mm", "yaw", "held"),
             )
@@ -200,3 +198,8 @@ class Trainer:
 
 def _phase_number(phase: str) -> int:
     return 0 if phase == "demos" else int(phase.split("-")[1])
+
+
+def _steps_before(student: StudentConfig, number: int) -> int:
+    """Steps of the phases before that of this `_phase_number`: curves count on from there."""
+    return student.training.steps + (number - 1) * student.dagger.steps if number else 0

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int, UInt8, UInt16
 
 from ddg_jax.generate import Clip, by_frames
-from ddgrasp import cores
+from ddgrasp import machine
 from ddgrasp.config import Config
 from mjx_envs import scene
 from mjx_envs.object_spec import ObjectSpec, SlotLayout
@@ -36,7 +36,7 @@ class RigSource:
         self._config, self._ideal = config, ideal
         self._table = ObjectTable(config.world.objects)
         self._own = threading.local()
-        self._threads = ThreadPoolExecutor(cores.available())
+        self._threads = ThreadPoolExecutor(machine.cores())
 
     def episodes(
         self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0

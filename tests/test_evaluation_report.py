@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from app.commands import parse
-from ddgrasp import artifacts
+from ddgrasp import artifacts, machine
 from ddgrasp.config import Config, StudentConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import PICTURES, Progress
@@ -21,6 +21,7 @@ from evaluation.report import figures
 from evaluation.report.comparison import differences
 from evaluation.report.html import flatten
 from evaluation.report.meanings import explain
+from evaluation.report.run_page import render_html
 from evaluation.report.stage import write_report
 from evaluation.report.summary import build_report, print_summary, summary_rows
 from evaluation.report.targets import targets
@@ -72,7 +73,28 @@ def test_the_report_has_the_promised_keys(run_dir):
         "loaded": False,
     }
     assert report["stages"]["student"]["loaded"] is True
-    assert report["machine"]["cores"] >= 1
+    assert report["machine"]["cores"] >= 1 and report["stages"]["ddg"]["machine"] == report["machine"]
+
+
+def test_the_page_names_what_each_stage_was_made_on_not_where_it_was_written(run_dir, monkeypatch):
+    here = render_html(build_report(run_dir), run_dir)
+    assert "Made on " in here and "made on" not in here
+    gpu = {"processor": "Xeon", "cores": 16, "system": "Linux x86_64", "accelerators": ["NVIDIA H100"]}
+    monkeypatch.setattr(machine, "describe", lambda: gpu)
+    artifacts.finish(run_dir / "teacher", "teacher", CONFIG, seconds=10, metrics=METRICS["teacher"])
+    report = build_report(run_dir)
+    assert report["stages"]["teacher"]["machine"] == gpu != report["machine"]
+    assert "teacher made on Xeon, 16 cores, NVIDIA H100. " in render_html(report, run_dir)
+
+
+def test_a_run_of_before_machines_were_noted_has_a_page_too(run_dir):
+    for path in run_dir.glob("*/manifest.json"):
+        value = json.loads(path.read_text())
+        del value["machine"]
+        path.write_text(json.dumps(value))
+    report = build_report(run_dir)
+    assert report["machine"] == {}
+    assert "Made on a machine that was not noted then." in render_html(report, run_dir)
 
 
 def test_the_table_ends_with_the_student_in_the_rig(run_dir, capsys):

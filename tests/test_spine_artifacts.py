@@ -14,7 +14,15 @@ import pytest
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Config, ExportConfig, WorldConfig
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_path, atomic_write_bytes, atomic_write_json, new_folder, read_json, to_json
+from ddgrasp.files import (
+    atomic_path,
+    atomic_write_bytes,
+    atomic_write_json,
+    new_folder,
+    read_json,
+    replaced_folder,
+    to_json,
+)
 from ddgrasp.presets import PRESETS
 from ddgrasp.stages import get_stage
 
@@ -49,6 +57,20 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
     with pytest.raises(OSError), new_folder(tmp_path / "sets" / "set") as temporary:
         temporary.mkdir()
     assert (tmp_path / "sets" / "set" / "file").read_text() == "whole"
+
+
+def test_a_folder_is_replaced_by_a_whole_one_or_stays(tmp_path):
+    path = tmp_path / "sets" / "set"
+    for text in ("first", "second"):
+        with replaced_folder(path) as temporary:
+            temporary.mkdir()
+            (temporary / "file").write_text(text)
+        assert (path / "file").read_text() == text
+    with pytest.raises(KeyboardInterrupt), replaced_folder(path) as temporary:
+        temporary.mkdir()
+        raise KeyboardInterrupt
+    assert (path / "file").read_text() == "second"
+    assert [there.name for there in path.parent.iterdir()] == ["set"]
 
 
 @pytest.mark.parametrize("make", [atomic_path, new_folder])

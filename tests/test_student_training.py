@@ -30,7 +30,7 @@ from mjx_envs.camera import nominal_camera
 from student_jax import train
 from student_jax.act import StudentActor, keep_clean
 from student_jax.augment import disparity_noise, unseen_objects
-from student_jax.dagger import ACTED, CHECKPOINTS, PLAN, Trainer
+from student_jax.dagger import ACTED, CHECKPOINTS, PLAN, Trainer, _steps_before
 from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gripper, with_change
 from student_jax.depth_source import make_source
 from student_jax.frames_io import useful_steps
@@ -194,6 +194,13 @@ def test_a_fit_interrupted_and_resumed_ends_as_an_uninterrupted_one(tmp_path):
     again._phase("demos", lambda: again._fit("demos", 5))
     jax.tree.map(np.testing.assert_array_equal, again.params, whole.params)
     assert again.history == whole.history and not folder.exists()
+
+
+@pytest.mark.parametrize(("number", "before"), [(0, 0), (1, 500), (2, 540), (3, 580)])
+def test_curves_count_on_from_phase_to_phase(number, before):
+    training = dataclasses.replace(CONFIG.training, steps=500)
+    student = dataclasses.replace(CONFIG, training=training, dagger=DaggerConfig(rounds=3, steps=40))
+    assert _steps_before(student, number) == before
 
 
 def test_a_round_interrupted_after_its_episodes_keeps_their_success(tmp_path):

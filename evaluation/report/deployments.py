@@ -81,7 +81,7 @@ def verdict(deployments: Sequence[Deployment]) -> str:
     runs."""
     judged = [d.report["success"] for d in deployments if d.report["success"] is not None]
     rate = wilson.describe(wilson.success(sum(judged), len(judged))) if judged else "none was judged"
-    driven = [d.report for d in deployments if not d.report.get("dry_run")]
+    driven = _driven(deployments)
     faults = sum(bool(report["fault"]) for report in driven)
     missed = sum(report["missed_deadlines"] for report in driven)
     steps = sum(report["steps"] for report in driven)
@@ -114,5 +114,10 @@ def _title(deployment: Deployment) -> str:
 
 def _alarm(deployments: Sequence[Deployment]) -> str:
     """Red where a deadline was missed or a robot failed."""
-    bad = any(d.report["missed_deadlines"] or d.report["fault"] for d in deployments)
+    bad = any(report["missed_deadlines"] or report["fault"] for report in _driven(deployments))
     return "missed" if bad else "verdict"
+
+
+def _driven(deployments: Sequence[Deployment]) -> list[Mapping[str, Any]]:
+    """Reports of all but dry runs."""
+    return [d.report for d in deployments if not d.report.get("dry_run")]

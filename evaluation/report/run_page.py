@@ -35,8 +35,8 @@ _STUDENT = {"student": ("student_clean", "student_ddg"), "deploy": ("student_rig
 
 def render_html(report: Mapping[str, Any], run_dir: Path) -> str:
     """The whole page of one run."""
-    preset, machine = escape(str(report["preset"])), report["machine"]
-    made = f"{report['created']}, {machine['processor']}, {machine['cores']} cores."
+    preset = escape(str(report["preset"]))
+    made = f"{report['created']}. {_machines(report['stages'])}"
     stages = [stage for stage in (*STAGES, *ON_REQUEST) if stage.name in report["stages"]]
     warning = trial_run(report)
     body = [
@@ -53,6 +53,20 @@ def render_html(report: Mapping[str, Any], run_dir: Path) -> str:
         *_origin(report),
     ]
     return page(f"{preset}: DiffuDepGrasp-JAX report", body)
+
+
+def _machines(stages: Mapping[str, Any]) -> str:
+    """What the stages were made on: one line for all, or each with its own."""
+    made_on = {name: _machine(entry.get("machine", {})) for name, entry in stages.items()}
+    if len(kinds := set(made_on.values())) == 1:
+        return f"Made on {kinds.pop()}."
+    return " ".join(f"{name} made on {where}." for name, where in made_on.items())
+
+
+def _machine(described: Mapping[str, Any]) -> str:
+    if not described:
+        return "a machine that was not noted then"
+    return ", ".join((described["processor"], f"{described['cores']} cores", *described["accelerators"]))
 
 
 def metrics_of(stage: str, report: Mapping[str, Any]) -> dict[str, Any]:

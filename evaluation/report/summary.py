@@ -3,13 +3,12 @@
 Numbers come from the stages' manifests as they were measured; this module only adds Wilson intervals.
 """
 
-import platform
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts, contract, cores
+from ddgrasp import artifacts, contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
 from ddgrasp.stages import ON_REQUEST, STAGES, get_stage
@@ -25,11 +24,11 @@ TESTS_PRESET = "debug"
 def build_report(run_dir: Path) -> dict[str, Any]:
     """Report of every finished stage under `run_dir`; UserError if there is none.
 
-    Keys: `stages.<name>.{seconds, trained, loaded}`; `<name>` holds what that stage measured, except keys
-    that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top; `machine`,
-    `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`; `targets`, each with what was
-    measured and whether it is met; `outdated.<name>`, the parent that was made again since that stage, which
-    is left out. A success rate is {rate, n, successes, low, high}.
+    Keys: `stages.<name>.{seconds, trained, loaded, machine}`; `<name>` holds what that stage measured, except
+    keys that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top;
+    `machine` (the last stage's), `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`;
+    `targets`, each with what was measured and whether it is met; `outdated.<name>`, the parent that was made
+    again since that stage, which is left out. A success rate is {rate, n, successes, low, high}.
     `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows; `teacher.backends`, if `ddgrasp
     teacher compare` was, is `evaluation.backends.table`; `student.perception`, if `ddgrasp student
     perception` was, is `evaluation.perception.tabulate`.
@@ -53,7 +52,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
         "seed": latest.seed,
         "contract_version": contract.CONTRACT_VERSION,
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "machine": describe_machine(),
+        "machine": latest.machine,
         "versions": latest.versions,
         "outdated": outdated,
         "stages": {},
@@ -64,6 +63,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
             "trained": manifest.origin == "trained",
             "loaded": manifest.origin == "loaded",
             "created": manifest.created,
+            "machine": manifest.machine,
         }
         metrics = with_intervals(manifest.metrics)
         report[name] = {key: value for key, value in metrics.items() if not key.startswith(_TOP_LEVEL)}
@@ -101,22 +101,6 @@ def with_intervals(value: Any) -> Any:
     if isinstance(value, list):
         return [with_intervals(item) for item in value]
     return value
-
-
-def describe_machine() -> dict[str, Any]:
-    """Processor, cores this process may use, operating system."""
-    processor = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = [
-            line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line
-        ]
-        processor = names[0] if names else processor
-    return {
-        "processor": processor,
-        "cores": cores.available(),
-        "system": f"{platform.system()} {platform.machine()}",
-    }
 
 
 # --- for people ----------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from mujoco.batch import Batch
 
-from ddgrasp import cores
+from ddgrasp import machine
 from mjx_envs import devices, scene
 from mjx_envs.object_spec import SlotLayout
 from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
@@ -46,7 +46,7 @@ class CpuPhysics:
 
 def _threads(shard: int) -> int:
     """Threads of a share's batch: this host's devices divide its cores; the whole has all."""
-    return cores.available() if shard < 0 else max(1, cores.available() // jax.local_device_count())
+    return machine.cores() if shard < 0 else max(1, machine.cores() // jax.local_device_count())
 
 
 class _HostBatch:

@@ -50,7 +50,7 @@ class ScenePicture:
             [geom_rgb(self.model), np.zeros((1, 3), np.float32)]
         )  # black where none is
         self._canvases: dict[tuple[int, int], Canvas] = {}
-        _without_display()
+        draw_without_display()
 
     def pose(self, qpos: Float64[np.ndarray, " nq"]) -> None:
         """The scene from now on."""
@@ -130,14 +130,22 @@ def _slopes(
     return slopes
 
 
-def _without_display() -> None:
-    """Lets MuJoCo draw through EGL on a machine without a screen. Raises UserError without EGL."""
-    if sys.platform != "linux" or os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY"):
+def draw_without_display() -> None:
+    """Lets MuJoCo draw through EGL, where nobody has said how: a display may be absent, or named and gone.
+
+    Raises UserError where there is neither EGL nor a display.
+    """
+    if sys.platform != "linux" or os.environ.get("MUJOCO_GL"):
         return
     from mujoco.rendering.classic import gl_context
 
     try:
         from mujoco.egl import GLContext
     except Exception as error:  # its loaders raise what they like
-        raise UserError(f"camera 'rig' draws with OpenGL, and EGL is absent ({error}): add it.") from error
+        if os.environ.get("DISPLAY"):
+            return
+        raise UserError(
+            f"without a display this is drawn by OpenGL through EGL, which is absent ({error}): install "
+            "libegl1, or set MUJOCO_GL=osmesa with libosmesa6."
+        ) from error
     gl_context.GLContext = GLContext
