@@ -14,11 +14,11 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-import onnxruntime as ort
 
 from benchmarks.compare import seconds_in_turns
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import ExportConfig, StudentConfig, WorldConfig
+from ddgrasp.onnx_runtime import ort
 from export import graph, parity
 from student_jax import policy
 

@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import onnx
-import onnxruntime
 
 from benchmarks import network_graphs
 from benchmarks.compare import seconds_in_turns
+from ddgrasp.onnx_runtime import ort
 from foundation import catalog
 from foundation.convert import depth_network, variable_shapes
 from foundation.depth import DTYPES
@@ -99,13 +99,11 @@ def cases(side: int) -> list[Case]:
     ]
 
 
-def open_session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+def open_session(model: onnx.ModelProto) -> ort.InferenceSession:
     """On all cores; threads that wait do not spin, which on a busy machine would slow both sides."""
-    options = onnxruntime.SessionOptions()
+    options = ort.SessionOptions()
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    return onnxruntime.InferenceSession(
-        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-    )
+    return ort.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
 def measure(case: Case, batch: int, dtypes: Sequence[str], runs: int) -> None:

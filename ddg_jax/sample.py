@@ -216,9 +216,13 @@ def generate(
       frame: (B,) numbers within the episode, 0, 1, ... by default.
       steps: network evaluations per map, the configuration's by default.
 
-    Raises UserError for depth of another type, rank or aspect ratio.
+    Raises UserError for depth of another type, rank, unit or aspect ratio, and for numbers that are not of
+    its frames.
     """
     _check_depth(depth_m, generator.config)
+    _check_numbers("episode", np.asarray(episode), len(depth_m), alone=True)
+    if frame is not None:
+        _check_numbers("frame", np.asarray(frame), len(depth_m), alone=False)
     depth_m = mixed(depth_m, generator.config.graft.window_px)
     c = condition(generator, depth_m, rgb, one_episode=np.ndim(episode) == 0)
     x = predict(key, generator, c, episode=episode, frame=frame, steps=steps)
@@ -332,9 +336,27 @@ def _check_depth(depth_m: np.ndarray, config: DDGConfig) -> None:
         raise UserError(
             f"Simulated depth is {depth_m.dtype} {depth_m.shape}; expected (T, H, W) floating-point metres."
         )
-    if not np.isfinite(depth_m).all() or np.max(depth_m, initial=0) > FARTHEST_SANE_M:
-        raise UserError(
-            f"Simulated depth reaches {np.max(depth_m):g}; expected finite metres, 0 for nothing in range "
-            "(divide millimetres by 1000)."
-        )
+    if not depth_m.size:
+        raise UserError(f"Simulated depth is {depth_m.shape}; expected a frame or more.")
+    check_metres(depth_m)
     check_aspect(depth_m.shape[1:], config)
+
+
+def check_metres(depth_m: Float[np.ndarray, "..."]) -> None:
+    """UserError if simulated depth is in another unit, negative or not finite."""
+    low, high = np.min(depth_m, initial=0), np.max(depth_m, initial=0)
+    if not (low >= 0 and high <= FARTHEST_SANE_M):  # neither is so for NaN
+        raise UserError(
+            f"Simulated depth reaches from {low:g} to {high:g}; expected finite metres, 0 for nothing in "
+            "range (divide millimetres by 1000)."
+        )
+
+
+def _check_numbers(name: str, numbers: np.ndarray, count: int, alone: bool) -> None:
+    """UserError unless there is a whole number for each of `count` frames, or, `alone`, one for all."""
+    fits = numbers.shape == (count,) or (alone and numbers.ndim == 0)
+    if not (fits and np.issubdtype(numbers.dtype, np.integer)):
+        raise UserError(
+            f"{name} is {numbers.dtype} {numbers.shape} of {count} frames; expected a whole number for each"
+            f"{' or one for all' if alone else ''}."
+        )

@@ -42,7 +42,8 @@ def learned(generator: Generator) -> Sense:
     """Sampling and grafting by a fitted generator; every picture is an episode of one frame.
 
     Sampling is traced with the rest; the prior, a function of NumPy arrays, runs on the host. For whole
-    data sets `ddg_jax.sample.generate` is quicker: it batches.
+    data sets `ddg_jax.sample.generate` is quicker: it batches. It also refuses depth that is not in finite
+    metres, which a traced function cannot.
 
     Raises:
         UserError: the generator's prior needs a network on colour pictures, which cannot run in a callback.

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import onnxruntime as ort
 
 from ddgrasp import generator_metadata as names
 from ddgrasp.errors import UserError
+from ddgrasp.onnx_runtime import ort
 from ddgrasp.shipped import shipped
 
 ASPECT_TOLERANCE = 0.02

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import onnxruntime as ort
 from jaxtyping import Float, Float32
 
 from ddgrasp import artifacts, contract
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.errors import UserError
 from ddgrasp.gripper import ClosingLatch, WidthChange
+from ddgrasp.onnx_runtime import ort
 from ddgrasp.shipped import shipped
 from deploy.interfaces import Depth
 
@@ -23,6 +23,9 @@ LEAST_VALID = 0.02
 """Share of a frame's pixels: with fewer something is over the lens, or nearer than the camera sees."""
 PLAUSIBLE_MEDIAN_M = (0.05, 20.0)
 """A scene's median depth outside this is another unit, not another scene."""
+
+FARTHEST_JOINT_RAD, WIDEST_M = 7.0, 0.5
+"""No arm's joint turns farther, no gripper opens wider: more are degrees, or millimetres."""
 
 
 class DepthInput(NamedTuple):
@@ -140,8 +143,8 @@ class OnnxPolicy:
 
         Call this or `wait` in every control step.
 
-        UserError for a frame of another size or type, and for a state that is not eight finite numbers; the
-        frames of before stay.
+        UserError for a frame of another size or type, and for a state that is not eight finite numbers, in
+        radians and metres; the frames of before stay.
         """
         if problem := self.check_fit(depth) or _wrong_state(state):
             raise UserError(f"{problem}.")
@@ -197,7 +200,12 @@ def _wrong_state(state: Float[np.ndarray, "..."]) -> str:
         return (
             f"wrong state: size {np.shape(state)}, expected ({contract.STATE_SIZE},): joints, gripper's width"
         )
-    return "" if np.isfinite(state).all() else f"wrong state: {np.asarray(state).tolist()} is not finite"
+    values = np.asarray(state).tolist()
+    if not np.isfinite(state).all():
+        return f"wrong state: {values} is not finite"
+    if max(map(abs, values[:-1])) > FARTHEST_JOINT_RAD:
+        return f"wrong state: joints {values[:-1]} cannot be radians"
+    return "" if abs(values[-1]) < WIDEST_M else f"wrong state: an opening of {values[-1]:g} cannot be metres"
 
 
 def _open(path: Path) -> ort.InferenceSession:

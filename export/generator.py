@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import onnxruntime as ort
 from jaxtyping import Float32, Key
 
 from ddg_jax.representation import channels, correlations
@@ -19,6 +18,7 @@ from ddgrasp.config import PROGRESSIVE, DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.generator_metadata import GeneratorMetadata
+from ddgrasp.onnx_runtime import ort
 from export.generator_graph import build_model
 from export.parity import open_session
 from export.sampler_tables import MOST_STEPS, is_stochastic

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import onnxruntime as ort
 from jaxtyping import Float, Float32, UInt16
 
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.depth import to_metres, to_millimetres
+from ddgrasp.onnx_runtime import ort
 from student_jax import denoiser, preprocess
 
 RawDepth = UInt16[np.ndarray, "*batch H W"] | Float32[np.ndarray, "*batch H W"]

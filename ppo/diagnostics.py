@@ -28,7 +28,7 @@ def of_update(
       policy_after: the actor's after it.
 
     Returns:
-      policy/kl: KL divergence of the new action distributions from the old ones, mean, nats.
+      policy/kl: KL divergence of the action distributions, KL(old || new), mean, nats.
       policy/clip_fraction: share of the actions whose probability moved further than PPO's clipping range.
       policy/std: mean standard deviation of the exploration noise, before the tanh.
       value/explained_variance: 1 - Var(return - value) / Var(return), with the return as GAE estimates it

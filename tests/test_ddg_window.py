@@ -14,6 +14,7 @@ from ddg_jax.train import init_params
 from ddg_jax.window import mixed
 from ddgrasp.config import DDGConfig, DDGDepthConfig, GraftConfig, SamplingConfig, UNetConfig
 from ddgrasp.depth import to_metres, to_millimetres
+from ddgrasp.errors import UserError
 
 CONFIG = DDGConfig(
     depth=DDGDepthConfig(height_px=16, width_px=24),
@@ -72,3 +73,31 @@ def test_the_camera_model_has_the_window_too():
     made = [np.asarray(sense(jax.random.key(2), d, None)) for sense, d in zip(senses, inputs, strict=True)]
     np.testing.assert_allclose(*made, atol=1e-6)
     assert np.abs(made[0] - np.asarray(senses[1](jax.random.key(2), clean_m, None))).max() > 0.05
+
+
+FITTED = Generator(CONFIG, init_params(CONFIG, jax.random.key(0)), make_prior(CONFIG))
+SCENE_M = np.random.default_rng(0).uniform(0.5, 0.9, (6, 16, 24)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"episode": np.arange(2)}, r"episode is int64 \(2,\) of 6 frames; expected .* or one for all"),
+        ({"frame": np.zeros(7, int)}, r"frame is int64 \(7,\) of 6 frames"),
+        ({"depth_m": -SCENE_M}, r"from -0.\d+ to 0; expected finite metres"),
+        ({"depth_m": 1000 * SCENE_M}, "divide millimetres by 1000"),
+        ({"depth_m": np.where(SCENE_M > 0.6, np.nan, SCENE_M)}, "expected finite metres"),
+        ({"depth_m": SCENE_M[:0]}, "expected a frame or more"),
+    ],
+)
+def test_numbers_and_depth_that_do_not_fit_are_refused(change, said):
+    with pytest.raises(UserError, match=said):
+        generate(jax.random.key(0), FITTED, **{"depth_m": SCENE_M} | change)
+
+
+def test_frames_come_out_the_same_however_many_come_at_once():
+    together = generate(jax.random.key(0), FITTED, SCENE_M)  # a batch and a half
+    for t in (0, 5):
+        alone = generate(jax.random.key(0), FITTED, SCENE_M[t : t + 1], frame=np.array([t]))
+        for one, all_of_them in zip(vars(alone).values(), vars(together).values(), strict=True):
+            np.testing.assert_allclose(one[0], all_of_them[t], atol=1e-6)

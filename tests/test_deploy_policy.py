@@ -1,11 +1,17 @@
 """An exported file on the robot side: checks at loading, frame buffer, chunks, noise."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from ddgrasp.errors import UserError
 from deploy.policy import OnnxPolicy
-from deploy_support import SHAPE, constant_bias, depth_mm, describe, write_policy
+from deploy_support import HOME_RAD, SHAPE, constant_bias, depth_mm, describe, write_policy
+from tutorial_support import code
 
 STATE = np.zeros(8, np.float32)
 
@@ -39,7 +45,7 @@ def test_state_reaches_the_network_in_order(tmp_path):
     gain = np.zeros((9, 4, 8))
     gain[np.arange(8), 0, np.arange(8)] = 2.0
     policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", state_gain=gain))
-    state = np.arange(8, dtype=np.float32)
+    state = np.arange(8, dtype=np.float32) / 16
     np.testing.assert_array_equal(policy.act(depth_mm(), state), 2 * state)
 
 
@@ -47,12 +53,12 @@ def test_the_network_is_told_how_the_opening_changes_also_while_a_chunk_is_playe
     gain = np.zeros((9, 4, 8))
     gain[8, :, 0] = 1.0
     policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", state_gain=gain), execute_steps=2)
-    widths, told = (8.0, 7.0, 5.0, 5.0, 4.5), []
+    widths, told = (0.46875, 0.4375, 0.3125, 0.3125, 0.28125), []
     for width in widths:
         told.append(float(policy.act(depth_mm(), np.array([0, 0, 0, 0, 0, 0, 0, width], np.float32))[0]))
-    assert told == [0.0, 0.0, -2.0, -2.0, -0.5]
+    assert told == [0.0, 0.0, -0.125, -0.125, -0.03125]
     policy.forget()
-    assert policy.act(depth_mm(), np.full(8, 3, np.float32))[0] == 0.0
+    assert policy.act(depth_mm(), np.full(8, 0.3, np.float32))[0] == 0.0
 
 
 def test_chunk_is_played_for_execute_steps_and_frames_keep_coming(tmp_path):
@@ -215,3 +221,50 @@ def test_what_cannot_be_used_is_refused_and_the_next_frame_goes_on(tmp_path):
         with pytest.raises(UserError, match=message):
             policy.act(depth, state)
         policy.act(depth_mm(), STATE)
+
+
+def test_the_page_s_lines_do_what_the_policy_class_does(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    gain, state_gain = rng.normal(0, 1e-3, (3, 4, 8)), rng.normal(0, 1, (9, 4, 8))
+    info = describe(execute_steps=2, closing_steps=3)
+    path = write_policy(tmp_path / "policy.onnx", info, depth_gain=gain, state_gain=state_gain)
+    monkeypatch.chdir(tmp_path)
+    (lines,) = (block for block in code("../data.md") if "InferenceSession" in block)
+    page: dict = {}
+    exec(lines, page)
+    policy, closed = OnnxPolicy(path), []
+    for _ in range(12):
+        depth, width_m = depth_mm(int(rng.integers(400, 900))), float(rng.uniform(0, 0.08))
+        q_rad = HOME_RAD + rng.normal(0, 0.1, 7)
+        action = policy.act(depth, np.append(q_rad, width_m).astype(np.float32))
+        target_rad, close = page["act"](depth, q_rad, width_m)
+        wanted = q_rad + info.action_scale_rad * np.clip(action[:7], -1, 1)
+        np.testing.assert_allclose(
+            target_rad, np.clip(wanted, info.joint_lower_rad, info.joint_upper_rad), atol=1e-6
+        )
+        assert close == (action[7] > 0)
+        closed.append(close)
+    assert True in closed and False in closed
+
+
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [
+        (np.append(np.degrees(HOME_RAD), 0.08), "cannot be radians"),
+        (np.append(HOME_RAD, 80.0), "an opening of 80 cannot be metres"),
+    ],
+)
+def test_a_state_in_other_units_is_refused(tmp_path, state, said):
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx"))
+    with pytest.raises(UserError, match=said):
+        policy.act(depth_mm(), state.astype(np.float32))
+
+
+def test_nothing_is_kept_or_told_of_what_runs(tmp_path):
+    path, home = write_policy(tmp_path / "p.onnx"), tmp_path / "home"
+    home.mkdir()
+    quiet = ("CI", "ORT_DISABLE_TELEMETRY", "ORT_RUNNING_UNIT_TESTS", "XDG_CACHE_HOME")
+    env = {name: value for name, value in os.environ.items() if name not in quiet} | {"HOME": str(home)}
+    lines = f"from deploy.policy import OnnxPolicy; OnnxPolicy({str(path)!r}).warm_up()"
+    subprocess.run([sys.executable, "-c", lines], env=env, check=True, cwd=Path(__file__).parents[1])
+    assert list(home.rglob("*")) == []

@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import jax
 import numpy as np
-import onnxruntime as ort
 import pytest
 
 from ddg_jax.prior import make_prior
@@ -24,6 +23,7 @@ from ddgrasp.config import (
     UNetConfig,
 )
 from ddgrasp.errors import UserError
+from ddgrasp.onnx_runtime import ort
 from export import generator as exported
 from export import prior_graph
 from export.builder import GraphBuilder, tensor

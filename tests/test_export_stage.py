@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-import onnxruntime as ort
 import pytest
 
 from config_support import unchecked
@@ -21,6 +20,7 @@ from ddgrasp.config import (
 )
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
+from ddgrasp.onnx_runtime import ort
 from ddgrasp.progress import Progress
 from demos.stage import STORE
 from demos.store import EpisodeStore

@@ -23,5 +23,5 @@ def moved(command: list[str], places: dict[str, Path]) -> list[str]:
 
 
 def code(page: str) -> list[str]:
-    """Python blocks of a tutorial, in order."""
+    """Python blocks of a tutorial, or of another page by its path from there, in order."""
     return re.findall(r"^```python\n(.*?)^```", (TUTORIALS / page).read_text(), re.MULTILINE | re.DOTALL)
