@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -121,25 +121,62 @@ class Streaming:
             self._give(number)
 
 
+class Nothing:
+    """A set of frames without one, and the frame that is not in it: false, and without pixels."""
+
+    def __bool__(self) -> bool:
+        return False
+
+    def get_depth_frame(self) -> "Nothing":
+        return self
+
+    def get_infrared_frame(self, index: int) -> "Nothing":
+        return self
+
+    def get_data(self) -> Any:
+        raise RuntimeError('null pointer passed for argument "frame_ref"')
+
+
 class ScriptedLibrary:
-    """What recording needs of pyrealsense2; the pipeline delivers `numbers`, or raises what is among them."""
+    """What recording, a camera and an imager need of pyrealsense2; buffers are reused, as the library's are.
+
+    Every poll and every wait takes the next of `numbers`: a frame's, what is raised, or None, which is a set
+    without frames. `said` lists what was asked, every poll and every wait, in order.
+    """
 
     camera_info = SimpleNamespace(name="name", serial_number="serial_number")
-    stream = SimpleNamespace(depth="depth", color="color")
-    format = SimpleNamespace(z16="z16", rgb8="rgb8")
+    stream = SimpleNamespace(depth="depth", color="color", infrared="infrared")
+    format = SimpleNamespace(z16="z16", rgb8="rgb8", y8="y8")
     option = SimpleNamespace(stereo_baseline="baseline", emitter_enabled="emitter")
+    timestamp_domain = SimpleNamespace(hardware_clock="hardware_clock")
+    intrinsics = SimpleNamespace(
+        fx=FX_PX, fy=FX_PX, ppx=SIZE[1] / 2 - 0.5, ppy=SIZE[0] / 2 - 0.5, width=SIZE[1], height=SIZE[0],
+        coeffs=[0.1, 0.2, 0.3, 0.4, 0.5],
+    )  # fmt: skip
 
-    def __init__(self, numbers, *, start_error: str = "", serials: tuple[str, ...] = (SERIAL,)):
+    def __init__(
+        self, numbers: Iterable[Any], *, start_error: str = "", serials: tuple[str, ...] = (SERIAL,),
+        unit_m: float = 0.0001,
+    ):  # fmt: skip
         self._numbers, self._start_error, self._serials = iter(numbers), start_error, serials
-        self.asked: list[tuple] = []
+        self._unit_m = unit_m
+        self._depth, self._rgb, self._gray = depth_mm(0), rgb(0), np.zeros(SIZE, np.uint8)
+        self.said: list[Any] = []
+        self.silent = ""
+        """What switching the projector raises, if not empty: it streams, and does not answer."""
         self.stopped = False
+
+    @property
+    def asked(self) -> list[tuple]:
+        """What was asked of the configuration and of the projector."""
+        return [said for said in self.said if isinstance(said, tuple)]
 
     def pipeline(self) -> "ScriptedLibrary":
         return self
 
     def config(self) -> Any:
         def ask(*values):
-            self.asked.append(values)
+            self.said.append(values)
 
         return SimpleNamespace(enable_device=ask, enable_stream=ask)
 
@@ -151,25 +188,49 @@ class ScriptedLibrary:
         if self._start_error:
             raise RuntimeError(self._start_error)
         sensor = SimpleNamespace(
-            supports=lambda what: True, get_option=lambda what: -BASELINE_MM, get_depth_scale=lambda: 0.0001,
-            set_option=lambda what, value: self.asked.append((what, value)),
+            supports=lambda what: True, get_option=lambda what: -BASELINE_MM, set_option=self._set_option,
+            get_depth_scale=lambda: self._unit_m,
         )  # fmt: skip
         device = SimpleNamespace(get_info=lambda what: NAME, first_depth_sensor=lambda: sensor)
-        stream = SimpleNamespace(fps=lambda: 30, get_intrinsics=lambda: SimpleNamespace(fx=FX_PX))
+        stream = SimpleNamespace(fps=lambda: 30, get_intrinsics=lambda: self.intrinsics)
         video = SimpleNamespace(as_video_stream_profile=lambda: stream)
-        return SimpleNamespace(get_device=lambda: device, get_stream=lambda kind: video)
+        return SimpleNamespace(get_device=lambda: device, get_stream=lambda *kind: video)
 
     def stop(self) -> None:
+        self.said.append("stop")
         self.stopped = True
 
+    def poll_for_frames(self) -> Any:
+        self.said.append("poll")
+        return self._next()
+
     def wait_for_frames(self, timeout_ms: int) -> Any:
-        number = next(self._numbers)
-        if callable(number):
-            number = number()
+        self.said.append("wait")
+        return self._next()
+
+    def _set_option(self, what: str, value: float) -> None:
+        if self.silent:
+            raise RuntimeError(self.silent)
+        self.said.append((what, value))
+
+    def _next(self) -> Any:
+        item = next(self._numbers)
+        number: Any = item() if callable(item) else item
         if isinstance(number, Exception):
             raise number
-        depth = SimpleNamespace(get_data=lambda: 10 * depth_mm(number), get_frame_number=lambda: number)
-        color = SimpleNamespace(get_data=lambda: rgb(number))
+        if number is None:
+            return Nothing()
+        np.copyto(self._depth, depth_mm(number) * round(0.001 / self._unit_m))
+        np.copyto(self._rgb, rgb(number))
+        self._gray[:] = number % 256
         return SimpleNamespace(
-            get_depth_frame=lambda: depth, get_color_frame=lambda: color, get_frame_number=lambda: number
-        )
+            get_depth_frame=lambda: self._frame(number, self._depth), get_frame_number=lambda: number,
+            get_color_frame=lambda: self._frame(number, self._rgb),
+            get_infrared_frame=lambda index: self._frame(number, self._gray),
+        )  # fmt: skip
+
+    def _frame(self, number: int, pixels: np.ndarray) -> Any:
+        return SimpleNamespace(
+            get_data=lambda: pixels, get_frame_number=lambda: number,
+            get_frame_timestamp_domain=lambda: self.timestamp_domain.hardware_clock,
+        )  # fmt: skip

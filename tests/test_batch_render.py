@@ -23,10 +23,16 @@ def make_renderer(name, scenes, **options):
     return batch_render.make_renderer(name, scenes.camera, **options)
 
 
+@pytest.fixture(scope="module")
+def renderers(scenes):
+    """Name -> the renderer of whole pictures, compiled once."""
+    return {name: jax.jit(make_renderer(name, scenes)) for name in batch_render.RENDERERS}
+
+
 @pytest.mark.parametrize("name", batch_render.RENDERERS)
-def test_pictures_agree_with_open_gl(name, scenes, open_gl):
+def test_pictures_agree_with_open_gl(name, scenes, renderers, open_gl):
     expected = render_check.draw_with_open_gl(scenes, open_gl)
-    seen = jax.jit(make_renderer(name, scenes))(scenes.geoms, scenes.T_world_cam)
+    seen = renderers[name](scenes.geoms, scenes.T_world_cam)
     measures = render_check.compare(seen, expected)
     print(name, {key: f"{value:.2g}" for key, value in measures.items()})
     assert render_check.violations(measures) == []
@@ -35,15 +41,15 @@ def test_pictures_agree_with_open_gl(name, scenes, open_gl):
 
 
 @pytest.mark.parametrize("name", batch_render.RENDERERS)
-def test_pictures_agree_with_numpy(name, scenes):
+def test_pictures_agree_with_numpy(name, scenes, renderers):
     expected = render_check.draw_with_numpy(scenes)
-    seen = jax.jit(make_renderer(name, scenes))(scenes.geoms, scenes.T_world_cam)
+    seen = renderers[name](scenes.geoms, scenes.T_world_cam)
     assert render_check.violations(render_check.compare(seen, expected)) == []
 
 
 @pytest.mark.parametrize("name", batch_render.RENDERERS)
-def test_depth_alone_is_the_same_depth(name, scenes):
-    whole = jax.jit(make_renderer(name, scenes))(scenes.geoms, scenes.T_world_cam)
+def test_depth_alone_is_the_same_depth(name, scenes, renderers):
+    whole = renderers[name](scenes.geoms, scenes.T_world_cam)
     alone = jax.jit(make_renderer(name, scenes, depth_only=True))(scenes.geoms, scenes.T_world_cam)
     assert alone.rgb is None and alone.segmentation is None
     assert np.mean(np.abs(alone.depth_m - whole.depth_m) > 2e-5) < 5e-4
@@ -51,9 +57,9 @@ def test_depth_alone_is_the_same_depth(name, scenes):
     assert 0 < float(near.depth_m.max()) <= 0.8 < float(alone.depth_m.max())
 
 
-def test_a_picture_that_is_off_is_found(scenes):
+def test_a_picture_that_is_off_is_found(scenes, renderers):
     """The check can fail: another camera's pictures, another geom, another light."""
-    renderer = jax.jit(make_renderer("jax", scenes))
+    renderer = renderers["jax"]
     seen = jax.tree.map(np.asarray, renderer(scenes.geoms, scenes.T_world_cam))
     assert render_check.violations(render_check.compare(seen, seen)) == []
     nearer = scenes.T_world_cam.copy()

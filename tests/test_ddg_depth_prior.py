@@ -21,33 +21,21 @@ from ddgrasp.config import (
     StudentConfig,
 )
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_json
 from demos.rollout import Scene
 from evaluation.depth_score.data import REAL, SIM, Episode
 from evaluation.depth_score.domains import Methods, sense
 from evaluation.treatments import Monocular, make_treatment
-from foundation import convert, store
+from foundation import store
 from student_jax.act import SourceCamera
 from student_jax.depth_source import GeneratorSource, MonocularSource
 from student_jax.source_check import check_source
+from weights_support import depth_anything_v2_small
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """The small image network's folder, as `weights convert` would leave it; random weights."""
-    directory = tmp_path_factory.mktemp("weights") / "depth_anything_v2_small"
-    rng = np.random.default_rng(0)
-    arrays = {
-        key: (rng.normal(0, 0.3, target.shape) / max(1, np.prod(target.shape[1:])) ** 0.5).astype(np.float32)
-        for key, target in convert.targets("depth_anything_v2_small").items()
-    }
-    arrays["depth_head.scratch.output_conv2.2.bias"] += 1
-    store._save(directory / store.CHECKPOINT, convert.convert("depth_anything_v2_small", arrays))
-    manifest = store.WeightsManifest(
-        "depth_anything_v2_small", "x.pth", "ab12", "Apache-2.0", "here", 1, 0.0, {}, "today"
-    )
-    atomic_write_json(directory / store.MANIFEST, vars(manifest))
-    return directory
+    """The small image network's folder, random weights."""
+    return depth_anything_v2_small(tmp_path_factory.getbasetemp())
 
 
 def config(weights, in_sim: PriorInSim = "depth", depth=DDGDepthConfig()) -> DDGConfig:  # noqa: B008

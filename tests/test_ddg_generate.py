@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from app import cli
 from ddg_jax import generate, sample, train
 from ddg_jax.prior import make_prior
 from ddgrasp import artifacts, contract
@@ -76,11 +77,14 @@ def noisy_store(directory: Path) -> EpisodeStore:
     return EpisodeStore(directory / "noisy" / generate.STORE)
 
 
+def command(run: Path, out: Path, *extra: str) -> list[str]:
+    told = ["ddg", "generate", "--out", str(out), "--seed", "3"]
+    return [*told, "--model", str(run / "ddg"), "--demos", str(run / "demos"), *extra]
+
+
 def job(run: Path, out: Path, *extra: str, devices: int = 1) -> subprocess.Popen:
-    command = [sys.executable, "-m", "app.cli", "ddg", "generate", "--out", str(out), "--seed", "3"]
-    command += ["--model", str(run / "ddg"), "--demos", str(run / "demos"), *extra]
     return subprocess.Popen(
-        command,
+        [sys.executable, "-m", "app.cli", *command(run, out, *extra)],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -228,7 +232,7 @@ def test_the_stream_hands_colour_to_a_prior_that_needs_it(run):
     np.testing.assert_array_equal(holes(rgb), holes(rgb))
 
 
-def test_wrong_input_is_refused(run, tmp_path, straight):
+def test_wrong_input_is_refused(run, tmp_path, straight, capsys):
     config = dataclasses.replace(
         CONFIG, ddg=dataclasses.replace(CONFIG.ddg, prior=dataclasses.replace(CONFIG.ddg.prior, in_sim="rgb"))
     )
@@ -240,9 +244,8 @@ def test_wrong_input_is_refused(run, tmp_path, straight):
     text = (old / artifacts.MANIFEST).read_text()
     changed = text.replace(f'"contract_version": {contract.CONTRACT_VERSION}', '"contract_version": 99')
     (old / artifacts.MANIFEST).write_text(changed)
-    process = job(run, tmp_path / "out", "--demos", str(old))
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 2 and "contract version 99" in errors and errors.count("\n") == 1
-    again = job(run, straight[0])
-    _, errors = again.communicate(timeout=300)
-    assert again.returncode == 2 and "continue with --resume" in errors
+    assert cli.main(command(run, tmp_path / "out", "--demos", str(old))) == 2
+    errors = capsys.readouterr().err
+    assert "contract version 99" in errors and errors.count("\n") == 1
+    assert cli.main(command(run, straight[0])) == 2
+    assert "continue with --resume" in capsys.readouterr().err

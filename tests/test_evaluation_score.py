@@ -28,7 +28,6 @@ from ddgrasp.config import (
     UNetConfig,
 )
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_json
 from ddgrasp.progress import Progress
 from evaluation.depth_score import data as score_data
 from evaluation.depth_score import features as score_features
@@ -47,10 +46,10 @@ from evaluation.depth_score.domains import (
 from evaluation.depth_score.episodes import Scored, collect, score_episodes
 from evaluation.depth_score.figures import draw_efficiency
 from evaluation.report.stage import write_report
-from foundation import convert, store
 from job_support import make_job
 from sensors.inpainting import inpainted
 from sensors.recordings.recording import RecordingWriter
+from weights_support import depth_anything_v2_small
 
 ROOT = Path(__file__).parents[1]
 CONFIG = Config(
@@ -365,19 +364,10 @@ def test_episodes_scored_for_other_columns_are_scored_again(run_dir, tmp_path):
     assert score("real_raw", FLOOR) == {"real_raw": 3, FLOOR: 3}
 
 
-def test_the_monocular_column_uses_the_users_weights(run_dir, tmp_path):
-    network = "depth_anything_v2_small"
-    rng = np.random.default_rng(0)
-    arrays = {
-        key: (rng.normal(0, 0.3, target.shape) / max(1, np.prod(target.shape[1:])) ** 0.5).astype(np.float32)
-        for key, target in convert.targets(network).items()
-    }
-    arrays["depth_head.scratch.output_conv2.2.bias"] += 1
-    store._save(tmp_path / store.CHECKPOINT, convert.convert(network, arrays))
-    manifest = store.WeightsManifest(network, "x.pth", "ab12", "Apache-2.0", "here", 1, 0.0, {}, "today")
-    atomic_write_json(tmp_path / store.MANIFEST, manifest)
+def test_the_monocular_column_uses_the_users_weights(run_dir, tmp_path, tmp_path_factory):
+    weights = depth_anything_v2_small(tmp_path_factory.getbasetemp())
     generator = Generator.load(run_dir / "ddg")
-    methods = Methods(ScoreConfig(monocular_weights=str(tmp_path)), 0, generator)
+    methods = Methods(ScoreConfig(monocular_weights=str(weights)), 0, generator)
     assert methods.needs_rgb
     for side in score_data.SIDES:
         made = sense(methods, episode(side), ["real_monocular", "sim_monocular"])[f"{side}_monocular"]

@@ -1,6 +1,7 @@
 """The ONNX file computes what JAX computes, for every option, unit, batch size and kind of bad pixel."""
 
 from dataclasses import replace
+from functools import cache
 from typing import get_args
 
 import jax
@@ -21,9 +22,14 @@ from ddgrasp.config import (
 )
 from ddgrasp.config.student import Conditioning
 from ddgrasp.errors import UserError
+from ddgrasp.gripper import CLOSE
+from ddgrasp.layout import ACTION
+from demos.rollout import Scene
+from deploy.policy import POLICY_FILE, OnnxPolicy
 from export import graph, parity
 from learning.diffusion import q_sample
 from student_jax import policy
+from student_jax.act import StudentActor, keep_clean
 
 PROFILE = contract.D455.scaled(0.125)
 SMALL = StudentConfig(
@@ -73,6 +79,17 @@ OPTIONS = {
         if name not in ("film", "concat")  # above
     },
 }
+
+
+@cache
+def initial(config: StudentConfig) -> dict:
+    return policy.init_params(jax.random.key(0), config, PROFILE)
+
+
+@cache
+def trained(config: StudentConfig) -> dict:
+    """Parameters by which a policy can be told from another. To be left as they are."""
+    return trained_head(jittered(initial(config)), config)
 
 
 def jittered(params: dict, seed: int = 0) -> dict:
@@ -125,7 +142,7 @@ def export(config: StudentConfig, options: ExportConfig, params: dict):
 @pytest.mark.parametrize("name", OPTIONS)
 def test_onnx_equals_jax(name):
     config, options = OPTIONS[name]
-    params = trained_head(jittered(policy.init_params(jax.random.key(0), config, PROFILE)), config)
+    params = trained(config)
     session = export(config, options, params)
     reference = parity.jax_policy(params, config, PROFILE, options.ddim_steps)
     rng = np.random.default_rng(0)
@@ -137,9 +154,34 @@ def test_onnx_equals_jax(name):
     assert parity.max_abs_diff(session, reference, iter(inputs)) <= 1e-4
 
 
+def test_a_student_acts_in_training_as_its_file_does_on_a_robot(tmp_path):
+    """Six control steps of two robots, of which every second plays a chunk on; a closing that lasts."""
+    config = replace(SMALL, head=replace(SMALL.head, execute_steps=2, closing_steps=3))
+    params = trained(SMALL)
+    options = ExportConfig(depth_dtype="uint16_mm")
+    described = metadata.describe(config, options, PROFILE)
+    path = tmp_path / POLICY_FILE
+    path.write_bytes(graph.build_model(params, config, options, PROFILE, described).SerializeToString())
+    robots = [OnnxPolicy(path), OnnxPolicy(path)]
+    rng, unused = np.random.default_rng(0), np.random.default_rng(1)
+    student = StudentActor(params, config, PROFILE, keep_clean, unused, noise="zero", teacher_share=0.0)
+    nobody = np.full((2, 8), np.nan), np.zeros((2, 40)), np.zeros(2, bool)
+    grips = []
+    for step in range(6):
+        given = parity.random_inputs(rng, 2, config, PROFILE, "uint16_mm")
+        depth, state = given.depth[:, 0], given.state[:, :8]
+        ours = student(Scene(depth, state, *nobody, step))
+        theirs = np.stack([robot.act(*seen) for robot, *seen in zip(robots, depth, state, strict=True)])
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+        assert np.mean(np.abs(ours[:, ACTION.arm]) < 0.95) > 0.5
+        grips.append(ours[:, ACTION.gripper])
+    grips = np.array(grips)
+    assert (grips == CLOSE).any() and (grips < 0).any()  # the first is a closing that goes on
+
+
 def test_parity_check_sees_one_changed_weight():
     config, options = OPTIONS["keypoints, trimmed crop"]
-    params = trained_head(jittered(policy.init_params(jax.random.key(0), config, PROFILE)), config)
+    params = trained(config)
     reference = parity.jax_policy(params, config, PROFILE)
     changed = jax.tree.map(np.copy, params)
     changed["encoder"]["features"]["kernel"] *= 1.05
@@ -150,7 +192,7 @@ def test_parity_check_sees_one_changed_weight():
 
 def test_units_agree_and_bad_pixels_are_the_same_as_none():
     """500 mm is 0.5 m; NaN, infinity, negative and absurd readings all act like 0."""
-    params = jittered(policy.init_params(jax.random.key(0), SMALL, PROFILE))
+    params = jittered(initial(SMALL))
     millimetres = export(SMALL, ExportConfig(depth_dtype="uint16_mm"), params)
     metres = export(SMALL, ExportConfig(depth_dtype="float32_m"), params)
     rng = np.random.default_rng(0)
@@ -164,7 +206,7 @@ def test_units_agree_and_bad_pixels_are_the_same_as_none():
 
 
 def test_options_and_parameters_that_do_not_fit_are_refused():
-    params = policy.init_params(jax.random.key(0), SMALL, PROFILE)
+    params = initial(SMALL)
 
     def build(config, options):
         graph.build_model(params, config, options, PROFILE, metadata.describe(SMALL, ExportConfig(), PROFILE))

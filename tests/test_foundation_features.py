@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import checkpoint_support as files
-import parity_support as parity
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json
 from foundation import convert, features, pictures, store
 from foundation.resnet import ResNet18
+from weights_support import resnet18
 from xla_support import optimized
 
 FIRST_NUMBERS = (0.00240183, 0.05313183)
@@ -29,8 +29,7 @@ def test_the_built_in_extractor_is_fixed_and_says_so():
 
 
 def test_published_weights_are_used_where_given(tmp_path):
-    shapes = {key: target.shape for key, target in convert.targets("resnet18").items()}
-    arrays = {key: parity.draw_parameter(key, shape, 3, 1.0) for key, shape in shapes.items()}
+    arrays = resnet18()
     files.write_safetensors(
         tmp_path / "r.safetensors", {k: a for k, a in arrays.items() if a.dtype == np.float32}
     )

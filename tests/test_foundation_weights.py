@@ -12,6 +12,7 @@ import pytest
 
 import checkpoint_support as files
 import parity_support as parity
+import weights_support
 from app.cli import main
 from ddgrasp.errors import UserError
 from foundation import catalog, convert, store
@@ -125,10 +126,9 @@ def test_files_of_other_kinds_are_named(tmp_path):
 # --- networks ------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def resnet18() -> dict[str, np.ndarray]:
-    shapes = {key: target.shape for key, target in convert.targets("resnet18").items()}
-    return {key: parity.draw_parameter(key, shape, 5, 1.0) for key, shape in shapes.items()}
+    return weights_support.resnet18()
 
 
 KEY_FILES = {

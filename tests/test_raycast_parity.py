@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from ddgrasp import contract
 from ddgrasp.errors import UserError
 from mjx_envs import scene
 from mjx_envs.camera import Camera, look_at, nominal_camera
-from mjx_envs.render import raycast_numpy, render_check
+from mjx_envs.render import raycast, raycast_numpy, render_check
 from mjx_envs.render.visible_geoms import BACKGROUND_RGB, visible_geoms
 
 HEIGHT, WIDTH, FY = 120, 160, 130.0
@@ -125,7 +126,6 @@ def test_depth_agrees_with_open_gl(make_scene, make_camera, open_gl) -> None:
 
 @pytest.mark.parametrize(("make_scene", "make_camera"), SCENES)
 def test_numpy_and_jax_agree(make_scene, make_camera) -> None:
-    raycast = pytest.importorskip("mjx_envs.render.raycast")
     for seed in range(4):
         (model, data), camera = make_scene(seed), make_camera(seed)
         expected = raycast_numpy.render(model, data, camera)
@@ -144,8 +144,6 @@ def test_numpy_and_jax_agree(make_scene, make_camera) -> None:
 
 
 def test_vmap_and_crop_give_the_window_of_the_whole_picture() -> None:
-    jax = pytest.importorskip("jax")
-    raycast = pytest.importorskip("mjx_envs.render.raycast")
     scenes = [_every_type(seed) for seed in (0, 1)]
     cameras = [_camera(seed) for seed in (0, 1)]
     geoms = [raycast.Geoms.of_model(m, d.geom_xpos, d.geom_xmat) for m, d in scenes]

@@ -8,11 +8,10 @@ import pytest
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
 from ddgrasp.presets import get_preset
+from rig import world as rig
 from rig.camera import RigCamera
 from rig.stage import act, record_trajectory
 from sensors.recordings.recording import Recording
-
-rig = pytest.importorskip("rig.world", reason="the rig is not there")
 
 
 @pytest.fixture(scope="module")

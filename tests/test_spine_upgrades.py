@@ -159,3 +159,98 @@ def test_a_manifest_of_a_later_version_is_refused_by_its_number(tmp_path):
     path.write_text(json.dumps(read_json(path) | {"manifest_version": 99}))
     with pytest.raises(UserError, match=f"is of version 99, this code reads up to {upgrades.VERSION}"):
         artifacts.read_manifest(tmp_path / "export")
+
+
+# --- what is in the folder, and not made from the tables ---------------------------------------------
+
+ABSENT = "absent"
+BY_HAND: dict[int, tuple[str, tuple[tuple[str, object, str, object], ...]]] = {
+    1: (
+        "teacher",
+        (
+            ("student.denoiser_width", 256, "student.head.width", 256),
+            ("ddg.sample_steps", 5, "ddg.sampling.steps", 5),
+            ("teacher.init_from", "", "teacher.start", "guide"),
+            ("world.random.crop_px", 24, "world.random.crop_px", ABSENT),
+            ("student.depth_source", ABSENT, "student.depth_source", "learned"),
+        ),
+    ),
+    8: (
+        "student",
+        (
+            ("ddg.unet.position", ABSENT, "ddg.unet.position", False),
+            ("student.picture.fill_holes", True, "student.picture.fill_holes", True),
+            ("student.training.edge_noise_px", 0.6, "student.training.edge_noise_px", 0.6),
+        ),
+    ),
+    9: (
+        "d435",
+        (
+            ("deploy.retry", ABSENT, "deploy.retry", False),
+            ("deploy.franka.approach_m_s", ABSENT, "deploy.franka.approach_m_s", 0.06),
+            ("ddg.unet.blocks", [1, 1, 1], "ddg.unet.blocks", (1, 1, 1)),
+        ),
+    ),
+    10: (
+        "ddg",
+        (
+            ("deploy.retry", True, "deploy.retry", True),
+            ("deploy.franka.approach_below_m", ABSENT, "deploy.franka.approach_below_m", 0.16),
+            ("deploy.franka.give_way", ABSENT, "deploy.franka.give_way", 0.5),
+        ),
+    ),
+    12: (
+        "table2/paper_generator",
+        (
+            ("student.dextrah_scale", ABSENT, "student.dextrah_scale", 1.0),
+            ("deploy.franka.give_way", 0.5, "deploy.franka.give_way", 0.5),
+            ("ddg.unet.position", True, "ddg.unet.position", True),
+        ),
+    ),
+    13: (
+        "table2/rand_noise_double",
+        (
+            ("student.dextrah_scale", 2.0, "student.dextrah_scale", 2.0),
+            ("student.depth_source", "dextrah", "student.depth_source", "dextrah"),
+            ("student.picture.fill_holes", False, "student.picture.fill_holes", False),
+        ),
+    ),
+}
+"""Version -> a manifest of it in pretrained/, and (field there, its value, field today, its value)."""
+
+
+def _shipped() -> list[Path]:
+    """Folders of the stages that come with the project; the features' network has a manifest of its own."""
+    paths = (ROOT / "pretrained").rglob(artifacts.MANIFEST)
+    return sorted(path.parent for path in paths if "stage" in read_json(path))
+
+
+def test_every_manifest_that_comes_along_is_read_and_is_of_its_own_configuration():
+    assert len(_shipped()) >= 8
+    for directory in _shipped():
+        artifact = artifacts.read_artifact(directory)
+        config = artifacts.config_from_json(artifact.manifest.config)
+        artifacts.check_config(artifact, config)  # fields that a version lacked are there, or it would differ
+
+
+@pytest.mark.parametrize("version", BY_HAND)
+def test_values_written_down_by_hand_are_today_s(version):
+    name, fields = BY_HAND[version]
+    written = read_json(ROOT / "pretrained" / name / artifacts.MANIFEST)
+    assert written.get("manifest_version", 1) == version
+    config = artifacts.config_from_json(artifacts.read_manifest(ROOT / "pretrained" / name).config)
+    for old, there, new, today in fields:
+        assert _at(written["config"], old) == there, old
+        assert _at(config, new) == today, new
+
+
+def test_every_version_that_comes_along_has_values_written_down_by_hand():
+    found = {read_json(path / artifacts.MANIFEST).get("manifest_version", 1) for path in _shipped()}
+    assert found == BY_HAND.keys()
+
+
+def _at(value, name: str):
+    """The dotted field `name` of a configuration or of its JSON, ABSENT if it has none."""
+    for part in name.split("."):
+        value = value.get(part, ABSENT) if isinstance(value, dict) else getattr(value, part, ABSENT)
+    return value

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import checkpoint_support as files
-import parity_support as parity
 from ddgrasp.config import EncoderConfig, StudentConfig, WorldConfig
 from ddgrasp.errors import UserError
 from foundation import convert, store
 from student_jax import policy, pretrained_encoder
+from weights_support import resnet18
 
 PROFILE = WorldConfig().profile
 RESNET18 = StudentConfig(
@@ -22,8 +22,7 @@ RESNET18 = StudentConfig(
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     """Folder of converted ResNet-18 weights, and its parameters."""
-    shapes = {key: target.shape for key, target in convert.targets("resnet18").items()}
-    arrays = {key: parity.draw_parameter(key, shape, 5, 1.0) for key, shape in shapes.items()}
+    arrays = resnet18()
     folder = tmp_path_factory.mktemp("weights")
     files.write_pth(folder / "resnet18.pth", arrays)
     return store.convert_file(folder / "resnet18.pth", folder), convert.convert("resnet18", arrays)["params"]

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,6 @@ import numpy as np
 import optax
 import pytest
 from brax.training import types
-from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from optax.tree_utils import tree_get_all_with_path
 
@@ -26,6 +24,7 @@ from mjx_envs.grasp_env import AutoReset
 from ppo import learner
 from ppo import policy as teacher_policy
 from ppo import train as ppo_train
+from teacher_support import learner_without_envs
 
 TEACHER = TeacherConfig(
     total_steps=4 * 8 * 4, num_envs=8, unroll_steps=4, minibatches=2, epochs=1, hidden=(16,), eval_every=100,
@@ -169,6 +168,34 @@ def test_an_early_end_is_not_trained_past_when_it_is_resumed(uninterrupted, tmp_
         assert ppo_train._train(CONFIG, tmp_path, unused, saved, Progress(quiet=True)) is ended
 
 
+def test_two_good_evaluations_in_a_row_end_training(tmp_path, monkeypatch):
+    """The first, of what it starts from, counts for nothing; a rate that just reaches `stop_at` is good."""
+    teacher = dataclasses.replace(TEACHER, total_steps=8 * 8 * 4, eval_every=1, stop_at=0.9)
+    rates, counts = iter([1.0, 0.9, 0.8, 0.95, 0.9, 0.0]), []
+
+    def iterate(state):
+        counts.append(int(state.good_evaluations))
+        curves = {name: jnp.zeros(()) for name in ("success", "contacts_dropped")}
+        return replace(state, iteration=state.iteration + 1), curves, {}
+
+    monkeypatch.setattr(ppo_train, "_start", lambda *_: learner_without_envs(teacher))
+    monkeypatch.setattr(ppo_train, "compile_iteration", lambda *_: iterate)
+    monkeypatch.setattr(ppo_train, "_evaluate", lambda *_: next(rates))
+    with Checkpoints(tmp_path) as saved:
+        config = dataclasses.replace(CONFIG, teacher=teacher)
+        ended = ppo_train._train(config, tmp_path, object.__new__(AutoReset), saved, Progress(quiet=True))
+    assert counts == [0, 1, 0, 1] and int(ended.good_evaluations) == 2
+    assert teacher.iterations == 8 and int(ended.iteration) == 4
+
+
+def test_good_evaluations_count_while_they_come_one_after_another():
+    state, counts = learner_without_envs(TEACHER), []
+    for good in (True, False, True, True):
+        state = learner.with_evaluation(state, good)
+        counts.append(int(state.good_evaluations))
+    assert counts == [1, 0, 1, 2]
+
+
 @pytest.mark.parametrize("kl", [1.0, 0.05, 0.001])
 def test_a_step_size_below_the_least_is_not_raised_by_a_large_divergence(kl):
     config = dataclasses.replace(TEACHER, target_kl=0.02, learning_rate=2e-5)
@@ -183,12 +210,10 @@ def test_an_actor_that_does_not_learn_yet_keeps_its_optimiser():
     """While the critic warms up the policy stands still: its KL says nothing of its step size, and an Adam
     that counts the steps without gradients would take the first ones with them several times too large."""
     config = dataclasses.replace(TEACHER, target_kl=0.02, learning_rate=2e-5, critic_warmup=2)
-    key, mesh = jax.random.key(0), devices.make_mesh()
-    networks = learner.make_networks(config)
-    params = learner.network_params(networks.policy_network.init(key), networks.value_network.init(key))
-    normalizer = running_statistics.init_state(specs.Array((40,), jnp.dtype("float32")))
+    mesh, state = devices.make_mesh(), learner_without_envs(config)
+    key, networks = state.key, learner.make_networks(config)
     seen = jax.random.normal(key, (8, 4, 40))
-    act = ppo_networks.make_inference_fn(networks)((normalizer, params.policy))
+    act = ppo_networks.make_inference_fn(networks)((state.normalizer, state.params.policy))
     action, extras = act(seen, key)
     steps = jnp.ones((8, 4))
     data = types.Transition(
@@ -196,9 +221,6 @@ def test_an_actor_that_does_not_learn_yet_keeps_its_optimiser():
         next_observation=seen,
         extras={"policy_extras": extras, "state_extras": {"truncation": 0 * steps}},
     )  # fmt: skip
-    begun = learner.make_optimizer(config).init(params)
-    zero = jnp.zeros((), jnp.int32)
-    state: Any = learner.LearnerState(params, normalizer, begun, None, key, zero, zero)  # pyright: ignore
     improve = jax.jit(lambda state: learner.improve(config, mesh, state, data, {})[:2])
     rates = []
     for _ in range(3):

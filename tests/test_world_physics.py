@@ -55,11 +55,80 @@ def test_violations_are_named():
     ]
 
 
+DEFECTS = {
+    "object_friction": (1.1, {"slide_relative", "slide_from_cpu_m"}),
+    "object_mass": (2.5, {"fall_from_cpu_m", "slide_from_cpu_m"}),
+    "object_inertia": (1.1, {"turn_from_cpu_rad"}),
+    "slot_size": (1.05, {"slide_from_cpu_m", "lift_from_cpu_m"}),
+    "link_mass_scale": (1.1, {"arm_from_cpu_rad"}),
+    "joint_damping": (1.1, {"arm_from_cpu_rad"}),
+    "joint_friction": (1.1, {"arm_from_cpu_rad"}),
+    "gain_scale": (0.98, {"arm_from_cpu_rad"}),
+}
+"""Field of ModelParams -> (what a faulty backend makes of it, the measures that see it)."""
+
+
+@pytest.fixture(scope="module")
+def c_step():
+    return conformance.make_step(make_backend("cpu"))
+
+
+def beyond(step) -> set[str]:
+    """Measures of `step` that are beyond MJX-JAX's limits, the widest but the C engine's own."""
+    return {line.split()[1] for line in conformance.violations("jax", conformance.measure(step))}
+
+
+@pytest.mark.parametrize("field", DEFECTS)
+def test_a_backend_with_one_defect_is_found_by_the_measure_that_should_see_it(field, c_step):
+    factor, seen_by = DEFECTS[field]
+
+    def step(params, state, ctrl):
+        return c_step(params.replace(**{field: factor * getattr(params, field)}), state, ctrl)
+
+    assert beyond(step) == seen_by
+
+
+def test_a_backend_that_takes_another_world_s_parameters_is_found_by_every_measure_but_the_fall(c_step):
+    def step(params, state, ctrl):
+        return c_step(jax.tree.map(lambda x: np.roll(x, 1, axis=0), params), state, ctrl)
+
+    assert beyond(step) == conformance.LIMITS.keys() - {"fall_relative"}  # all fall alike
+
+
+@pytest.mark.parametrize(
+    ("forgotten", "seen_by"),
+    [
+        ("qvel", {"slide_relative", "slide_from_cpu_m", "turn_from_cpu_rad", "arm_from_cpu_rad"}),
+        ("touch", {"touch_relative"}),
+    ],
+)
+def test_a_backend_that_forgets_part_of_its_state_is_found(forgotten, seen_by, c_step):
+    def step(params, state, ctrl):
+        def without(state):
+            return state.replace(**{forgotten: 0 * getattr(state, forgotten)})
+
+        return without(c_step(params, without(state), ctrl))
+
+    assert beyond(step) == seen_by
+
+
+def test_the_angle_between_orientations_is_exact_for_small_ones_too():
+    qpos = np.zeros((4, 16))
+    qpos[:, 12], angles = 1.0, np.array([0.0, 1e-6, 0.3, 3.0])
+    turned = qpos.copy()
+    turned[:, 12], turned[:, 14] = np.cos(angles / 2), np.sin(angles / 2)
+    np.testing.assert_allclose(conformance.turned_rad(qpos, turned), angles, rtol=1e-9)
+    turned[:, 12:] *= -1  # the same orientation
+    np.testing.assert_allclose(conformance.turned_rad(qpos, turned), angles, rtol=1e-9)
+
+
 def test_the_experiments_do_what_they_say():
-    """The C engine: objects fall, harder friction stops them sooner, the gripper holds with force."""
+    """The C engine: objects fall and turn, more friction stops them sooner, the gripper holds with force."""
     seen = conformance.cpu_reference()
     fall, slide, lift = (seen[name].qpos[..., 9:12] for name in ("free_fall", "sliding", "grasp_and_lift"))
     np.testing.assert_allclose(fall[0, :, 2] - fall[-1, :, 2], 9.81 * DT_S**2 * 20 * 21 / 2, rtol=1e-3)
+    qpos = seen["free_fall"].qpos
+    assert conformance.turned_rad(qpos[0], qpos[-1]).min() > 0.18
     scenario, _ = conformance.experiments()["sliding"]
     mu = conformance.contact_friction(np.asarray(scenario.params.object_friction))
     slid = (slide[-1] - slide[0])[np.argsort(mu, kind="stable"), 0]

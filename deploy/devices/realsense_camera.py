@@ -68,6 +68,7 @@ class RealSenseCamera:
         """Open the stream and check its intrinsics. Raises UserError."""
         rs = load_pyrealsense2()
         self._rs, pipeline, config = rs, rs.pipeline(), rs.config()
+        self._number = self._frame = None  # of the stream before, whose counter begins anew
         if self._serial:
             config.enable_device(self._serial)
         size = self._mode.width_px, self._mode.height_px
@@ -93,7 +94,8 @@ class RealSenseCamera:
         self._stream = self._checked(intrinsics)
 
     def read(self) -> Frame:
-        """The newest frame; waits for one only at the very start, or when the stream has paused."""
+        """The newest frame; waits for the first alone. A stream that pauses leaves its last one, whose time
+        tells its age."""
         try:
             frames = self._pipeline.poll_for_frames()
             if not frames and self._frame is None:

@@ -56,9 +56,15 @@ class RealSenseImager:
                 f"USB 3 cable and deploy.realsense.serial {self._serial!r}."
             ) from error
         self._pipeline, self._active = pipeline, active
-        project(rs, active, on=False)  # its dots would lie on the board
-        stream = active.get_stream(rs.stream.infrared, LEFT).as_video_stream_profile()
-        self._lens = lens_of(stream.get_intrinsics())
+        try:
+            project(rs, active, on=False)  # its dots would lie on the board
+            stream = active.get_stream(rs.stream.infrared, LEFT).as_video_stream_profile()
+            self._lens = lens_of(stream.get_intrinsics())
+        except RuntimeError as error:
+            self.stop()
+            raise UserError(
+                f"the RealSense streams, and does not answer ({error}): plug it in anew."
+            ) from error
 
     def lens(self) -> Lens:
         """The imager's own."""
@@ -71,9 +77,9 @@ class RealSenseImager:
             for _ in range(SKIPPED):
                 self._pipeline.wait_for_frames(_TIMEOUT_MS)
             frame = self._pipeline.wait_for_frames(_TIMEOUT_MS).get_infrared_frame(LEFT)
+            return np.asanyarray(frame.get_data()).copy()  # a set without the frame fails here
         except RuntimeError as error:
             raise CameraError(str(error)) from error
-        return np.asanyarray(frame.get_data()).copy()
 
     def stop(self) -> None:
         """Switch the projector on again and close the stream, if it is open."""

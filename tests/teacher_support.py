@@ -1,0 +1,19 @@
+"""PPO learners without environments, made by hand: quick to have, and enough for what does not act."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.training.acme import running_statistics, specs
+
+from ddgrasp.config import TeacherConfig
+from ppo import learner
+
+
+def learner_without_envs(config: TeacherConfig) -> learner.LearnerState:
+    """A fresh learner of networks, normaliser and optimiser alone; its `env_state` is None."""
+    key, networks = jax.random.key(0), learner.make_networks(config)
+    params: Any = learner.network_params(networks.policy_network.init(key), networks.value_network.init(key))
+    normalizer = running_statistics.init_state(specs.Array((40,), jnp.dtype("float32")))
+    begun, zero = learner.make_optimizer(config).init(params), jnp.zeros((), jnp.int32)
+    return learner.LearnerState(params, normalizer, begun, None, key, zero, zero)  # pyright: ignore

@@ -1,0 +1,62 @@
+"""A student that starts from another one (`student.init_from`)."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from ddgrasp.config import Config, EncoderConfig, HandViewConfig, HeadConfig, StudentConfig
+from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
+from learning.params import save_params
+from ppo.policy import TeacherPolicy
+from student_jax import start
+from student_jax.dagger import Trainer
+from student_jax.depth_source import make_source
+from student_jax.policy import PARAMS_FILE, init_params, param_shapes
+
+STUDENT = StudentConfig(
+    depth_source="ideal",
+    encoder=EncoderConfig(width=8, keypoints=4, stage_blocks=(1, 1), features=16),
+    head=HeadConfig(width=16, blocks=1, state_features=8),
+    hand_view=HandViewConfig(size_px=8, width=8, blocks=1, channels=2, features=8),
+)
+CONFIG = Config("test", student=STUDENT)
+PROFILE = CONFIG.world.profile
+
+
+@pytest.fixture(scope="module")
+def params() -> dict:
+    """Those of the student that others start from: not what seed 0 gives."""
+    return init_params(jax.random.key(1), STUDENT, PROFILE)
+
+
+@pytest.fixture
+def run(params, tmp_path) -> Path:
+    """A run with that student."""
+    (tmp_path / "run" / "student").mkdir(parents=True)
+    save_params(tmp_path / "run" / "student" / PARAMS_FILE, params)
+    return tmp_path / "run"
+
+
+def test_a_start_is_taken_leaf_by_leaf(params, run, tmp_path):
+    config = replace(CONFIG, student=replace(STUDENT, init_from=str(run)))
+    start.check(config)
+    still = TeacherPolicy(np.zeros(40), np.ones(40), [(np.zeros((40, 16)), np.zeros(16))])
+    source = make_source(config, tmp_path)
+    begun = Trainer(config, still, source, tmp_path / "new", Progress(quiet=True))
+    begun._restore()
+    jax.tree.map(np.testing.assert_array_equal, begun.params, params)
+    fresh = Trainer(CONFIG, still, source, tmp_path / "fresh", Progress(quiet=True))
+    fresh._restore()
+    assert np.any(fresh.params["encoder"]["features"]["kernel"] != params["encoder"]["features"]["kernel"])
+
+
+@pytest.mark.parametrize(("changed", "where"), [({"width": 16}, "encoder"), ({"features": 24}, "aux_hidden")])
+def test_a_start_of_another_width_is_refused(changed, where, run):
+    other = replace(STUDENT, init_from=str(run), encoder=replace(STUDENT.encoder, **changed))
+    with pytest.raises(UserError, match=f"does not fit this configuration's network .*{where}") as error:
+        start.load(other, param_shapes(other, PROFILE))
+    assert "\n" not in str(error.value)
