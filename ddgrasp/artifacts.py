@@ -291,7 +291,7 @@ def check_inputs(directory: Path | str, inputs: Mapping[str, str]) -> None:
 def _check_same_inputs(
     directory: Path | str, there: Mapping[str, str], here: Mapping[str, str | None], how: str
 ) -> None:
-    if difference := next(_differences(there, here), None):
+    if difference := next(differences(there, here), None):
         raise UserError(
             f"{directory} was {how} with other inputs: {difference}. Use those, another --out, or delete the "
             "directory."
@@ -305,7 +305,7 @@ def _check_same_config(
     if there == here:
         return
     before, expected = _hash(there), _hash(here)
-    difference = next(_differences(there, here), "a field that no longer exists")
+    difference = next(differences(there, here), "a field that no longer exists")
     raise UserError(
         f"{directory} was {how} with another configuration (hash {before}, "
         f"this run has {expected}): {difference}. "
@@ -370,10 +370,10 @@ def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
+def differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
     """'student.encoder.width is 16 there, 32 here' for every differing leaf."""
     if isinstance(there, Mapping) and isinstance(here, Mapping):
         for key in sorted({*there, *here}):
-            yield from _differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)
+            yield from differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)
     elif there != here:
         yield f"{name} is {there!r} there, {here!r} here"

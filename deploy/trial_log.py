@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ddgrasp import artifacts
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_text
 from deploy.trials import TrialResult
@@ -19,7 +20,8 @@ class TrialLog:
     """
 
     def __init__(self, path: Path, header: dict[str, Any]):
-        """Read what is there. Raises UserError if it belongs to another policy, configuration or rule.
+        """Read what is there. Raises UserError, which says what differs, if it belongs to another policy,
+        configuration or rule.
 
         Args:
             header: what the trials belong to: the policy and the configuration.
@@ -47,9 +49,10 @@ class TrialLog:
     def _read(self) -> dict[tuple[int, bool], TrialResult]:
         header, results = read_log(self._path)
         if results and header != self._header:
+            others = ", ".join(artifacts.differences(header, self._header))
             raise UserError(
-                f"{self._path} was begun with another policy, configuration or rule: delete "
-                f"{self._path.parent} to start them anew, or choose another --out."
+                f"{self._path} was begun otherwise: {others}. Choose another --out, or delete "
+                f"{self._path.parent} and its {len(results)} trials."
             )
         return {result.key: result for result in results}
 

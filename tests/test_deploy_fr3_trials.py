@@ -209,7 +209,7 @@ def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):
     ]
     again = rig_trials.run(config, policy, series, out, 0, Progress(quiet=True))
     assert again == table and (out / rig_trials.TRIALS_FILE).read_text().splitlines() == lines
-    with pytest.raises(UserError, match="begun with another policy, configuration or rule"):
+    with pytest.raises(UserError, match="begun otherwise: .*number is 0 there, 1 here"):
         rig_trials.run(config, policy, replace(series, number=1), out, 0, Progress(quiet=True))
 
 

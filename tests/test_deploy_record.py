@@ -320,6 +320,7 @@ def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
     for written, message in (
         ("{", "not valid JSON"),
         ("{}", "has no 'success'"),
+        ('{"success": true, "steps": 3, "events": []}', "lacks holds, missed_deadlines, fault, latency_ms"),
         (None, "success\" is 'yes'"),
     ):
         text = json.dumps({**values, "success": "yes"}) if written is None else written
@@ -330,3 +331,7 @@ def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
     parse("report", [str(other)]).run()
     said = capsys.readouterr().out
     assert "none was judged" in said and "in 0 steps. Beside them 1 dry run." in said
+    late = {**values, "success": None, "dry_run": True, "missed_deadlines": 3}
+    (other / "report.json").write_text(json.dumps(late))
+    parse("report", [str(other)]).run()
+    assert "<p class=verdict>" in (other / "report.html").read_text(), "no arm was late"

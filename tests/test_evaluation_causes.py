@@ -68,7 +68,7 @@ def test_the_table_is_kept_and_its_trials_are_not_run_again(tmp_path, policy):
     assert causes.run(CONFIG, policy, names, SERIES, out, 0)["rows"] == made["rows"]
     assert (out / "ideal" / rig_trials.TRIALS_FILE).read_bytes() == log
     other = Series("development", ("cube",), 1, number=1, seconds=0.5)
-    with pytest.raises(UserError, match="begun with another policy, configuration or rule"):
+    with pytest.raises(UserError, match="begun otherwise: .*number is 0 there, 1 here"):
         causes.run(CONFIG, policy, names, other, out, 0)
 
 
@@ -94,7 +94,7 @@ def test_logs_of_other_lengths_are_not_paired_and_old_ones_without_go_on(tmp_pat
     assert trials_page.compare([trials("short"), trials("again")])[1][-1][2:] == ("other trials",)
     causes.run(CONFIG, policy, (causes.REFERENCE,), short, tmp_path / "again", 0)
     assert log.read_bytes() == old
-    with pytest.raises(UserError, match="begun with another policy, configuration or rule"):
+    with pytest.raises(UserError, match="begun otherwise: config_hash is "):
         causes.run(CONFIG, policy, (causes.REFERENCE,), long, tmp_path / "again", 0)
 
 

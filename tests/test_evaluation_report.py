@@ -159,9 +159,21 @@ def test_a_machine_too_slow_for_the_real_clock_is_said(tmp_path):
     assert "frame to command not measured" in (tmp_path / "report.html").read_text()
 
 
-def test_an_empty_directory_is_refused(tmp_path):
-    with pytest.raises(UserError, match="holds no finished stage"):
-        build_report(tmp_path)
+def test_what_is_no_run_is_refused_for_what_it_is(run_dir, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").touch()
+    log = tmp_path / "tried" / "ddg" / "trials.jsonl"
+    log.parent.mkdir(parents=True)
+    log.touch()
+    for place, said in (
+        ("empty", "holds no finished stage: nothing to report"),
+        ("file", "is a file: name the folder"),
+        ("absent", "is not there"),
+        ("teacher", f"is one finished stage: name the run that it is of, {run_dir}"),
+        ("tried", "holds trials, of ddg: name one of these folders"),
+    ):
+        with pytest.raises(UserError, match=said):
+            build_report(tmp_path / place)
 
 
 def test_the_page_is_self_contained_and_shows_curves_and_pictures(run_dir):

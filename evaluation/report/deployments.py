@@ -19,6 +19,9 @@ _NOTE = (
     "command sent.</p>"
 )
 
+_FIELDS = ("steps", "holds", "missed_deadlines", "fault", "events", "latency_ms")
+"""Of a report, that the page shows."""
+
 
 @dataclass(frozen=True)
 class Deployment:
@@ -53,6 +56,8 @@ def _report(path: Path) -> Mapping[str, Any]:
         )
     if report["success"] not in (True, False, None):
         raise UserError(f'{path}: "success" is {report["success"]!r}; expected true, false or null.')
+    if absent := [name for name in _FIELDS if name not in report]:
+        raise UserError(f"{path} lacks {', '.join(absent)}: change nothing in it but 'success'.")
     return {"interrupted": False, **report}
 
 

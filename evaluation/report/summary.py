@@ -39,9 +39,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
         if artifacts.is_finished(run_dir / stage.name)
     }
     if not found:
-        raise UserError(
-            f"{run_dir} holds no finished stage: nothing to report. Start one with `ddgrasp run`."
-        )
+        raise UserError(f"{run_dir} {_why_nothing(run_dir)}")
     outdated = _outdated(found)
     finished = {name: artifact.manifest for name, artifact in found.items() if name not in outdated}
     flow = [stage.name for stage in STAGES if stage.name in finished]
@@ -79,6 +77,17 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     report["config"] = latest.config
     report["targets"] = targets(report)
     return report
+
+
+def _why_nothing(run_dir: Path) -> str:
+    """Why there is nothing to report, and what to do."""
+    if not run_dir.is_dir():
+        return "is a file: name the folder it is in." if run_dir.exists() else "is not there: name a run."
+    if artifacts.is_finished(run_dir):
+        return f"is one finished stage: name the run that it is of, {run_dir.resolve().parent}."
+    if inside := sorted(path.parent.name for path in run_dir.glob("*/trials.jsonl")):
+        return f"holds trials, of {', '.join(inside)}: name one of these folders, or several."
+    return "holds no finished stage: nothing to report. Start one with `ddgrasp run`."
 
 
 def _outdated(found: Mapping[str, Artifact]) -> dict[str, str]:
