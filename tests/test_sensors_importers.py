@@ -81,6 +81,29 @@ def test_bad_frames_are_named_and_counted(tmp_path, capsys):
     assert shown.splitlines()[-1] == "1 recordings with 1 frames imported; left out: 5 frames, 0 recordings"
 
 
+@pytest.mark.parametrize(("lost", "consecutive"), [((0, 1), True), ((5,), True), ((2,), False)])
+def test_frames_with_a_gap_between_them_are_not_consecutive(tmp_path, lost, consecutive):
+    root = make_folder(tmp_path / "desk", frames=6)
+    for frame in lost:
+        (root / "rgb" / f"{frame:04d}_rgb.png").unlink()
+    run(root, "--out", tmp_path / "out", "--consecutive")
+    assert Recording.open(tmp_path / "out" / "desk").consecutive == consecutive
+
+
+def test_what_is_passed_over_is_named(tmp_path, capsys, monkeypatch):
+    make_folder(tmp_path / "all" / "desk")
+    (make_folder(tmp_path / "all" / "grey") / "rgb").rename(tmp_path / "elsewhere")
+    run(tmp_path / "all", "--out", tmp_path / "out")
+    shown = capsys.readouterr().out
+    assert f"{tmp_path / 'all' / 'grey'}: depth/ without one of color/" in shown
+    assert "left out: 0 frames, 1 recordings" in shown
+    (tmp_path / "all" / "a.bag").touch()
+    source = importers.folder_source(tmp_path / "all" / "desk", 0.0, {})
+    monkeypatch.setattr("sensors.recordings.realsense.file_source", lambda file: source)
+    _, refused = importers.find_sources(tmp_path / "all", 0.0, {})
+    assert refused == [f"{tmp_path / 'all' / 'desk'}: pictures beside RealSense files: import it by itself."]
+
+
 def test_float_depth_is_metres_unless_its_size_says_otherwise(tmp_path):
     root = make_folder(tmp_path / "desk")
     for i, file in enumerate(sorted((root / "depth").iterdir())):

@@ -29,6 +29,7 @@ from sensors.recordings.recording import (
 from sensors.recordings.sources import RawFrame, Source, in_time
 
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
+_COLOR_NAMES = ", ".join(f"{name}/" for name in COLOR_FOLDERS)
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 REALSENSE_SUFFIXES = (".bag", ".db3")
@@ -61,6 +62,8 @@ class Imported:
 def import_recording(source: Source, path: Path) -> Imported:
     """Writes the usable frames of `source` to a recording at `path`, which appears only when complete.
 
+    Frames left out between others are a gap: the recording's are not called consecutive then.
+
     Raises:
         UserError: `path` exists, no usable frame, or depth whose median cannot be a D4xx's in that unit (of
             the first frames alone, where the unit is certain).
@@ -68,14 +71,16 @@ def import_recording(source: Source, path: Path) -> Imported:
     """
     if path.exists():
         raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
-    skipped, medians_m, size, frames = [], [], None, 0
+    skipped, medians_m, size, frames, gaps, last = [], [], None, 0, False, False
     with RecordingWriter(path, source.meta) as writer:
         for frame in source.frames():
             medians_m += _median_m(frame, source.depth_unit_m)
             depth_mm, reason = _usable(frame, source.depth_unit_m, size)
             if depth_mm is None or frame.rgb is None:
                 skipped.append(f"{frame.name}: {reason}")
+                last = False
                 continue
+            gaps, last = gaps or not (last or not frames), True
             size = depth_mm.shape
             try:
                 writer.add(frame.rgb, depth_mm)
@@ -88,6 +93,8 @@ def import_recording(source: Source, path: Path) -> Imported:
             if frames == UNIT_CHECK_FRAMES:  # not after an hour
                 _check_unit(source, medians_m)
         writer.meta.update(source.closing_meta())
+        if gaps:
+            writer.meta["consecutive_frames"] = False
         if not source.unit_is_certain or frames < UNIT_CHECK_FRAMES:
             _check_unit(source, medians_m)
         if not frames:
@@ -201,10 +208,13 @@ def folder_sources(root: Path, depth_unit_m: float, meta: dict[str, Any]) -> tup
     folders = [root] if _is_pair(root) else sorted(p for p in root.iterdir() if _is_pair(p))
     if not folders:
         raise UserError(
-            f"{root}: no depth/ beside one of {', '.join(f'{n}/' for n in COLOR_FOLDERS)} in it or in its "
-            "folders; put the pictures there, named alike."
+            f"{root}: no depth/ beside one of {_COLOR_NAMES} in it or in its folders; put the pictures "
+            "there, named alike."
         )
-    return _each(folders, lambda folder: folder_source(folder, depth_unit_m, meta))
+    sources, refused = _each(folders, lambda folder: folder_source(folder, depth_unit_m, meta))
+    without = (p for p in sorted(root.iterdir()) if (p / "depth").is_dir() and not _is_pair(p))
+    passed_over = (f"{p}: depth/ without one of {_COLOR_NAMES} beside it." for p in without)
+    return sources, [*refused, *(() if folders == [root] else passed_over)]
 
 
 def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> Source:
@@ -308,7 +318,11 @@ def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple
         source = replace(source, meta={**source.meta, **meta})
         return replace(source, depth_unit_m=depth_unit_m, unit_is_certain=False) if depth_unit_m else source
 
-    return _each(files, given)
+    sources, refused = _each(files, given)
+    passed_over = (
+        f"{p}: pictures beside RealSense files: import it by itself." for p in inside if _is_pair(p)
+    )
+    return sources, [*refused, *passed_over]
 
 
 def _each(paths: Iterable[Path], source_of: Callable[[Path], Source]) -> tuple[list[Source], list[str]]:
