@@ -22,7 +22,7 @@ DARK_RGBA = "0.2 0.15 0.1 1"
 
 
 _CLUTTER = 1
-"""Of a trial's seed, the stream that clutter is drawn from."""
+"""Stream of a trial's seed that clutter is drawn from."""
 
 
 class FurnishedWorld(RigWorld):

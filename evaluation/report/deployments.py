@@ -20,7 +20,7 @@ _NOTE = (
 )
 
 _FIELDS = ("steps", "holds", "missed_deadlines", "fault", "events", "latency_ms")
-"""Of a report, that the page shows."""
+"""What the page shows of a report."""
 
 
 @dataclass(frozen=True)
