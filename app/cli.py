@@ -3,7 +3,9 @@
 Imports nothing heavy: `--help` and typing errors answer at once, and Ctrl-C is handled from the first moment.
 """
 
+import contextlib
 import errno
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -13,6 +15,7 @@ _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit status: 0 fine, 1 trouble, 2 wrong input, 130 interrupted."""
+    _mend_streams()
     # JAX's GPU build takes most of the device's memory at its start unless told otherwise.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     # Compiled programs are kept: the second run of a stage starts in seconds.
@@ -33,9 +36,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(message, 2 if type(error).__name__ == "UserError" else 1)
 
 
+def _mend_streams() -> None:
+    """Streams that were closed (`>&-`) lead nowhere; what a terminal cannot show is escaped."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def _dispatch(argv: list[str]) -> int:
     from app import extras
     from app.commands import COMMANDS, describe_commands, parse
+    from app.commands.parsing import HELP_ALL
     from ddgrasp.errors import UserError, unknown_name
 
     if argv and argv[0] == "help":
@@ -63,10 +77,21 @@ def _dispatch(argv: list[str]) -> int:
         raise unknown_name("command", group, {name.split()[0] for name in COMMANDS})
     if len(words) > 1:
         raise unknown_name("command", " ".join(words[:2]), [n for n in COMMANDS if n.startswith(f"{group} ")])
-    if not words and argv and argv[0] not in ("--help", "-h", "--help-all"):
+    helped = not argv or not {"--help", "-h", HELP_ALL}.isdisjoint(argv)
+    if not words and not helped:
         raise UserError(f"{argv[0]} is no option of ddgrasp by itself: give a command, see ddgrasp --help.")
+    if len(argv) > 1 and not helped:
+        raise UserError(f"`ddgrasp {group}` is half a command: put {_seconds(group)} before {argv[1]}.")
     print(describe_commands(group))
-    return 0 if "--help" in argv or "-h" in argv or not argv else 2
+    return 0 if helped else 2
+
+
+def _seconds(group: str) -> str:
+    """The words that make a command with `group`."""
+    from app.commands import COMMANDS
+
+    *most, last = (name.split()[1] for name in COMMANDS if name.startswith(f"{group} "))
+    return f"{', '.join(most)} or {last}" if most else last
 
 
 def _one_line(error: BaseException) -> str | None:
@@ -90,13 +115,31 @@ def _one_line(error: BaseException) -> str | None:
             )
         cause = cause.__cause__ or cause.__context__
     if not isinstance(error, OSError):
-        return None
+        return _platforms(error)
     place = error.filename2 or error.filename  # of a renaming the second is what was asked for
+    if place is None:
+        return None
     if isinstance(error, PermissionError):
         return f"No permission for {place}: choose another --out, or change its owner."
     if isinstance(error, (FileExistsError, NotADirectoryError, IsADirectoryError)):
         return f"{place} cannot be written ({error.strerror}): choose another --out."
-    return None
+    return f"{place} cannot be read or written ({error.strerror}): mend that, or give another path."
+
+
+def _platforms(error: BaseException) -> str | None:
+    """One line if JAX has no such devices here as the environment asks for; it fails by an assertion, too."""
+    asked = os.environ.get("JAX_PLATFORMS")
+    if not asked or "jax" not in sys.modules:
+        return None
+    if "Unable to initialize backend" not in str(error):
+        if not isinstance(error, AssertionError):
+            return None
+        import jax
+
+        with contextlib.suppress(AssertionError, RuntimeError):
+            jax.devices()
+            return None
+    return f"JAX_PLATFORMS is {asked!r}, which JAX has no device for here: unset it, or set it to cpu."
 
 
 def _fail(message: str, status: int) -> int:

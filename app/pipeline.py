@@ -53,8 +53,6 @@ def run(
 def check_place(config: Config, run_dir: Path, *, resume: bool, stages: Sequence[Stage] = STAGES) -> None:
     """UserError if `run_dir` is or lies below a file, holds a run and `resume` is off, or stages that are
     finished or begun with another configuration. Writes nothing."""
-    if not resume:
-        _refuse_occupied(run_dir, [stage.name for stage in stages])
     place, first = run_dir.absolute(), run_dir / stages[0].name
     try:
         there = next(path for path in (place, *place.parents) if path.exists())
@@ -62,6 +60,8 @@ def check_place(config: Config, run_dir: Path, *, resume: bool, stages: Sequence
         raise _no_place(first, error.errno) from None
     if not there.is_dir():
         raise _no_place(first, errno.ENOTDIR)
+    if not resume:
+        _refuse_occupied(run_dir, [stage.name for stage in stages])
     for stage in stages:
         artifacts.check_place(run_dir / stage.name, stage.name, config)
 

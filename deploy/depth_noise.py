@@ -7,6 +7,7 @@ Imports NumPy and onnxruntime; PyTorch only where tensors come in, JAX never.
 """
 
 import importlib
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,7 +61,7 @@ class DepthGenerator:
         self._kind, self._device_number = _device(device)
         self._session = _open(self.path, self._kind, self._device_number, threads)
         self.info = names.read(self._session.get_modelmeta().custom_metadata_map, str(self.path))
-        self._seed, self._normals = seed, {}
+        self._seed, self._normals, self._looked = seed, {}, False
 
     def __call__(self, depth_m: Array, noise: Array | None = None, *, steps: int | None = None) -> Array:
         """`generate`, the grafted depth alone."""
@@ -79,6 +80,8 @@ class DepthGenerator:
         Raises:
           UserError: depth of another type, rank, shape or unit, noise that does not fit, or steps that the
             file does not have.
+
+        Warns in the first call if most of the scene is nearer or farther than what it was fitted on.
         """
         steps = self._checked_steps(steps)
         frames = _frames(depth_m)
@@ -133,6 +136,22 @@ class DepthGenerator:
             raise UserError(
                 f"Depth reaches from {low:g} to {high:g}; expected finite metres, 0 where nothing is in "
                 "range (put 0 for infinity and NaN; divide millimetres by 1000)."
+            )
+        self._warn_once(frames)
+
+    def _warn_once(self, frames: Array) -> None:
+        """Says so in the first call if most of the scene is where the camera had no readings."""
+        near_m, far_m = (self.info.camera.get(name) for name in ("near_m", "far_m"))
+        if self._looked or near_m is None or far_m is None:
+            return
+        self._looked = True
+        seen = int((frames > 0).sum())
+        outside = seen - int(((frames >= near_m) & (frames <= far_m)).sum())
+        if 2 * outside > seen:
+            warnings.warn(
+                f"{outside / seen:.0%} of the depth lies outside of the {near_m:g} to {far_m:g} m of "
+                f"readings that {self.path} was fitted on: what it draws there, it has not seen.",
+                stacklevel=4,
             )
 
     # --- running -----------------------------------------------------------------------------------

@@ -21,4 +21,4 @@ def evaluate_backends(
     """
     environments = {name: GraspEnv(replace(world, backend=name)) for name in backends}
     for name, env in environments.items():
-        yield name, evaluate(env, policy, trials or DEFAULT_TRIALS[name], seed)
+        yield name, evaluate(env, policy, DEFAULT_TRIALS[name] if trials is None else trials, seed)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -144,6 +145,18 @@ def test_wrong_depth_is_one_line(generator, depth, said):
     with pytest.raises(UserError, match=said) as refused:
         generator(depth)
     assert "\n" not in str(refused.value)
+
+
+def test_a_scene_beyond_what_it_was_fitted_on_is_told_once():
+    far = DepthGenerator(FILE)
+    depth = np.full((1, 180, 320), 3.0, np.float32)
+    with pytest.warns(UserWarning, match="100% of the depth lies outside of the 0.361 to 1.786 m") as told:
+        far(depth, steps=1)
+        far(depth, steps=1)
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        DepthGenerator(FILE)(depth / 3, steps=1)
 
 
 def test_wrong_noise_and_steps_are_refused(generator, scene):

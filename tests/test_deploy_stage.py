@@ -128,7 +128,8 @@ def test_trials_of_another_policy_are_refused_and_kept(tmp_path):
     path = tmp_path / "trials.jsonl"
     TrialLog(path, {"policy_sha256": "a"}).append(result(0))
     before = path.read_bytes()
-    with pytest.raises(UserError, match="begun otherwise: policy_sha256 is 'a' there, 'b' here. Choose another --out, or .* and its 1 tr"):
+    said = "begun otherwise: policy_sha256 is 'a' there, 'b' here. Choose another --out, or .* and its 1 tr"
+    with pytest.raises(UserError, match=said):
         TrialLog(path, {"policy_sha256": "b"})
     assert path.read_bytes() == before
 

@@ -1,34 +1,55 @@
-"""The command line as a person meets it: in a process of its own."""
+"""The command line as a person meets it, in a process of its own where that matters."""
 
+import contextlib
 import dataclasses
+import io
 import json
-import os
 import subprocess
 import sys
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import pytest
 
+from app import commands
+from app.cli import main
 from app.commands import COMMANDS, parse
 from app.commands.checks import CHECKPOINTS, check_config_values, check_networks, stage_folder
 from app.commands.parsing import HELP_ALL
 from ddgrasp import artifacts
 from ddgrasp.config import CAMERAS
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_bytes
 from ddgrasp.install import pip_install
 from ddgrasp.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
 
 
-def ddgrasp(*args: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-m", "app.cli", *args], cwd=ROOT, capture_output=True, text=True, timeout=60
-    )
+class Ended(NamedTuple):
+    """What a command left."""
+
+    returncode: object
+    stdout: str
+    stderr: str
 
 
-def _one_error_line(result: subprocess.CompletedProcess) -> str:
+def ddgrasp(*args: str, encoding: str = "utf-8") -> Ended:
+    """The command in the repository, in this process, before a terminal of that encoding."""
+    said, printed = io.StringIO(), io.TextIOWrapper(io.BytesIO(), encoding, newline="")
+    with contextlib.chdir(ROOT), contextlib.redirect_stderr(said), contextlib.redirect_stdout(printed):
+        try:
+            status = main(args)
+        except SystemExit as stop:
+            status = stop.code
+    printed.seek(0)
+    return Ended(status, printed.read(), said.getvalue())
+
+
+def _one_error_line(result: Ended | subprocess.CompletedProcess) -> str:
     assert result.stderr.count("\n") == 1, result.stderr
     assert result.stdout == ""
     return result.stderr
@@ -66,12 +87,8 @@ def test_help_lists_every_command():
 
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 def test_help_shows_a_command_s_own_options_and_help_all_every_value(encoding):
-    texts = {}
-    for option in ("--help", HELP_ALL):
-        command = [sys.executable, "-m", "app.cli", "teacher", "train", option]
-        env = {**os.environ, "PYTHONIOENCODING": encoding}
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, encoding=encoding, env=env, timeout=60)
-        texts[option] = done.stdout
+    options = ("--help", HELP_ALL)
+    texts = {option: ddgrasp("teacher", "train", option, encoding=encoding).stdout for option in options}
     assert ("╭" in texts["--help"]) == (encoding == "utf-8")
     assert "--resume" in texts["--help"] and "--teacher." not in texts["--help"]
     assert texts["--help"].endswith("score, hosts): ddgrasp teacher train --help-all\n")
@@ -98,16 +115,16 @@ WRONG = [
     (("tacher", "train"), "Unknown command 'tacher'. Did you mean 'teacher'?"),
     (("teacher", "trian"), "Unknown command 'teacher trian'. Did you mean 'teacher train'?"),
     (("run", "--world.objects", "cube", "aple"), "Unknown object 'aple'. Did you mean 'apple'?"),
-    (("report", "nowhere"), "nowhere holds no finished stage"),
+    (("report", "nowhere"), "nowhere is not there: name a run"),
     (
         ("run", "--out", "README.md"),
         "README.md/teacher cannot be created (Not a directory): choose another",
     ),
     (("teacher", "train", "--out", "README.md/a"), "README.md/a/teacher cannot be created (Not a"),
     (("teacher", "train", "--out", "/proc/a"), "/proc/a/teacher cannot be created (No such file or"),
-    (
-        ("run", "--out", "a" * 300, "--resume"),
-        "cannot be created (File name too long): choose another --out.",
+    *(
+        (("run", "--out", "a" * 300, *resume), "cannot be created (File name too long): choose another --out")
+        for resume in ((), ("--resume",))
     ),
     (("run", "--demos.episodes", "0"), "demos.episodes is 0; expected at least 1."),
     (("teacher", "eval", "nowhere", "--trials", "0"), "--trials is 0; expected at least 1."),
@@ -187,18 +204,20 @@ def test_a_later_stage_of_another_configuration_is_told_before_jax_is_imported(t
     assert [path.name for path in tmp_path.iterdir()] == ["deploy"]
 
 
-def test_an_out_that_is_a_file_gets_one_line_from_other_commands(tmp_path):
+def test_a_file_that_cannot_be_written_is_named_in_one_line_and_no_temporary_one(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    result = ddgrasp("calibrate", "board", "--out", str(tmp_path / "file" / "a.png"))
-    assert result.returncode == 1
-    assert "file cannot be written (File exists): choose another --out." in _one_error_line(result)
-
-
-def test_an_out_that_is_a_folder_is_named_and_no_temporary_file(tmp_path):
-    (out := tmp_path / "a.png").mkdir()
-    result = ddgrasp("calibrate", "board", "--out", str(out))
-    assert result.returncode == 1
-    assert f"ddgrasp: {out} cannot be written (Is a directory): choose another" in _one_error_line(result)
+    (tmp_path / "a.png").mkdir()
+    for out, trouble in (
+        ("file/a.png", "file cannot be written (File exists): choose another --out."),
+        ("a.png", "a.png cannot be written (Is a directory): choose another --out."),
+        ("a" * 250, "cannot be read or written (File name too long): mend that, or give another path."),
+    ):
+        writes = SimpleNamespace(run=partial(atomic_write_bytes, tmp_path / out, b""))
+        monkeypatch.setattr(commands, "parse", lambda name, args, writes=writes: writes)
+        result = ddgrasp("objects", "list")
+        assert result.returncode == 1
+        told = _one_error_line(result)
+        assert told.startswith(f"ddgrasp: {tmp_path}") and trouble in told and ".tmp-" not in told
 
 
 def test_an_export_looks_at_out_before_it_works(tmp_path):

@@ -1,5 +1,6 @@
 """`ddgrasp completion`: what bash offers after a few words."""
 
+import re
 import shutil
 import subprocess
 
@@ -28,6 +29,21 @@ def text() -> str:
         (("record", "im"), ["import"]),
         (("record", "--resu"), ["--resume"]),
         (("deploy", "trials", "--ri"), ["--rig"]),
+        (("deploy", "--ro"), ["--robot"]),
+        (("deploy", "tri"), ["trials"]),
+        (("play", "--obj"), ["--object", "--objects"]),
+        (("record", "import", "--no-"), ["--no-consecutive", "--no-aligned"]),
+        (("run", "--student.picture.no-f"), ["--student.picture.no-fill-holes"]),
+        (("run", "--preset", "ppo"), ["ppo", "ppo_paper"]),
+        (("run", "--seed", "3", "--preset", "de"), ["debug", "demo"]),
+        (("play", "--viewer", ""), ["auto", "film", "mujoco", "rerun", "web"]),
+        (("deploy", "--camera", "rig"), ["rig", "rig-ideal"]),
+        (("deploy", "trials", "--camera", ""), ["stereo", "coarse", "ideal"]),
+        (("teacher", "compare", "x", "--backends", "c"), ["cpu"]),
+        (("play", "--out", ""), []),
+        (("run", "--config", ""), []),
+        (("run", "--student.init-from", "--"), []),
+        (("run", "--resume", "--out"), ["--out"]),
         (("no", "--x"), []),
     ],
 )
@@ -42,6 +58,13 @@ def test_every_command_has_its_options(text):
     for name in COMMANDS:
         line = next(line for line in text.splitlines() if line.strip().startswith((f'"{name}")', f"{name})")))
         assert "--help" in line and "--help-all" in line, name
+
+
+def test_only_options_that_there_are_are_offered_whatever_the_terminal_s_width(text, monkeypatch):
+    options = set(re.findall(r"--[\w.-]+", text))
+    assert [option for option in options if not option[-1].isalnum()] == [] and len(options) > 200
+    monkeypatch.setenv("COLUMNS", "300")
+    assert script("bash") == text
 
 
 def test_another_shell_is_named(capsys, text):

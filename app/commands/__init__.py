@@ -23,10 +23,19 @@ from app.commands.parsing import HELP_ALL, parsed
 from app.commands.play import Play
 from app.commands.rig import RigFr3, RigPictures
 from app.commands.score import DDGCurve, DDGFeatures, DDGSamplers, DDGScore, Scoring
-from app.commands.student import Deploy, Export, StudentEval, StudentPerception, StudentTrain, config_of
+from app.commands.student import (
+    DEFAULT_POLICY,
+    Deploy,
+    Export,
+    StudentEval,
+    StudentPerception,
+    StudentTrain,
+    config_of,
+)
 from app.commands.study import StudyCauses, StudyTable2
 from app.commands.teacher import TeacherCompare, TeacherEval, TeacherTrain, with_world_of
 from app.commands.trials import DeployTrials
+from app.commands.words import check_words
 from ddgrasp import artifacts, config_file
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
@@ -52,6 +61,7 @@ class Run(FromPreset):
         print_summary(report)
 
 
+_SCALE = "--scale"
 COMMANDS: dict[str, type] = {
     "play": Play,
     "run": Run,
@@ -99,6 +109,10 @@ def parse(name: str, args: Sequence[str]) -> Command:
     """The command `name` with its options; --help and --help-all print and raise SystemExit(0), options
     that are wrong raise UserError."""
     cls = COMMANDS[name]
+    check_words(cls, args)
+    unused = _SCALE if cls in (Deploy, Calibrate) else ""
+    if unused and _option(args, unused) is not None:
+        raise UserError(f"{unused} makes nothing smaller that `ddgrasp {name}` does: leave it out.")
     options: dict[str, Any] = {}
     if issubclass(cls, FromPreset):
         base = _base(args, cls.default_preset())
@@ -108,7 +122,7 @@ def parse(name: str, args: Sequence[str]) -> Command:
         default = cls(preset.score, preset.preset, Path("runs") / preset.preset)
         options["default"] = replace(default, ddg=preset.ddg) if isinstance(default, DDGScore) else default
     elif cls is Deploy:
-        policy = shipped(_option(args, "--policy") or f"runs/{DEFAULT_PRESET}/export/policy.onnx")
+        policy = shipped(_option(args, "--policy") or DEFAULT_POLICY)
         options["default"] = Deploy(config=config_of(policy, _option(args, "--preset")), policy=policy)
     elif cls is Calibrate:
         options["default"] = Calibrate(get_preset(_option(args, "--preset") or DEFAULT_PRESET))
@@ -117,7 +131,7 @@ def parse(name: str, args: Sequence[str]) -> Command:
     program, whole = f"ddgrasp {name}", HELP_ALL in args
     given = ["--help" if arg == HELP_ALL else arg for arg in args]
     read = partial(tyro.cli, cls, prog=program, args=given, **options)
-    command = _found(parsed(read, program, whole))
+    command = _found(parsed(read, program, whole, unused))
     check_options(command)
     return command
 
@@ -136,10 +150,10 @@ def _teacher_s_run(args: Sequence[str]) -> Path | None:
 
 def _base(args: Sequence[str], default_preset: str) -> Config:
     """What single values are given besides: the file of --config, or a preset at --scale."""
-    file, preset, scale = (_option(args, name) for name in ("--config", "--preset", "--scale"))
+    file, preset, scale = (_option(args, name) for name in ("--config", "--preset", _SCALE))
     if file is None:
         return _scaled(get_preset(preset or default_preset), scale)
-    for name, value in (("--preset", preset), ("--scale", scale)):
+    for name, value in (("--preset", preset), (_SCALE, scale)):
         if value is not None:
             raise UserError(f"--config {file} and {name} {value} both say where to begin: give one.")
     return config_file.read(Path(file))

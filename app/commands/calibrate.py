@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from app.commands.checks import check_file
 from ddgrasp.config import Config
 from ddgrasp.config.checks import Range
 from ddgrasp.errors import UserError
@@ -67,6 +68,8 @@ class Calibrate:
 
     def run(self) -> None:
         """Drives the poses, prints the errors, writes the calibration."""
+        if self.out is not None:
+            check_file("--out", self.out)
         from deploy.calibration.session import CalibrationOptions, run
 
         run(self.config, CalibrationOptions(
@@ -91,6 +94,7 @@ class CalibrateBoard:
         kind = self.out.suffix.lower()
         if kind not in (".pdf", ".png"):
             raise UserError(f"--out is {self.out}; expected a name that ends with .pdf or .png.")
+        check_file("--out", self.out)
         board = self.board.made()
         atomic_write_bytes(self.out, printable(board, "pdf" if kind == ".pdf" else "png"))
         print(f"{self.out}: {board.describe()}")

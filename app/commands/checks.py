@@ -4,19 +4,24 @@ What a value of the configuration may be, the configuration itself knows (ddgras
 files, devices or packages above it.
 """
 
+import contextlib
+import os
 import sys
-import types
 import typing
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ddgrasp import artifacts
 from ddgrasp.config import PROGRESSIVE, Config, ScoreConfig, WorldConfig
-from ddgrasp.config.checks import Range, check_value, kinds
+from ddgrasp.config.checks import Range, check_value, kinds, stated
 from ddgrasp.errors import UserError
+from ddgrasp.files import TEMPORARY
 from ddgrasp.learnable import check_learnable
 from ddgrasp.shipped import PRETRAINED, holding, shipped
+
+if TYPE_CHECKING:
+    from evaluation.rig_trials import Series
 
 CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
 """File that a folder a stage starts from must hold, itself or in a folder named after the stage. Named here
@@ -27,10 +32,8 @@ def check_options(command: Any) -> None:
     """UserError for a command's own option beyond the bounds or choices that its type states."""
     for field, kind in kinds(type(command)).items():
         value, option = getattr(command, field), f"--{field.replace('_', '-')}"
-        if typing.get_origin(kind) is types.UnionType:
-            kind = typing.get_args(kind)[0]
-        if value is not None and _is_stated(kind):
-            check_value(option, value, kind)
+        if value is not None and _is_stated(stated(kind)):
+            check_value(option, value, stated(kind))
 
 
 def _is_stated(kind: Any) -> bool:
@@ -70,12 +73,53 @@ def check_objects(world: WorldConfig) -> None:
         get_object(name)
 
 
+def check_tried(series: "Series") -> None:
+    """UserError for a plain shape among the objects of `series`: students train on them, no rig has one."""
+    from mjx_envs.objects import SHAPES
+
+    if shapes := [name for name in series.objects if name in SHAPES.keys() - series.known()]:
+        raise UserError(
+            f"object {shapes[0]!r} is a plain shape, for training only (--world.objects): choose one of "
+            f"{', '.join(series.known())}."
+        )
+
+
 def check_file(option: str, path: Path) -> None:
-    """UserError if `path` cannot become a file: it is a folder, or lies below a file."""
-    if path.is_dir():
+    """UserError if `path` cannot become a file: it is a folder, or nothing can be written there."""
+    if os.path.isdir(path):
         raise UserError(f"{option} is {path}, a folder: name a file, in it or elsewhere.")
-    if not (there := next(place for place in path.absolute().parents if place.exists())).is_dir():
-        raise UserError(f"{option} is {path}, and {there} is no folder: name a file elsewhere.")
+    _try_writing(option, path, path.absolute().parent, "a file")
+
+
+def check_folder(option: str, path: Path) -> None:
+    """UserError if no files can be written into the folder `path`, which need not be there yet."""
+    _try_writing(option, path, path.absolute(), "a folder")
+
+
+def _try_writing(option: str, path: Path, folder: Path, kind: str) -> None:
+    """Makes what is missing of `folder` and a file in it, as `atomic_path` would, and takes them away."""
+    missing: list[Path] = []
+    try:
+        missing += (place for place in (folder, *folder.parents) if not place.exists())
+        there = next(place for place in (folder, *folder.parents) if place not in missing)
+        if not there.is_dir():
+            raise UserError(f"{option} is {path}, and {there} is no folder: name {kind} elsewhere.")
+        folder.mkdir(parents=True, exist_ok=True)
+        (tried := folder / f"{TEMPORARY}{os.getpid()}-{path.name}").touch()
+        tried.unlink()
+    except OSError as error:
+        raise UserError(
+            f"{option} is {path}, where nothing can be written ({error.strerror}): name {kind} elsewhere."
+        ) from None
+    finally:
+        for place in missing:
+            with contextlib.suppress(OSError):
+                place.rmdir()
+
+
+def is_shipped(directory: Path) -> bool:
+    """Whether `directory` is, or lies in, what comes with the project: it is not written over."""
+    return directory.resolve().is_relative_to(PRETRAINED.resolve())
 
 
 def check_score(score: ScoreConfig) -> None:

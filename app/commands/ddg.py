@@ -5,7 +5,14 @@ from pathlib import Path
 
 from app import pipeline
 from app.commands.base import OneStage
-from app.commands.checks import check_config_values, check_data, check_file, recordings_in, stage_folder
+from app.commands.checks import (
+    check_config_values,
+    check_data,
+    check_file,
+    check_folder,
+    recordings_in,
+    stage_folder,
+)
 from ddgrasp import artifacts
 from ddgrasp.config.checks import Count, Seed, Steps, Text
 from ddgrasp.config.ddg import HALVED_SPACINGS, PROGRESSIVE, Sampler
@@ -51,6 +58,7 @@ class DDGSample:
         from ddg_jax.stage import sample_folder
         from ddgrasp.progress import Progress
 
+        check_folder("--out", self.out)
         check_data("--data", self.data)
         model, progress = _fitted(self.model), Progress(name="ddg sample")
         print(sample_folder(model, self.data, self.out, seed=self.seed, progress=progress, count=self.count))
@@ -155,6 +163,7 @@ class DDGThresholds:
         from ddg_jax import thresholds
         from ddgrasp.progress import Progress
 
+        check_folder("--out", self.out)
         check_data("--data", self.data)
         model, progress = _fitted(self.model), Progress(name="thresholds")
         rows = thresholds.analyse(model, self.data, self.out, progress, count=self.count, seed=self.seed)

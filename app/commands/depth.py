@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from app.commands.base import DEFAULT_PRESET, OneStage
+from app.commands.checks import check_folder
 from ddgrasp import contract
 from ddgrasp.config import CameraScale, RecordConfig, StereoConfig
 from ddgrasp.config.checks import Count, Range, Seed, Share
@@ -53,6 +54,7 @@ class RecordImport:
 
     def run(self) -> None:
         """Imports every source that can be used and says what was left out."""
+        check_folder("--out", self.out)
         from sensors.recordings import importers
 
         known = {"sensor": self.sensor, "fx_px": self.fx_px, "baseline_m": self.baseline_m}
@@ -91,6 +93,7 @@ class RecordRealsense:
         from ddgrasp.progress import Progress
         from sensors.recordings import realsense_live as live
 
+        check_folder("--out", self.out)
         frames = live.frame_count(self.frames, self.seconds, self.hz)
         options = live.LiveOptions(frames, self.hz, self.width, self.height, self.serial)
         path = live.new_path(self.out, self.name)
@@ -125,6 +128,7 @@ class RecordFr3:
         from deploy import fr3_record
         from rig import seeds
 
+        check_folder("--out", self.out)
         config = get_preset(self.preset)
         given = {"trajectories": self.trajectories, "frames": self.frames}
         changed = {name: value for name, value in given.items() if value is not None}
@@ -155,6 +159,7 @@ class SensorsCompare:
 
     def run(self) -> None:
         """Prints both cameras' figures side by side and writes sensors.json and sensors.png."""
+        check_folder("--out", self.out)
         from ddgrasp.progress import Progress
         from evaluation import camera_comparison as compare
 

@@ -1,5 +1,6 @@
 """ddgrasp weights, objects, report."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from app.commands.checks import check_file
+from app.commands.checks import check_file, check_folder, is_shipped
 from ddgrasp import contract
 from ddgrasp.config.checks import Range
 from ddgrasp.errors import UserError
@@ -30,6 +31,7 @@ class WeightsConvert:
 
     def run(self) -> None:
         """Converts one file and prints what it is."""
+        check_folder("--out", self.out)
         from foundation import store
 
         directory = store.convert_file(self.file, self.out, self.max_depth_m)
@@ -84,11 +86,19 @@ class Report:
             print(f"{deployments.write(self.out, found)}\n\n{deployments.verdict(found)}")
             return
         from evaluation.report.stage import write_report
-        from evaluation.report.summary import print_summary
+        from evaluation.report.summary import build_report, print_summary
 
-        report = write_report(self.out)
-        print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
+        if is_shipped(self.out):
+            report = build_report(self.out)
+            print(_NO_PAGE.format(self.out))
+        else:
+            report = write_report(self.out)
+            print(f"{self.out / 'report.json'}\n{self.out / 'report.html'}\n")
         print_summary(report)
+
+
+_NO_PAGE = "{} comes with the project: nothing is written there; copy it to have pages.\n"
+"""For runs; trials that come with the project may have pages: git ignores them."""
 
 
 def _compare(runs: Sequence[Path]) -> None:
@@ -100,11 +110,12 @@ def _compare(runs: Sequence[Path]) -> None:
         _compare_trials(runs, [trials for trials in tried if trials is not None])
         return
     reports = [build_report(run) for run in runs]
-    print(f"{comparison.write(runs, reports)}\n")
+    written = _NO_PAGE.format(runs[0]) if is_shipped(runs[0]) else f"{comparison.write(runs, reports)}\n"
+    print(written)
     for title, rows in zip(
         ("configured otherwise", "measured"), comparison.differences(reports), strict=True
     ):
-        _print_table((title, *(str(run) for run in runs)), rows)
+        _print_table((title, *told_apart(runs)), rows)
 
 
 def _compare_trials(runs: Sequence[Path], tried: Sequence["Trials"]) -> None:
@@ -114,14 +125,32 @@ def _compare_trials(runs: Sequence[Path], tried: Sequence["Trials"]) -> None:
         others = [str(run) for run in runs if trials_page.find(run) is None]
         raise UserError(f"{', '.join(others)}: no finished trials to set beside {tried[0].folder}.")
     print(f"{trials_page.write_comparison(tried)}\n")
-    _print_table(*trials_page.compare(tried))
+    _, rows = trials_page.compare(tried)
+    _print_table(("", *told_apart(runs)), rows)
+
+
+def told_apart(folders: Sequence[Path]) -> list[str]:
+    """What of each folder's path the others do not share, for the heading of a narrow column."""
+    parts = [folder.parts for folder in folders]
+    spare = max(0, min(map(len, parts)) - 1)  # a part is left of each
+    before = _shared(parts, spare)
+    behind = _shared([path[::-1] for path in parts], spare - before)
+    return [str(Path(*path[before : len(path) - behind])) for path in parts]
+
+
+def _shared(paths: Sequence[tuple[str, ...]], most: int) -> int:
+    """How many parts all paths begin with, at most so many."""
+    alike = (len(set(column)) == 1 for column in zip(*paths, strict=False))
+    return min(most, len(list(itertools.takewhile(bool, alike))))
 
 
 def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    shown = Table(*header, box=None)
+    shown = Table(box=None)
+    for title in header:
+        shown.add_column(title, overflow="fold")
     for row in rows:
         shown.add_row(*row)
     Console().print(shown)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.presets import PRESETS
 
 T = TypeVar("T")
 
@@ -25,22 +26,24 @@ _NUMBER = re.compile(
 )
 
 
-def parsed(parse: Callable[[], T], command: str, whole: bool) -> T:
+def parsed(parse: Callable[[], T], command: str, whole: bool, unused: str = "") -> T:
     """What `parse`, a call of tyro, returns; UserError in one line for options that it refuses.
 
     Help is printed, without the sections of the run's configuration unless the `whole` is asked for, and ends
-    with SystemExit(0).
+    with SystemExit(0). It does not show the option `unused`.
     """
     told = io.StringIO()
-    helped = io.TextIOWrapper(io.BytesIO(), encoding=sys.stdout.encoding, newline="")
+    helped = io.TextIOWrapper(io.BytesIO(), sys.stdout.encoding, "backslashreplace", newline="")
     try:
         with contextlib.redirect_stderr(told), contextlib.redirect_stdout(helped):
             return parse()
     except SystemExit as stop:
         if stop.code != 2:
             helped.seek(0)
-            text = helped.read()
-            sys.stdout.write(text if whole else shortened(text, command))
+            text = _without(unused, helped.read()) if unused else helped.read()
+            sys.stdout.write(
+                "\n".join([text.rstrip("\n"), *_presets(text), ""]) if whole else shortened(text, command)
+            )
             sys.stderr.write(told.getvalue())
             raise
     raise refused(told.getvalue(), command)
@@ -56,7 +59,17 @@ def shortened(text: str, command: str) -> str:
         if not hiding:
             kept.append(line.rstrip())
     more = [f"Every value of the run ({', '.join(hidden)}): {command} {HELP_ALL}"] if hidden else []
-    return "\n".join([*kept, *more]) + "\n"
+    return "\n".join([*kept, *_presets(text), *more]) + "\n"
+
+
+def _presets(text: str) -> list[str]:
+    """The line that names the presets, for help `text` of a command that takes one."""
+    return [f"Presets: {', '.join(PRESETS)} (ddgrasp --help says more)"] if " --preset " in text else []
+
+
+def _without(option: str, text: str) -> str:
+    """Help `text` without the lines of `option`."""
+    return re.sub(rf"^[│ ] {option} .*\n(?:[│ ] {{3,}}.*\n)*", "", text, flags=re.MULTILINE)
 
 
 def refused(box: str, command: str) -> UserError:
@@ -73,7 +86,10 @@ def refused(box: str, command: str) -> UserError:
         return UserError(f"{number['option']} is {number['value']}; expected {kind}.")
     nearest = [re.search(r"--[^\s,]+", block) for block in more if block.startswith("Perhaps you meant")]
     hint = f" Did you mean {nearest[0].group()}?" if nearest and nearest[0] else ""
-    return UserError(f"{trouble.rstrip('.')}.{hint} Options: {command} --help.")
+    of_section = re.search(r"--[\w-]+\.\w", f"{trouble}{hint}")
+    return UserError(
+        f"{trouble.rstrip('.')}.{hint} Options: {command} {HELP_ALL if of_section else '--help'}."
+    )
 
 
 def _blocks(box: str) -> list[str]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 import tyro
 
 from app import extras
-from app.commands.checks import stage_folder
+from app.commands.checks import check_file, check_tried, stage_folder
 from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
@@ -82,9 +82,12 @@ class Play:
         if self.rig == "fr3":
             extras.check_fr3("--rig fr3")
         series = Series(self.rig, self.objects, self.trials, number=self.number, seconds=self.seconds)
+        check_tried(series)
         trials = series.plan()
         controls = Controls(_objects_by_rig(series), self.rig, self.noise)
         noise = _ChosenNoise(controls, generator)
+        if not self._live:
+            check_file("--out", self._film)
         viewer = self._viewer(noise)
         rigs = _Rigs(series, self.policy or _pretrained(), noise)
         try:

@@ -9,7 +9,7 @@ import tyro
 
 from app import pipeline
 from app.commands.base import load_config
-from app.commands.checks import check_config_values, check_score, recordings_in
+from app.commands.checks import check_config_values, check_folder, check_score, recordings_in
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig, DepthFeatureConfig, ScoreConfig
 from ddgrasp.config.checks import Count, Seed
@@ -123,6 +123,7 @@ class DDGFeatures:
 
     def run(self) -> None:
         """Trains, or goes on, and prints what the test said."""
+        check_folder("--out", self.out)
         from foundation.depth_feature_training import train
 
         manifest = train(self.config, self.out)

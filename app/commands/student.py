@@ -8,11 +8,15 @@ from typing import Annotated, Literal
 import tyro
 
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config
-from app.commands.checks import check_objects
+from app.commands.checks import check_objects, check_tried
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Camera, Config, Robot
 from ddgrasp.config.checks import Count, Range, Seed
+from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
+from ddgrasp.shipped import NAME, shipped
+
+DEFAULT_POLICY = Path("runs") / DEFAULT_PRESET / "export" / "policy.onnx"
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,7 @@ class StudentPerception:
         from evaluation.rig_trials import Series
 
         series = Series("development", self.objects, self.trials, number=self.number, camera=self.camera)
+        check_tried(series)
         progress = Progress(name="student perception")
         rows = perception.measure(config, self.run_dir, series, progress)
         print(perception_table.describe(rows))
@@ -135,10 +140,21 @@ class Deploy:
             self.robot, self.camera, self.recording, self.object_name, self.seconds,
             dry_run=self.dry_run, yes=self.yes, host=self.host, out=self.out, calibration=self.calibration,
         )  # fmt: skip
+        _check_policy(self.policy)
         report = deploy(self.config, self.policy, options)
         print(describe(report))
         if report.fault:
             sys.exit(1)
+
+
+def _check_policy(policy: Path) -> None:
+    """UserError that names the student of this project where no policy was given and there is none yet."""
+    there = Path(NAME) / "student" / "policy.onnx"
+    if policy == DEFAULT_POLICY and not policy.exists() and shipped(there).is_file():
+        raise UserError(
+            f"--policy is {policy}, which does not exist: make one with `ddgrasp export`, or give --policy "
+            f"{there}, which comes with this project."
+        )
 
 
 def config_of(policy: Path, preset: str | None) -> Config:

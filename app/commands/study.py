@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from app import extras
 from app.commands.base import FromPreset
-from app.commands.checks import check_config_values, check_devices, check_start, tell_needs
+from app.commands.checks import (
+    check_config_values,
+    check_devices,
+    check_folder,
+    check_start,
+    check_tried,
+    tell_needs,
+)
 from ddgrasp import artifacts, contract
 from ddgrasp.config import UNIFORM, Config, DDGConfig
 from ddgrasp.config.checks import Count, Range
@@ -20,10 +27,11 @@ if TYPE_CHECKING:
 class StudyTable2(FromPreset):
     """Train one student per depth source, all else equal, and try them on the same trials: Table II."""
 
-    rows: tuple[str, ...] = ()
-    """Rows by name instead of whole tables, made in the order in which they are given: sim_gt, rand_noise,
-    inpaint, monocular, ddg_no_graft, ddg, upper_bound, sim_gt_ripple, rand_noise_ripple, ddg_ripple,
-    sim_gt_filled, rand_noise_filled, ddg_filled, rand_noise_double, paper_ddg_no_graft, paper_ddg."""
+    rows: tuple[str, ...] | None = None
+    """Rows by name instead of the whole tables of --table, made in the order in which they are given: sim_gt,
+    rand_noise, inpaint, monocular, ddg_no_graft, ddg, upper_bound, sim_gt_ripple, rand_noise_ripple,
+    ddg_ripple, sim_gt_filled, rand_noise_filled, ddg_filled, rand_noise_double, paper_ddg_no_graft,
+    paper_ddg."""
     table: tuple[str, ...] = ("main",)
     """main (hand-made noise off), ripple (off and on), filled (holes as recorded, and filled by
     the student), formulas (with pixels of the picture's size, and twice as large), grafting (with the paper's
@@ -74,7 +82,9 @@ class StudyTable2(FromPreset):
         from evaluation.rig_trials import Series
         from evaluation.table2 import results, rows
 
-        names = rows.chosen(self.rows, self.table)
+        if self.rows == ():
+            raise UserError(f"--rows names none: give rows ({', '.join(rows.ROWS)}), or leave it out.")
+        names = rows.chosen(self.rows or (), self.table)
         if any(rows.ROWS[name].paper_generator for name in names):
             _check_paper_generator(self.config.ddg, self.paper_generator, self.out / results.PAPER / "ddg")
         elif self.paper_generator:
@@ -83,6 +93,7 @@ class StudyTable2(FromPreset):
                 "generator: leave it out, or ask for --rows paper_ddg."
             )
         series = Series(self.rig, self.objects, self.trials, self.split, self.number)
+        check_tried(series)
         series.names()
         if self.rig == "fr3":
             extras.check_fr3("--rig fr3")
@@ -130,7 +141,9 @@ class StudyCauses:
         rows = causes.chosen(self.rows)
         series = Series("development", self.objects, self.trials, "development", self.number)
         series = replace(series, seconds=self.seconds)
+        check_tried(series)
         series.names()
+        check_folder("--out", self.out)
         made = causes.run(
             config_of(self.policy, self.preset), self.policy, rows, series, self.out, self.workers
         )

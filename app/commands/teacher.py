@@ -7,13 +7,20 @@ import tyro
 
 from app import pipeline
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config
-from app.commands.checks import check_config_values, check_devices, check_objects, stage_folder
+from app.commands.checks import (
+    check_config_values,
+    check_devices,
+    check_folder,
+    check_objects,
+    is_shipped,
+    stage_folder,
+)
 from ddgrasp import artifacts
 from ddgrasp.config import Backend, HostsConfig, WorldConfig
 from ddgrasp.config.checks import Count, Seed
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
-from ddgrasp.shipped import PRETRAINED, holding
+from ddgrasp.shipped import holding
 from ddgrasp.stages import get_stage
 
 
@@ -64,6 +71,7 @@ class TeacherEval:
         directory = stage_folder("RUN-DIR", self.run_dir, "teacher")
         if self.out is None:
             _check_own(directory, "give --out FOLDER")
+        check_folder("--out", self.out or directory)
         teacher = artifacts.read_artifact(directory).hash
         from ddgrasp.progress import Progress
         from evaluation import teacher_trials
@@ -115,7 +123,7 @@ class TeacherCompare:
 
 def _check_own(directory: Path, remedy: str) -> None:
     """UserError for a folder that comes with the project: what was measured of it is not replaced."""
-    if directory.resolve().is_relative_to(PRETRAINED.resolve()):
+    if is_shipped(directory):
         raise UserError(f"{directory} comes with the project, with its own measurements: {remedy}.")
 
 

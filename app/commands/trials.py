@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from app.commands.checks import check_folder, check_tried
 from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
 
@@ -67,6 +68,8 @@ class DeployTrials:
             self.depth,
             None if self.retry else False,
         )
+        check_tried(series)
+        check_folder("--out", self.out)
         config = config_of(self.policy, self.preset)
         progress = Progress(name="deploy trials")
         table = rig_trials.run(

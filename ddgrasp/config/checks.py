@@ -6,6 +6,7 @@ reads those types when a value is made, so no field goes unchecked, from Python 
 
 import dataclasses
 import math
+import types
 import typing
 from dataclasses import dataclass
 from functools import cache
@@ -115,8 +116,15 @@ class Section:
 @cache
 def kinds(section: type) -> dict[str, Any]:
     """Name -> type of a dataclass's fields, bounds included."""
-    types = typing.get_type_hints(section, include_extras=True)
-    return {field.name: types[field.name] for field in dataclasses.fields(section)}
+    hints = typing.get_type_hints(section, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(section)}
+
+
+def stated(kind: Any) -> Any:
+    """What `kind` says of a value that is there: X of `X | None`, in both forms that Python has of it."""
+    if typing.get_origin(kind) not in (typing.Union, types.UnionType):
+        return kind
+    return next(one for one in typing.get_args(kind) if one is not NoneType)
 
 
 def check_value(name: str, value: Any, kind: Any) -> None:
@@ -164,7 +172,7 @@ def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
 
 def _check_tuple(name: str, value: Any, kinds_of_items: tuple[Any, ...]) -> None:
     if not isinstance(value, tuple):
-        raise UserError(f"{name} is {value!r}; expected a list.")
+        raise UserError(f"{name} is {value!r}; expected a tuple.")
     if kinds_of_items[-1] is Ellipsis:
         if not value:
             raise UserError(f"{name} is empty; expected at least one{_of(kinds_of_items[0])}.")

@@ -1,0 +1,193 @@
+"""How a command ends where a stream, a device or a place to write to is missing: in one line, early."""
+
+import errno
+import io
+import os
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from app import cli, commands, pipeline
+from app.commands import parse
+from app.commands.checks import check_file, check_folder
+from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
+
+ROOT = Path(__file__).parents[1]
+
+
+def ran(run, monkeypatch) -> int:
+    """The status of a command that does `run`."""
+    monkeypatch.setattr(commands, "parse", lambda name, args: SimpleNamespace(run=run))
+    return cli.main(["objects", "list"])
+
+
+# --- errors of the system ------------------------------------------------------------------------
+
+
+def _raise(error: BaseException) -> None:
+    raise error
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.ENAMETOOLONG, errno.ENOENT, errno.EIO, errno.ELOOP])
+def test_what_the_system_says_of_a_file_is_one_line(number, monkeypatch, capsys):
+    error = OSError(number, os.strerror(number), "runs/x/a.json")
+    assert ran(partial(_raise, error), monkeypatch) == 1
+    assert capsys.readouterr().err == (
+        f"ddgrasp: runs/x/a.json cannot be read or written ({os.strerror(number)}): mend that, or give "
+        "another path.\n"
+    )
+
+
+def test_an_error_that_names_no_file_keeps_its_traceback(monkeypatch):
+    for error in (OSError(errno.EIO, "no file"), PermissionError(errno.EPERM, "of a process"), KeyError("a")):
+        with pytest.raises(type(error)):
+            ran(partial(_raise, error), monkeypatch)
+
+
+@pytest.mark.parametrize("out", ["a" * 300, "README.md/a"])
+def test_a_run_s_place_is_looked_at_before_what_lies_in_it(out, tmp_path):
+    (tmp_path / "README.md").touch()
+    for resume in (False, True):
+        with pytest.raises(UserError, match=r"cannot be created \(.+\): choose another --out\.$"):
+            pipeline.check_place(PRESETS["debug"], tmp_path / out, resume=resume)
+    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+
+
+# --- devices -------------------------------------------------------------------------------------
+
+ASK_DEVICES = """
+import sys, types
+from app import cli, commands
+def run():
+    import jax
+    jax.numpy.zeros(3)
+commands.parse = lambda name, args: types.SimpleNamespace(run=run)
+sys.exit(cli.main(["objects", "list"]))
+"""
+
+
+@pytest.mark.parametrize("platforms", ["cuda", "foo", "cpu,foo"])
+def test_devices_that_are_not_here_are_named_by_their_variable(platforms):
+    env = {**os.environ, "JAX_PLATFORMS": platforms, "CUDA_VISIBLE_DEVICES": ""}
+    done = subprocess.run(
+        [sys.executable, "-c", ASK_DEVICES], cwd=ROOT, env=env, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 1
+    assert done.stderr == (
+        f"ddgrasp: JAX_PLATFORMS is {platforms!r}, which JAX has no device for here: unset it, or set it to "
+        "cpu.\n"
+    )
+
+
+def test_another_failed_assertion_keeps_its_traceback(monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    import jax
+
+    assert jax.devices()
+    for error in (AssertionError(), RuntimeError("of ours")):
+        with pytest.raises(type(error)):
+            ran(partial(_raise, error), monkeypatch)
+
+
+# --- streams -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("closed", [">&-", "<&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("command", ["objects list", "play --help", "play --objects aple"])
+def test_closed_streams_are_no_trouble(closed, command):
+    line = f"exec {sys.executable} -m app.cli {command} {closed}"
+    done = subprocess.run(["bash", "-c", line], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    wrong = "aple" in command
+    assert done.returncode == (2 if wrong else 0), done.stderr
+    assert "Traceback" not in done.stderr
+    assert bool(done.stdout) == (not wrong and ">&-" not in closed.replace("2>&-", ""))
+
+
+def test_closed_streams_of_this_process_are_made_to_lead_nowhere(monkeypatch):
+    for name in ("stdin", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    assert cli.main(["--help"]) == 0
+    assert not sys.stdin.isatty() and sys.stdin.read() == ""
+    for stream in (sys.stdin, sys.stdout, sys.stderr):
+        stream.close()
+
+
+def test_what_a_terminal_cannot_show_is_escaped(monkeypatch, capsys):
+    printed = io.TextIOWrapper(io.BytesIO(), "ascii", newline="")
+    monkeypatch.setattr(sys, "stdout", printed)
+    assert ran(lambda: print("1 µm, 日"), monkeypatch) == 0
+    printed.seek(0)
+    assert printed.read() == "1 \\xb5m, \\u65e5\n"
+
+
+# --- places to write to --------------------------------------------------------------------------
+
+
+def test_a_place_is_tried_and_left_as_it_was(tmp_path):
+    (tmp_path / "a.png").write_text("old")
+    for path in ("a.png", "new.png", "b/c/new.png"):
+        check_file("--out", tmp_path / path)
+    for path in ("", "b", "b/c"):
+        check_folder("--out", tmp_path / path)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+    assert (tmp_path / "a.png").read_text() == "old"
+
+
+@pytest.mark.parametrize(
+    ("path", "trouble"),
+    [
+        ("file/a.png", "and {}/file is no folder: name a file elsewhere."),
+        ("folder", "a folder: name a file, in it or elsewhere."),
+        ("a" * 250, "where nothing can be written (File name too long): name a file elsewhere."),
+        (f"{'a' * 300}/a.png", "where nothing can be written (File name too long): name a file elsewhere."),
+        ("/proc/a.png", "where nothing can be written ("),
+        ("/proc/b/a.png", "where nothing can be written ("),
+    ],
+)
+def test_a_file_that_cannot_be_is_refused(path, trouble, tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(UserError) as error:
+        check_file("--out", tmp_path / path)
+    assert str(error.value).startswith(f"--out is {tmp_path / path}, {trouble.format(tmp_path)}")
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "folder"}
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "teacher eval pretrained",
+        "ddg sample --model pretrained/ddg --data nowhere",
+        "ddg thresholds --model pretrained/ddg --data nowhere",
+        "ddg features",
+        "sensors compare",
+        "study causes --policy pretrained/student/policy.onnx",
+        "deploy trials --policy pretrained/student/policy.onnx --rig development",
+        "record fr3",
+        "record import nowhere",
+        "record realsense",
+        "weights convert nowhere.pth",
+        "calibrate board",
+        "calibrate",
+        "ddg export --model pretrained/ddg",
+        "objects sheet",
+        "play",
+    ],
+)
+@pytest.mark.parametrize("place", ["/proc", "{}/file"])
+def test_where_a_command_is_to_write_is_tried_before_it_works(command, place, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    out = f"{place.format(tmp_path)}/a.mp4" if command == "play" else f"{place.format(tmp_path)}/a.pdf"
+    words = command.split()
+    name = " ".join(words[:2]) if " ".join(words[:2]) in commands.COMMANDS else words[0]
+    with pytest.raises(
+        UserError, match=rf"^--out is {out}, (where nothing can be written|and \S+/file is no)"
+    ):
+        parse(name, [*words[len(name.split()) :], "--out", out]).run()
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
