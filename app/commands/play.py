@@ -84,7 +84,7 @@ class Play:
         series = Series(self.rig, self.objects, self.trials, number=self.number, seconds=self.seconds)
         check_tried(series)
         trials = series.plan()
-        controls = Controls(_objects_by_rig(series), self.rig, self.noise)
+        controls = Controls(_objects_by_rig(series, self._live), self.rig, self.noise)
         noise = _ChosenNoise(controls, generator)
         if not self._live:
             check_file("--out", self._film)
@@ -180,9 +180,12 @@ class _Rigs:
             bench.close()
 
 
-def _objects_by_rig(series: "Series") -> dict[str, tuple[str, ...]]:
-    """What each rig that can run here has to grasp, that of `series` first."""
-    others = set() if extras.lacks_fr3() else {"development", "fr3"} - {series.rig}
+def _objects_by_rig(series: "Series", choice: bool) -> dict[str, tuple[str, ...]]:
+    """What the rig of `series` has to grasp; with a `choice` of them, every other that can run here as well.
+
+    The FR3's meshes take a second to import, in which trimesh loses a Ctrl-C.
+    """
+    others = {"development", "fr3"} - {series.rig} if choice and not extras.lacks_fr3() else set()
     return {rig: replace(series, rig=rig).known() for rig in (series.rig, *others)}
 
 
