@@ -83,3 +83,9 @@ def test_a_command_that_does_not_exist_is_found():
 def test_variables_that_a_block_sets_are_put_in_where_it_uses_them():
     block = 'A="--preset debug"\nB="$A --out runs/x"\nddgrasp run $B'
     assert expanded(block) == "ddgrasp run --preset debug --out runs/x"
+
+
+def test_the_table_of_what_they_leave_has_every_command():
+    page = (ROOT / "docs" / "commands.md").read_text()
+    table = page.split("## What each reads and leaves")[1].split("\n## ")[0]
+    assert COMMANDS.keys() <= set(re.findall(r"`([a-z0-9 ]+)`", table))
