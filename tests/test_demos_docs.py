@@ -24,7 +24,7 @@ def test_the_page_s_reader_reads_a_store(tmp_path):
         }
         store.append(steps, {"object_index": np.int32(0)})
         written.append(steps)
-    code, _ = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    code, *_ = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     names: dict = {}
     exec(code, names)
     read = list(names["episodes"](str(tmp_path / "episodes.zarr")))

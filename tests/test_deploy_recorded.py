@@ -112,7 +112,7 @@ def test_a_log_belongs_to_whose_trial_ended_first(tmp_path):
     fr3, development = TrialLog(path, {"rig": "fr3"}), TrialLog(path, {"rig": "development"})
     result = TrialResult(0, "cube", False, True, 1, 0, 0, {}, [], [], [], [], [], [])
     fr3.append(result)
-    with pytest.raises(UserError, match="was begun with another policy"):
+    with pytest.raises(UserError, match="begun otherwise: rig is 'fr3' there"):
         development.append(result)
     assert TrialLog(path, {"rig": "fr3"}).results == {(0, False): result}
 

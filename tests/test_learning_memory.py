@@ -11,7 +11,6 @@ from ddg_jax import memory as ddg_memory
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from demos import memory as demos_memory
-from learning import memory
 from learning.memory import Need, check, compiled_bytes, traced_bytes
 from student_jax import memory as student_memory
 
@@ -98,13 +97,3 @@ def test_a_batch_that_cannot_fit_is_refused_before_any_work(tmp_path):
     with pytest.raises(UserError, match="Stage student needs about .* lower student.training.batch_size"):
         check_networks(large, tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-def test_files_that_a_container_has_read_are_not_memory_that_it_lacks(tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "_CGROUP", tmp_path)
-    for name, value in (("max", 8_000_000), ("current", 7_000_000)):
-        (tmp_path / f"memory.{name}").write_text(f"{value}\n")
-    (tmp_path / "memory.stat").write_text("anon 900000\ninactive_file 6000000\nactive_file 100000\n")
-    assert memory.host_bytes() == 7_000_000
-    (tmp_path / "memory.max").write_text("max\n")
-    assert memory.host_bytes() > 8_000_000
