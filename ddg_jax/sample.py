@@ -338,11 +338,11 @@ def _check_depth(depth_m: np.ndarray, config: DDGConfig) -> None:
         )
     if not depth_m.size:
         raise UserError(f"Simulated depth is {depth_m.shape}; expected a frame or more.")
-    check_metres(depth_m)
+    _check_metres(depth_m)
     check_aspect(depth_m.shape[1:], config)
 
 
-def check_metres(depth_m: Float[np.ndarray, "..."]) -> None:
+def _check_metres(depth_m: Float[np.ndarray, "..."]) -> None:
     """UserError if simulated depth is in another unit, negative or not finite."""
     low, high = np.min(depth_m, initial=0), np.max(depth_m, initial=0)
     if not (low >= 0 and high <= FARTHEST_SANE_M):  # neither is so for NaN
