@@ -26,14 +26,17 @@ _PARTS = (
     (7, (0.0, 0.0, 0.045), 0.033),
     (7, (0.0, 0.07, 0.045), 0.033),
     (7, (0.0, -0.07, 0.045), 0.033),
+    (7, (0.0, 0.045, 0.1054), 0.008),
+    (7, (0.0, -0.045, 0.1054), 0.008),
 )
-"""Spheres around what can hit a table or a wall before the fingers do: elbow, forearm, wrist, flange, hand.
-(joint counted from 0, point in its frame, radius; metres), 7 being the hand. Sizes: mjx_envs/scene.py."""
+"""Spheres around what can hit a table or a wall: elbow, forearm, wrist, flange, hand, tips of open fingers.
+(joint counted from 0, point in its frame, radius; metres), 7 being the hand. Sizes: mjx_envs/scene.py. The
+tips' end 2 mm before the tips do, so that an upright hand may touch the table (2 degrees off upright too)."""
 PART_RADII_M = np.array([radius for *_, radius in _PARTS])
 
 
-def part_centers(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "11 3"]:
-    """(11, 3) centres of the spheres of `PART_RADII_M` in the robot's base frame, metres."""
+def part_centers(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "13 3"]:
+    """(13, 3) centres of the spheres of `PART_RADII_M` in the robot's base frame, metres."""
     frames = _frames(q_rad)
     return np.array([frames[i][:3, :3] @ point + frames[i][:3, 3] for i, point, _ in _PARTS])
 

@@ -39,10 +39,11 @@ class SafetyLimits:
     braking_reserve_rad_s: tuple[float, ...] = (0.0,) * 7
     workspace_lower_m: tuple[float, float, float] = (0.15, -0.45, 0.012)
     workspace_upper_m: tuple[float, float, float] = (0.80, 0.45, 0.80)
-    """Box for the point between the finger pads, robot base frame; 12 mm = fingertips on the table."""
+    """Box for the point between the finger pads, robot base frame; 12 mm = an upright hand's
+    fingertips on the table."""
     arm_lower_m: tuple[float, float, float] = (-0.55, -0.80, 0.0)
     arm_upper_m: tuple[float, float, float] = (0.95, 0.80, 1.30)
-    """Box that elbow, forearm, wrist and hand stay inside: table and walls."""
+    """Box that elbow, forearm, wrist, hand and open fingers stay inside: table and walls."""
     approach_below_m: float = 0.0
     """Below this height the grip point comes down slowly: the hand may land on something. 0: nowhere."""
     approach_m_s: float = math.inf

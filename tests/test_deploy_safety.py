@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ddgrasp import contract, policy_metadata
 from ddgrasp.presets import get_preset
 from deploy import kinematics
+from deploy.calibration.poses import reach
 from deploy.safety import NonFiniteAction, SafetyFilter, SafetyLimits
 from deploy.setup import safety_filter
 from mjx_envs.scene import HOME_RAD
@@ -180,6 +182,22 @@ def test_the_hand_s_side_stays_off_the_table_though_the_grip_point_may_go_there(
         lowest = kinematics.part_centers(q)[:, 2] - kinematics.PART_RADII_M
         assert lowest.min() >= -1e-9
     assert "arm" in causes and np.argmin(lowest) >= 7, "no part of the hand met the table: this says nothing"
+
+
+@pytest.mark.parametrize("tilt_deg", [20.0, 30.0])
+def test_a_tilted_hand_s_fingertips_stay_off_the_table(tilt_deg):
+    """Where the grip point alone is kept at 12 mm they end 14 and 18 mm below it."""
+    limits = SafetyLimits(acceleration_rad_s2=(1e6,) * 7)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
+    q = reach(kinematics.grip_pose(HOME) @ turn, HOME, limits)
+    assert q is not None
+    filter_ = SafetyFilter(limits, 0.1)
+    for _ in range(60):  # straight down, the hand turned as it is
+        down = np.linalg.pinv(kinematics.grip_jacobian(q)) @ (0.0, 0.0, -0.02, 0.0, 0.0, 0.0)
+        q = filter_.target(q, action(*(down / 0.1)))[0]
+    tips = [(kinematics.grip_pose(q) @ (0.0, y, 0.012, 1.0))[2] for y in (-0.05, 0.05)]
+    assert -0.006 < min(tips) < 0.005
 
 
 def test_the_elbow_stays_off_a_wall():

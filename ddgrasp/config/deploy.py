@@ -90,11 +90,12 @@ class DeployConfig(Section, name="deploy"):
     """Largest change between two steps, relative to Franka's acceleration limit. Targets lead the arm, so
     they may change faster than the arm itself; from 2.8 on, a full reversal of any joint passes."""
     workspace_lower_m: _Corner = (0.15, -0.45, 0.012)
-    """Where the point between the finger pads may go, robot base frame; 12 mm = fingertips on the table."""
+    """Where the point between the finger pads may go, robot base frame; 12 mm = fingertips on the table,
+    those of an upright hand."""
     workspace_upper_m: _Corner = (0.80, 0.45, 0.80)
     """The box's other corner."""
     arm_lower_m: _Corner = (-0.55, -0.80, 0.0)
-    """Where elbow, forearm, wrist and hand may be: table and walls, robot base frame."""
+    """Where elbow, forearm, wrist, hand and open fingers may be: table and walls, robot base frame."""
     arm_upper_m: _Corner = (0.95, 0.80, 1.30)
     """That box's other corner."""
     realtime_trials: Count = 3
