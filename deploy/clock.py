@@ -36,7 +36,6 @@ class RobotClock:
         """`stalled_after_s` of the machine's time without any of the robot's is an error."""
         self._stalled_after_s = stalled_after_s
         self._robot: TimedRobot | None = None
-        self._before_s = 0.0
         self._robot_s = 0.0
 
     def follow(self, robot: TimedRobot) -> None:
@@ -44,16 +43,11 @@ class RobotClock:
         self._robot = robot
 
     def now(self) -> float:
-        """Seconds, monotonic: a robot that counts anew after a new connection goes on from where it was.
-
-        Raises RobotError.
-        """
+        """Seconds since the robot began to answer. Raises RobotError."""
         seconds = self._read_s()
         if seconds is not None:
-            if seconds < self._robot_s:
-                self._before_s += self._robot_s
             self._robot_s = seconds
-        return self._before_s + self._robot_s
+        return self._robot_s
 
     def sleep_until(self, deadline_s: float) -> None:
         """Returns when `now` has reached the deadline.

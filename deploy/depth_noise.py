@@ -29,14 +29,15 @@ Array = Any
 
 
 class Reported(NamedTuple):
-    """What the camera would have reported; kind and shape are those of the depth that came in."""
+    """What the camera would have reported, in the library and the shape of the depth that came in; depth in
+    float32."""
 
     depth_m: Array
     """Simulated depth with the camera's artefacts, 0 = hole."""
     predicted_m: Array
     """The generator's own map."""
     mask: Array
-    """Where an artefact was grafted; everywhere else `depth_m` is the simulation's, bit for bit."""
+    """Where an artefact was grafted; everywhere else `depth_m` is the simulation's, to the bit of float32."""
 
 
 class DepthGenerator:

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,8 @@ from deploy.timing import Timings
 
 KEPT_EVENTS = 1000
 """Events kept in a report; later ones are counted only."""
+By = Literal["policy", "retry"]
+"""Who asked for an action: the network, or the rules for trying again (`deploy.retry`)."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,8 @@ class Step:
     """(7,) after the safety filter, None where the loop held position."""
     close: bool = False
     """Whether the fingers were last told to close; they wait for a slow hand, `action` does not say so."""
+    by: By | None = None
+    """Whose `action` is; None where the loop held position."""
 
 
 @dataclass
@@ -134,8 +138,8 @@ class ControlLoop:
         """Run until `max_steps`, until `on_step` returns True, until Ctrl-C, or until the robot fails.
 
         The last command has its whole period before this returns. Camera and robot are started here
-        and stopped whatever happens; on Ctrl-C the arm is told to hold first. The report comes back either
-        way: what the robot failed with is its `fault`, and an event.
+        and stopped whatever happens; on Ctrl-C an arm that has started is told to hold first. The report
+        comes back either way: what the robot failed with is its `fault`, and an event.
         """
         self._start_s = self._clock.now()
         moving = False
@@ -149,7 +153,8 @@ class ControlLoop:
             self._report.interrupted = True
             if moving:
                 self._hold_quietly()
-            self._log("stop", "interrupted; the robot holds position")
+            after = "the robot holds position" if moving else "the start was broken off"
+            self._log("stop", f"interrupted; {after}")
         except RobotError as error:
             self._fail(error)
         finally:
@@ -219,7 +224,8 @@ class ControlLoop:
         timings.act_s.append(ended - acting)
         if action is not None and inferring:
             timings.latency_s.append(ended - started)
-        return Step(self._report.steps, frame, state, None if problem else action, target, self._closed)
+        asked = None if problem else action
+        return Step(self._report.steps, frame, state, asked, target, self._closed, _whose(asked, own))
 
     def _act(self, frame: Frame, state: RobotState) -> tuple[np.ndarray, bool]:
         """(8,) the policy's action, or what is left of its last one; whether the network ran for it."""
@@ -361,6 +367,13 @@ class ControlLoop:
         except RobotError:
             pass
         return self._last_s
+
+
+def _whose(action: np.ndarray | None, own: np.ndarray | None) -> By | None:
+    """Who asked for (8,) `action`; `own` is the policy's."""
+    if action is None:
+        return None
+    return "policy" if action is own else "retry"
 
 
 def _state_problem(state: RobotState) -> str:

@@ -74,6 +74,7 @@ class DeploymentRecord:
         if step.state.felt_nm is not None:
             row["felt_nm"] = np.round(step.state.felt_nm, 3).tolist()
         row["action"] = None if step.action is None else np.asarray(step.action, float).tolist()
+        row["by"] = step.by
         row["close"] = step.close
         row["q_target_rad"] = None if step.q_target_rad is None else step.q_target_rad.tolist()
         self._rows.append(row)

@@ -38,7 +38,7 @@ def deploy(
 
     SIGTERM and a terminal that is closed end it as Ctrl-C does, and none cuts the stopping short when it
     comes again: the robot holds, both devices are stopped, the report comes back. So it does when the robot
-    fails; its `fault` says with what.
+    fails; its `fault` says with what. One that is ended before its first step leaves no folder.
 
     Raises UserError for an unknown name, a combination that cannot work, or a device that is absent.
     """
@@ -89,8 +89,7 @@ def _run(
             ending.enter_context(unbroken())
     except BaseException as error:
         if not loop.report.steps:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+            _drop(folder)
         else:  # a device that fails in a way of its own costs nothing of what was recorded
             fault = loop.report.fault or f"{type(error).__name__}: {error}"
             with unbroken(), contextlib.suppress(OSError, ValueError):
@@ -100,6 +99,9 @@ def _run(
         ending.close()
         raise
     with ending:
+        if report.interrupted and not report.steps:
+            _drop(folder)
+            return report
         kept.finish(folder, report.as_dict(), success, about | _object(camera, name))
     if success is not None:
         say(f"verdict: {ENDED[success]}")
@@ -192,6 +194,12 @@ def _new_folder(out: Path) -> Path:
             again += 1
         else:
             return folder
+
+
+def _drop(folder: Path) -> None:
+    """Takes away a folder that nothing was kept in."""
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 def _stamp() -> str:

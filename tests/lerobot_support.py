@@ -58,9 +58,13 @@ def write_deployment(
     success: bool | None = True,
     frames: int = 4,
     held: tuple[int, ...] = (),
+    by: tuple[str, ...] = ("policy",) * 4,
     **about: str | int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Makes a deployment of four steps as `deploy.record` leaves it; returns (states, depth_mm)."""
+    """Makes a deployment of four steps as `deploy.record` leaves it; returns (states, depth_mm).
+
+    Without `by` as before 2026-11-28.
+    """
     rng = np.random.default_rng(len(folder.name))
     states = rng.normal(size=(4, 8))
     depth_mm = rng.integers(500, 900, (frames, *SIZE)).astype(np.uint16)
@@ -73,6 +77,7 @@ def write_deployment(
             "q_rad": state[:7].tolist(),
             "width_m": state[7],
             "action": None if step in held else [*np.full(7, 0.1 * step).tolist(), 1.0 if step else -1.0],
+            **({"by": None if step in held else by[step]} if by else {}),
         }
         for step, state in enumerate(states)
     ]

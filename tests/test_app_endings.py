@@ -167,6 +167,7 @@ def test_a_file_that_cannot_be_is_refused(path, trouble, tmp_path):
         "ddg features",
         "sensors compare",
         "study causes --policy pretrained/student/policy.onnx",
+        "deploy --policy pretrained/student/policy.onnx",
         "deploy trials --policy pretrained/student/policy.onnx --rig development",
         "record fr3",
         "record import nowhere",

@@ -171,6 +171,29 @@ def test_the_card_counts_what_the_loop_missed_and_held(tmp_path):
     assert "**Time**: 2 control periods passed without a step" in text and "**Held**: in 2 steps" in text
 
 
+def test_who_acted_is_in_every_step_and_counted_on_the_card(tmp_path):
+    write_deployment(tmp_path / "new", held=(1,), by=("policy", "policy", "retry", "retry"))
+    write_deployment(tmp_path / "old", held=(1,), by=())
+    source = open_source(tmp_path)
+    new, old = (read() for read in source.episodes)
+    kinds = dataset._described(new, "video")
+    made = [list(steps.frames(episode, "lift it")) for episode in (new, old)]
+    assert all(frame.keys() - {"task"} == kinds.keys() for frames in made for frame in frames)
+    flags = [[bool(frame[steps.BY_POLICY][0]) for frame in frames] for frames in made]
+    assert flags == [[True, False, False, False], [False] * 4]
+    contents = card.Contents(keys=tuple(kinds))
+    for episode in (new, old):
+        contents.count(episode, 0)
+    how = {"name": "set", "storage": "video", "licence": "cc-by-4.0", "command": "ddgrasp demos export x"}
+    text = card.render(source, contents, **how)
+    assert "in 2 steps the control loop's rules acted" in text and "**Not noted**: 3 steps" in text
+    assert f"| `{steps.BY_POLICY}` |" in text and "`by_policy` says where it is the policy's" in text
+    write_deployment(tmp_path / "alone" / "one")
+    contents = card.Contents()
+    contents.count(open_source(tmp_path / "alone").episodes[0](), 0)
+    assert (contents.retried, contents.unnoted) == (0, 0)
+
+
 def test_what_stands_there_is_not_touched(tmp_path, monkeypatch):
     write_demos(tmp_path / "run")
     (tmp_path / "set").mkdir()

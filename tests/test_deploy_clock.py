@@ -1,4 +1,4 @@
-"""A clock that keeps a robot's time notices a robot whose time stands still."""
+"""A clock that keeps a robot's time, and notices a robot whose time stands still."""
 
 import time
 
@@ -14,6 +14,24 @@ class StandingStill(KinematicRobot):
 
     def time_s(self):
         return 3.0
+
+
+class Silent(KinematicRobot):
+    """A robot that does not answer at first, nor for a while later on."""
+
+    def __init__(self, clock, *answers):
+        super().__init__(clock)
+        self.answers = iter(answers)
+
+    def time_s(self):
+        return next(self.answers)
+
+
+def test_no_time_passes_while_a_robot_does_not_answer():
+    clock = RobotClock()
+    assert clock.now() == 0.0
+    clock.follow(Silent(clock, None, 7.5, None, 7.6))
+    assert [clock.now() for _ in range(4)] == [0.0, 7.5, 7.5, 7.6]
 
 
 def test_a_long_wait_on_a_robot_that_stands_still_ends_early():

@@ -68,6 +68,10 @@ def test_layout_of_the_input_is_kept(generator, scene):
         np.testing.assert_array_equal(
             generator(np.expand_dims(scene, axis), noise), np.expand_dims(plain, axis)
         )
+    fine = scene.astype(np.float64) * (1 + 1e-8)  # between two numbers of float32
+    made = generator.generate(fine, noise)
+    assert made.depth_m.dtype == made.predicted_m.dtype == np.float32
+    np.testing.assert_array_equal(made.depth_m[~made.mask], fine.astype(np.float32)[~made.mask])
     np.testing.assert_allclose(generator(scene.astype(np.float64), noise), plain)
     larger = scene.repeat(2, axis=1).repeat(2, axis=2)
     assert generator(larger, noise).shape == larger.shape

@@ -338,13 +338,68 @@ def test_a_hand_that_fails_leaves_an_arm_that_is_told_to_brake(error, said):
     assert spring.told == ["stay", "stop", "release"]
 
 
-def _connected(**arm) -> FrankaRobot:
+ARM = FrankaConfig(host="127.0.0.9")
+
+
+def _connected(config: FrankaConfig = ARM, **arm) -> FrankaRobot:
     """A driver at whose other end is an arm that has these attributes."""
     franky = pytest.importorskip("franky", reason="needs pip install -e '.[franka]'")
-    robot = FrankaRobot(FrankaConfig(host="127.0.0.9"), SimClock(), None)
+    robot = FrankaRobot(config, SimClock(), None)
     robot._franky, robot._arm = franky, SimpleNamespace(**arm)
     robot._errors, robot._lost_by = (franky.Exception, RuntimeError), (franky.NetworkException, RuntimeError)
     return robot
+
+
+class Limit:
+    """One of franky's, as it stands for a Panda."""
+
+    def __init__(self, *values: float):
+        self.values = np.array(values)
+
+    def get(self) -> np.ndarray:
+        return self.values
+
+    def set(self, values: np.ndarray) -> None:
+        self.values = values
+
+
+class Prepared:
+    """An arm that is well, and notes what it is told before it moves."""
+
+    has_errors = False
+
+    def __init__(self):
+        self.told: dict = {}
+        self.joint_velocity_limit = Limit(2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 9.0)
+        self.joint_acceleration_limit = Limit(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+        self.state = SimpleNamespace(
+            robot_mode="Idle", current_errors=[], joint_contact=[0.0] * 7, cartesian_contact=[0.0] * 6
+        )
+
+    def recover_from_errors(self) -> bool:
+        return True
+
+    def set_collision_behavior(self, **thresholds: float) -> None:
+        self.told |= thresholds
+
+    def set_load(self, mass_kg: float, F_x_Cload: list, load_inertia: list) -> None:
+        self.told |= {"load_kg": mass_kg, "centre_m": F_x_Cload, "inertia": load_inertia}
+
+
+def test_an_arm_is_told_its_thresholds_its_load_and_its_own_limits_before_it_moves():
+    arm = Prepared()
+    config = FrankaConfig(give_way=0.6, contact_torque_nm=15.0, contact_force_n=40.0, load_kg=0.3)
+    robot = _connected(config)
+    robot._arm = arm
+    robot._prepare()
+    assert arm.told == {
+        "lower_torque_threshold": 9.0, "upper_torque_threshold": 15.0,
+        "lower_force_threshold": 24.0, "upper_force_threshold": 40.0,
+        "load_kg": 0.3, "centre_m": [0.0, 0.0, 0.1034], "inertia": [0.0] * 9,
+    }  # fmt: skip
+    # Whatever of an FR3's own is lower: all of 10 rad/s2 but joint 2, and the last joint's speed.
+    np.testing.assert_array_equal(arm.joint_velocity_limit.values, [2.175] * 4 + [2.61, 2.61, 5.26])
+    np.testing.assert_array_equal(arm.joint_acceleration_limit.values, [10.0, 7.5, *[10.0] * 5])
 
 
 def test_an_arm_that_a_person_has_stopped_is_left_alone():

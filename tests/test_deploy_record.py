@@ -47,7 +47,7 @@ class ColourCamera:
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Deploys a policy that bends joint 1, before a camera; (report, the folder it left)."""
+    """Deploys a policy that bends joint 1, before a camera; (report, the folder it left, None if none)."""
     policy = write_policy(
         tmp_path / "p.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.2)
     )
@@ -59,7 +59,7 @@ def run(tmp_path, monkeypatch):
         options = replace(SessionOptions(seconds=0.5, out=tmp_path / "kept"), **changes)
         before = set(options.out.glob("*"))
         report = session.deploy(get_preset("debug"), policy, options, say)
-        (folder,) = set(options.out.glob("*")) - before
+        (folder,) = set(options.out.glob("*")) - before or {None}
         return report, folder
 
     return deployed
@@ -74,7 +74,7 @@ def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
     assert recording.optics() == pytest.approx((168.6, 0.095), abs=0.1)
     rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
     assert [row["frame"] for row in rows] == list(range(5)) and len(rows[0]["q_rad"]) == 7
-    assert [row["close"] for row in rows] == [False] * 5
+    assert [(row["close"], row["by"]) for row in rows] == [(False, "policy")] * 5
     assert rows[1]["action"][0] == pytest.approx(0.2) and rows[1]["q_target_rad"][0] > rows[1]["q_rad"][0]
     kept = json.loads((folder / "report.json").read_text())
     assert kept["calibration"] is None, "the simulated robot has no camera to calibrate"
@@ -102,7 +102,7 @@ def test_a_width_that_is_no_number_costs_no_report(run, monkeypatch):
     report, folder = run()
     assert report.holds == 5 and json.loads((folder / "report.json").read_text())["width_m"] is None
     rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]
-    assert [row["width_m"] for row in rows] == [None] * 5
+    assert [(row["width_m"], row["by"]) for row in rows] == [(None, None)] * 5
 
 
 def test_two_that_begin_in_the_same_second_have_two_folders(tmp_path, monkeypatch):
@@ -119,6 +119,34 @@ def test_one_that_never_began_leaves_no_folder(run, tmp_path):
     with pytest.raises(UserError, match="no camera"):
         run(Absent)
     assert list((tmp_path / "kept").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("at", "calls", "after"),
+    [
+        ("start", ["stop"], "the start was broken off"),
+        ("first frame", ["start", "hold", "stop"], "the robot holds position"),
+    ],
+)
+def test_one_that_is_interrupted_before_its_first_step_leaves_no_folder(run, monkeypatch, at, calls, after):
+    robots, stopped, said = [], [], []
+
+    def stop(self):
+        robots.append(self)
+        self.calls.append("stop")
+
+    def asked(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(KinematicRobot, "stop", stop)
+    monkeypatch.setattr(ColourCamera, "stop", lambda self: stopped.append(self))
+    if at == "start":
+        monkeypatch.setattr(KinematicRobot, "start", asked)
+    fails_at = 1 if at == "first frame" else None
+    report, folder = run(lambda clock: ColourCamera(clock, fails_at), said.append)
+    assert report.interrupted and not report.steps and folder is None
+    assert [robot.calls for robot in robots] == [calls] and len(stopped) == 1
+    assert len(said) == 1 and said[0].endswith(f"stop: interrupted; {after}")
 
 
 def test_two_in_a_second_are_two_recordings_of_one_folder(run, tmp_path):

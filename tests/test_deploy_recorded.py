@@ -3,6 +3,9 @@
 import json
 import os
 import signal
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -138,3 +141,43 @@ def killed(config, policy_path):
 def test_a_worker_that_is_killed_is_one_line():
     with pytest.raises(UserError, match="a worker was killed"):
         list(run_trials(CONFIG, Path("policy.onnx"), [Trial(0, "apple")], 1, killed))
+
+
+STAYS = """
+import os, socket, time
+from pathlib import Path
+from ddgrasp.config import Config
+from deploy.trials import Trial, run_trials
+
+def stays(config, policy_path):
+    with socket.create_connection(("127.0.0.1", int(policy_path.name))) as told:
+        told.sendall(f"{os.getpid()} {os.getppid()}".encode())
+        time.sleep(60)
+
+if __name__ == "__main__":
+    list(run_trials(Config("test"), Path("PORT"), [Trial(0, "apple")], 1, stays))
+"""
+
+
+def test_a_worker_goes_when_its_parent_was_killed(tmp_path):
+    """A connection that it keeps open ends with it."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(60)
+        script = tmp_path / "stays.py"
+        script.write_text(STAYS.replace("PORT", str(server.getsockname()[1])))
+        env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+        parent = subprocess.Popen([sys.executable, script], env=env)
+        try:
+            worker, _ = server.accept()
+            pid, of = map(int, worker.recv(100).split())
+            assert of == parent.pid
+        finally:
+            parent.kill()
+            parent.wait()
+    with worker:
+        worker.settimeout(5)
+        try:
+            assert worker.recv(1) == b""
+        except TimeoutError:
+            os.kill(pid, signal.SIGKILL)
+            raise

@@ -259,15 +259,18 @@ def test_the_loop_says_so_and_lets_the_policy_begin_anew(tmp_path):
             ScriptedCamera(clock, [depth_mm()]), robot, policy, SafetyFilter(limits, 0.1), clock,
             LoopSettings(0.1, retry=retry),
         )  # fmt: skip
-        closed = []
-        report = loop.run(7, lambda step: closed.append(bool(closes(step.action))))
-        return closed, [(event.step, event.kind) for event in report.events if event.kind == "retry"], report
+        told = []
+        report = loop.run(7, lambda step: told.append((bool(closes(step.action)), step.by)))
+        closed, by = map(list, zip(*told, strict=True))
+        events = [(event.step, event.kind) for event in report.events if event.kind == "retry"]
+        return closed, events, by, report
 
-    closed, events, report = run(retry=True)
+    closed, events, by, report = run(retry=True)
     # Shut from step 1 on, seen twice, open in steps 2 and 3 (the start pose is high), then the policy again.
     assert closed == [True, True, False, False, True, True, False] and events == [(2, "retry"), (6, "retry")]
+    assert by == ["policy", "policy", "retry", "retry", "policy", "policy", "retry"]
     assert len(report.timings.infer_s) == 7, "the policy goes on being asked, so that time is measured"
-    assert run(retry=False)[:2] == ([True] * 7, [])
+    assert run(retry=False)[:3] == ([True] * 7, [], ["policy"] * 7)
 
 
 def test_the_loop_says_what_the_arm_feels(tmp_path):

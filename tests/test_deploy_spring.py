@@ -110,6 +110,20 @@ def test_what_a_joint_lacks_of_its_step_is_asked_for_again_as_far_as_friction_go
     np.testing.assert_allclose(arm.moved.references[-1], [-STEP / 2, -STEP / 0.1], err_msg="against the step")
 
 
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("stiffness", [50.0, 100.0, 400.0, 3000.0])
+def test_what_is_asked_for_again_is_no_more_than_the_default_stiffness_gives(arm, stiffness, soft):
+    """Whatever the stiffness: the safety filter has been passed by then."""
+    spring = FrankaSpring(FRANKY, arm, stiffness)
+    for _ in range(4):
+        spring.follow(STEP, soft)
+    spring.release()
+    q_rad, speed_rad_s = arm.moved.references[-1]
+    friction_rad = 1.2 / (2.5 * stiffness * (SOFT if soft else 1.0))
+    np.testing.assert_allclose(q_rad - STEP / 2, min(friction_rad, 3.6e-3), rtol=1e-9)
+    np.testing.assert_allclose(speed_rad_s - STEP / 0.1, min(10 * friction_rad, 0.036), rtol=1e-9)
+
+
 def test_a_soft_arm_that_touches_something_makes_no_step_that_heeds_it(spring, arm):
     arm.touches = 1.0
     told = len(arm.moved.references)

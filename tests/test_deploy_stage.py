@@ -270,11 +270,12 @@ def test_a_trial_that_cannot_be_tried_costs_none_that_ran_beside_it(tmp_path):
 
 
 def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):
-    ran = []
+    ran, how = [], []
     real = stage.run_trials
 
     def counted(config, policy_path, trials, workers):
         ran.append([(t.index, t.realtime) for t in trials])
+        how.append((config.world.episode_steps, workers))
         for count, outcome in enumerate(real(config, policy_path, trials, workers)):
             yield outcome
             if len(ran) == 1 and count == 1:
@@ -292,6 +293,8 @@ def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):
     assert len(done) == 2 and not artifacts.is_finished(run_dir / "deploy")
     artifact = run_stage(run_dir, resume=True)
     assert {*ran[1], *ran[2]} == {(0, False), (1, False), (2, False), (0, True)} - done
+    # 12 s on the simulated clock; on the real one as long as an episode, with the machine to itself.
+    assert how[1:] == [(120, CONFIG.deploy.workers), (CONFIG.world.episode_steps, 1)]
     values = artifact.manifest.metrics
     assert values["student_rig"]["success"]["n"] == 3
     assert values["latency_ms"]["p50"] > 0 and values["jitter_ms"]["p50"] is not None

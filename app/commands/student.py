@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config
-from app.commands.checks import check_objects, check_tried
+from app.commands.checks import check_folder, check_objects, check_tried
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Camera, Config, Robot
 from ddgrasp.config.checks import Count, Range, Seed
@@ -141,6 +141,7 @@ class Deploy:
             dry_run=self.dry_run, yes=self.yes, host=self.host, out=self.out, calibration=self.calibration,
         )  # fmt: skip
         _check_policy(self.policy)
+        check_folder("--out", self.out)
         report = deploy(self.config, self.policy, options)
         print(describe(report))
         if report.fault:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from app.lerobot.episode import Episode, Source
-from app.lerobot.steps import ACTION_KEY, COLOUR, DEPTH, DONE, POSE, STATE_KEY, SUCCESS, Storage
+from app.lerobot.steps import ACTION_KEY, BY_POLICY, COLOUR, DEPTH, DONE, POSE, STATE_KEY, SUCCESS, Storage
 from ddgrasp import contract
 
 _HEADER = """---
@@ -32,6 +32,8 @@ _ROWS = {
     DEPTH: "planar depth (along the camera's axis) in millimetres; 0 where the camera has none",
     COLOUR: "colour of the same moment and view",
     POSE: "the camera's pose: position in metres, axes as in OpenCV, in the frame of the robot's base",
+    BY_POLICY: "true in a step whose `action` is the policy's: not where the loop's rules acted or the loop "
+    "held the arm, and not where nobody noted who acted",
     DONE: "true in an episode's last step",
     SUCCESS: "true in the last step of an episode whose object was lifted and held",
 }
@@ -62,6 +64,10 @@ class Contents:
     """Whether each episode succeeded."""
     held: int = 0
     """Steps in which the control loop held the arm."""
+    retried: int = 0
+    """Steps in which its rules acted instead of the policy."""
+    unnoted: int = 0
+    """Steps of which nobody noted which of the two acted."""
     missed: int = 0
     """Control periods without a step."""
     farther: int = 0
@@ -79,6 +85,10 @@ class Contents:
         self.steps += len(episode.state)
         self.outcomes.append(episode.success)
         self.held += int(episode.held.sum())
+        if episode.by is not None:
+            who = zip(episode.by, episode.held, strict=True)
+            self.unnoted += sum(not by and not held for by, held in who)
+            self.retried += sum(by == "retry" for by in episode.by)
         self.missed += episode.missed
         self.farther += farther
         self.objects[episode.object_name] = self.objects.get(episode.object_name, 0) + 1
@@ -106,6 +116,16 @@ def render(
     about += [
         f"* **Episodes**: {sum(contents.outcomes)} of {contents.episodes} succeeded. By object: {objects}."
     ]
+    if contents.retried:
+        about += [
+            f"* **Trying again**: in {contents.retried} steps the control loop's rules acted; their `action` "
+            "is not the policy's."
+        ]
+    if contents.unnoted:
+        about += [
+            f"* **Not noted**: {contents.unnoted} steps do not say whether policy or rules acted; they were "
+            "made before that was noted."
+        ]
     if contents.held:
         about += [
             f"* **Held**: in {contents.held} steps the control loop held the arm; their `action` is no joint "

@@ -168,4 +168,5 @@ def _described(episode: Episode, storage: Storage) -> Features:
     depth_mm, rgb = next(iter(episode.pictures()))
     rows, columns = depth_mm.shape
     colour = None if rgb is None else (rgb.shape[0], rgb.shape[1])
-    return features((rows, columns), colour, episode.T_world_cam is not None, storage)
+    pose, by = episode.T_world_cam is not None, episode.by is not None
+    return features((rows, columns), colour, pose, storage, by)

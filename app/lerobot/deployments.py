@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from app.lerobot.episode import Episode, Picture, Source
+from app.lerobot.steps import BY_POLICY
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION, STATE
@@ -45,9 +46,10 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
     about = {
         "Robot": f"Franka arm; driver or rig: {_each(taken, 'robot')}.",
         "Camera": f"{_each(taken, 'camera')}, across the table; its depth is raw, with its holes and noise.",
-        "How it was made": f"A depth-only policy ({_each(taken, 'policy')}) moved the arm. `action` is what "
-        "it asked for, before the safety filter, or what a slow arm lacked of that. Success is what the rig "
-        "knows or a person answered.",
+        "How it was made": f"A depth-only policy ({_each(taken, 'policy')}) moved the arm, and at times the "
+        "control loop's rules for trying again in its place (deploy/retry.py). `action` is what either asked "
+        f"for, before the safety filter, or what a slow arm lacked of that; `{BY_POLICY}` says where it is "
+        "the policy's. Success is what the rig knows or a person answered.",
     }
     return Source("deployments", "franka", about, episodes, left_out)
 
@@ -96,6 +98,7 @@ def _read(deployment: Deployment, recording: Recording) -> Episode:
         action=actions(rows),
         pictures=pictures,
         held=np.array([row["action"] is None for row in rows]),
+        by=[row.get("by") or "" for row in rows],  # steps of before 2026-11-28 have none
         missed=int(deployment.report.get("missed_deadlines", 0)),
     )
 

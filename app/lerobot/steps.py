@@ -13,8 +13,8 @@ CAMERA = "front"
 COLOUR, DEPTH = f"observation.images.{CAMERA}", f"observation.images.{CAMERA}_depth"
 STATE_KEY, ACTION_KEY = "observation.state", "action"
 DONE, SUCCESS = "next.done", "next.success"
-POSE = "camera.T_world_cam"
-"""No `observation` in front: that would make it an input of LeRobot's policies."""
+BY_POLICY, POSE = "by_policy", "camera.T_world_cam"
+"""No `observation` in front, nor `action`: that would make them inputs or outputs of LeRobot's policies."""
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 STATE_NAMES = [*(f"{joint}.pos" for joint in JOINTS), "gripper.width"]
 ACTION_NAMES = [*(f"{joint}.delta" for joint in JOINTS), "gripper.close"]
@@ -24,7 +24,7 @@ Features = dict[str, dict[str, Any]]
 
 
 def features(
-    depth: tuple[int, int], colour: tuple[int, int] | None, pose: bool, storage: Storage
+    depth: tuple[int, int], colour: tuple[int, int] | None, pose: bool, storage: Storage, by: bool = False
 ) -> Features:
     """Key -> type, shape and names, as `LeRobotDataset.create` takes them.
 
@@ -33,6 +33,7 @@ def features(
       colour: rows and columns; None without colour.
       pose: whether the camera's pose is known.
       storage: pictures as videos, or an image file for every step.
+      by: whether a loop drove, in which not every action is the policy's.
     """
     picture = {"dtype": "video" if storage == "video" else "image", "names": ["height", "width", "channels"]}
     flag = {"dtype": "bool", "shape": (1,), "names": None}
@@ -45,6 +46,8 @@ def features(
         made[COLOUR] = {**picture, "shape": (*colour, 3), "info": {"is_depth_map": False}}
     if pose:
         made[POSE] = {"dtype": "float32", "shape": (4, 4), "names": None}
+    if by:
+        made[BY_POLICY] = dict(flag)
     return {**made, DONE: flag, SUCCESS: dict(flag)}
 
 
@@ -63,6 +66,8 @@ def frames(episode: Episode, task: str) -> Iterator[dict[str, Any]]:
         }
         if rgb is not None:
             frame[COLOUR] = rgb
+        if episode.by is not None:
+            frame[BY_POLICY] = np.array([episode.by[step] == "policy"])
         if episode.T_world_cam is not None:
             frame[POSE] = episode.T_world_cam
         yield frame

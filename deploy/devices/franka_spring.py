@@ -27,6 +27,9 @@ to the stiffness, and at the hand the more the nearer it is to the base, with th
 FRICTION_NM = 1.2 * WEIGHTS
 """At most this is added to a joint that does not make its steps. The first four joints of an FR3 stick with
 1.1 N m (franky-sim's model of it), with which a soft arm makes 0.45 of steps of 0.007 rad."""
+MOST_OWED_RAD = FRICTION_NM / (400.0 * WEIGHTS * SOFT * (1.0 + DAMPING_S / contract.CONTROL_DT_S))
+"""(7,) at most this, 3.6 mrad at 0.036 rad/s, is added whatever the stiffness: what `FRICTION_NM` comes to
+on a soft arm of the default one. It is added to what the safety filter let pass."""
 LATE = 1.5
 """Control periods for which a joint keeps its speed if no command follows; then it brakes."""
 _LOOK_S = 0.01
@@ -76,8 +79,8 @@ class FrankaSpring:
 
         `soft`: with `SOFT` of the strength; `heeds`: gives way to what it touches, short of stopping itself.
         At the step's speed, about its middle: over the period the spring's pull is zero on average. What
-        joints lacked of the steps before, within `FRICTION_NM`, is added. A soft arm that touches something
-        already makes no step that heeds it: it would press with the step's pull on top.
+        joints lacked of the steps before, within `FRICTION_NM` and `MOST_OWED_RAD`, is added. A soft arm that
+        touches something already makes no step that heeds it: it would press with the step's pull on top.
         """
         state = self._arm.state
         q_rad = np.asarray(state.q)
@@ -148,7 +151,7 @@ class FrankaSpring:
         """(7,) what is left of the steps before the joints at `q_rad`; nothing of it against `step`."""
         if self._target_rad is not None:
             pull_nm_rad = self._strength() * (1.0 + DAMPING_S / contract.CONTROL_DT_S)
-            most = FRICTION_NM / pull_nm_rad
+            most = np.minimum(FRICTION_NM / pull_nm_rad, MOST_OWED_RAD)
             self._owed_rad = np.clip(self._owed_rad + self._target_rad - q_rad, -most, most)
         self._owed_rad = np.where(self._owed_rad * step > 0.0, self._owed_rad, 0.0)
         return self._owed_rad
