@@ -9,7 +9,7 @@ from ddgrasp.files import atomic_write_json, read_json
 from evaluation import wilson
 
 BACKENDS_FILE = "backends.json"
-_KEPT = ("success", "objects", "saturated_actions")
+_KEPT = ("success", "objects", "saturated_actions", "contacts_dropped")
 
 
 def save(directory: Path, results: Mapping[str, Mapping[str, Any]], seed: int) -> Path:
@@ -37,7 +37,7 @@ def load(directory: Path) -> list[dict[str, Any]]:
 
 def table(directory: Path, trained_on: str) -> list[dict[str, Any]]:
     """For the report: backend, success, drop in points from the backend trained on (None if that one was
-    not measured), and the success of each object."""
+    not measured), contacts dropped (None if they were not kept), and the success of each object."""
     rows = {row["backend"]: row for row in load(directory)}
     rates = {name: _success(row["success"]) for name, row in rows.items()}
     home = rates.get(trained_on)
@@ -46,6 +46,7 @@ def table(directory: Path, trained_on: str) -> list[dict[str, Any]]:
             "backend": name + (" (trained on)" if name == trained_on else ""),
             "success": rates[name],
             "drop_points": None if home is None else 100 * (home["rate"] - rates[name]["rate"]),
+            "contacts_dropped": row.get("contacts_dropped"),
             **{key: _success(counts) for key, counts in row["objects"].items()},
         }
         for name, row in rows.items()

@@ -38,7 +38,7 @@ class DepthNetwork:
     max_depth_m: float = 0.0
     """0: relative inverse depth. Otherwise the image network's metric variant: metres, up to this."""
     dtype: str = "float32"
-    """Arithmetic: float32, or bfloat16 (parameters stay float32; its error is in the README)."""
+    """Arithmetic: float32, or bfloat16 (parameters stay float32; its error is in docs/networks.md)."""
     frames_at_once: int = 8
     """Frames that the encoder and the finest layers work on together: bounds memory, changes no result."""
 

@@ -106,8 +106,6 @@ def load_pools(config: DepthFeatureConfig, work: Path, progress: Progress) -> tu
             task.advance()
     pools = [_read(file) for file in files]
     tested = max(1, round(config.devices * TEST_SHARE))
-    if tested >= len(pools):
-        raise UserError(f"features.devices is {config.devices}; expected at least 2: one is for testing.")
     return _joined(pools[:-tested]), _joined(pools[-tested:])
 
 

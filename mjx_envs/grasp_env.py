@@ -29,7 +29,7 @@ TOUCH_N = 0.3
 """Pad force from which a pad counts as touching the object."""
 LIFTED_M = 0.03
 OUT_OF_REACH_M = 0.35
-"""An object that rolled this far from the workspace's centre ends the episode."""
+"""An object that rolled this far from the workspace's centre, horizontally, ends the episode."""
 
 
 @struct.dataclass
@@ -100,6 +100,7 @@ class GraspEnv(MjxEnv):
         if self.config.random.held_share > 0:
             grasp = self._grasp_pose(qpos, variant, branch)
             half_width = jnp.asarray(self.table.half_width, jnp.float32)[variant] * size
+            # k_held is split(k_start, 3)[1], a pregrasp's key too; it stays so until teachers are retrained.
             k_held, share = jax.random.fold_in(k_start, 1), exploring * self.config.random.held_share
             qpos = randomize.maybe_held(k_held, share, qpos, *grasp, half_width)
         state = physics.initial_state(qpos)
@@ -169,10 +170,10 @@ class GraspEnv(MjxEnv):
             total_reward=episode.total_reward + reward, latency=latency,
         )  # fmt: skip
         metrics = {f"reward/{name}": value for name, value in terms.items()}
-        metrics["success"] = (over & (hold_count >= contract.HOLD_STEPS)).astype(jnp.float32)
+        metrics["success"] = (over & ~lost & (hold_count >= contract.HOLD_STEPS)).astype(jnp.float32)
         metrics |= {"return": episode.total_reward, "length": steps.astype(jnp.float32)}
         metrics["contacts_dropped"] = new.dropped.astype(jnp.float32)
-        metrics["saturated"] = jnp.mean(jnp.abs(action[ACTION.arm]) > 0.95)
+        metrics["saturated"] = jnp.mean(jnp.abs(action[ACTION.arm]) > grasp_math.SATURATED)
         info = state.info | {"episode": episode, "truncation": (over & ~lost).astype(jnp.float32)}
         return replace(
             state,

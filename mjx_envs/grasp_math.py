@@ -15,6 +15,8 @@ HAND_DOWN = (0.0, 1.0, 0.0, 0.0)
 """Hand orientation with the fingers down and opening along world y."""
 MIN_GRIP_HEIGHT_M = 0.02
 """The pads reach 12 mm beyond the grip site: keep them off the table."""
+SATURATED = 0.95
+"""An action component beyond this share of its range counts as saturated."""
 
 NO_OFFSET_M = (0.0, 0.0, 0.0)
 

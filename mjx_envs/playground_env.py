@@ -48,8 +48,7 @@ def world_config(config: config_dict.ConfigDict) -> WorldConfig:
     values: dict[str, Any] = config.to_dict()
     if (ctrl_dt := values.pop("ctrl_dt", contract.CONTROL_DT_S)) != contract.CONTROL_DT_S:
         raise UserError(f"ctrl_dt is {ctrl_dt!r}; expected {contract.CONTROL_DT_S:g}: the task has 10 Hz.")
-    ours = {theirs: name for name, theirs in _PLAYGROUND_NAMES.items()}
-    values = {ours.get(name, name): value for name, value in values.items()}
+    values = _in_our_names(values)
     for name, section in (("reward", RewardConfig), ("random", RandomConfig)):
         values[name] = section(**_known(section, values.get(name, {})))
     return WorldConfig(**_known(WorldConfig, values))
@@ -127,6 +126,15 @@ def _data(model: mujoco.MjModel, state: State) -> mujoco.MjData:
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = np.asarray(state.data.qpos), np.asarray(state.data.qvel)
     return data
+
+
+def _in_our_names(values: Mapping[str, Any]) -> dict[str, Any]:
+    """`values` under `WorldConfig`'s names; UserError for one of those that Playground calls otherwise."""
+    for name in values:
+        if theirs := _PLAYGROUND_NAMES.get(name):
+            raise UserError(f"setting {name!r} has Playground's name here: write {theirs!r}.")
+    ours = {theirs: name for name, theirs in _PLAYGROUND_NAMES.items()}
+    return {ours.get(name, name): value for name, value in values.items()}
 
 
 def _known(section: type, values: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -9,11 +9,10 @@ from jaxtyping import Bool, Float
 
 from ddgrasp import contract
 from ddgrasp.layout import ACTION, closes
+from mjx_envs.grasp_math import SATURATED
 
 JERK_LIMIT_RAD_S3 = (7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0)
 """Joint jerk limits: Franka's interface specification."""
-SATURATED = 0.95
-"""An action component beyond this share of its range counts as saturated."""
 
 
 def motion_metrics(
@@ -29,7 +28,7 @@ def motion_metrics(
       running: (T, N) bool, whether the episode was still going on in it.
 
     Returns:
-      saturated_actions: share of the joint actions beyond SATURATED.
+      saturated_actions: share of the joint actions beyond `mjx_envs.grasp_math.SATURATED`.
       acceleration_p99, acceleration_max, jerk_p99, jerk_max: of the joint nearest its limit, relative to
         that limit; 99th percentile and maximum over steps.
       gripper_toggles: changes between open and close per episode; a grasp at first try is one.

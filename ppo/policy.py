@@ -15,7 +15,6 @@ from ddgrasp.shipped import holding
 from learning.params import load_params, save_params
 
 PARAMS_FILE = "policy.msgpack"
-ACTIVATION = "elu"
 _STD_MIN = 1e-6
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -55,15 +55,17 @@ def _train(
         best.offer(_evaluate(test_env, state, config, 0, progress), state)
     with progress.task("PPO", total) as task:
         task.start_at(int(state.iteration))
-        clock = _Clock(teacher.num_envs * teacher.unroll_steps)
+        control_steps = teacher.num_envs * teacher.unroll_steps
+        clock, lost = _Clock(control_steps), _Lost(control_steps)
         for i in range(int(state.iteration) + 1, total + 1):
             if int(state.good_evaluations) >= 2:  # before any work: a checkpoint may hold this already
                 progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
                 break
             state, metrics, watched = iterate(state)
             health.check(i, watched, saved.latest, directory)
+            lost.add(metrics)
             if i % LOG_EVERY == 0 or i == total:
-                _log(i, metrics | clock.rate(i), teacher.num_envs * teacher.unroll_steps, progress, task)
+                _log(i, metrics | clock.rate(i) | lost.told(progress), progress, task)
             task.advance()
             if i % teacher.eval_every == 0 or i == total:
                 rate = _evaluate(test_env, state, config, i, progress)
@@ -71,6 +73,7 @@ def _train(
                 state = learner.with_evaluation(state, rate >= teacher.stop_at)
             if i % teacher.checkpoint_every == 0 or i == total:
                 saved.save(i, state)
+    lost.told(progress)
     return state
 
 
@@ -182,6 +185,27 @@ class _Clock:
         return {"steps_per_s": (now[0] - before[0]) * self._steps / max(now[1] - before[1], 1e-9)}
 
 
+class _Lost:
+    """Contacts that physics could not hold since they were told last."""
+
+    def __init__(self, steps_per_iteration: int):
+        self._per_iteration = steps_per_iteration
+        self._contacts, self._steps = 0.0, 0
+
+    def add(self, metrics: Mapping[str, jax.Array]) -> None:
+        """Counts those of an iteration."""
+        self._contacts += float(metrics["contacts_dropped"])
+        self._steps += self._per_iteration
+
+    def told(self, progress: Progress) -> dict[str, float]:
+        """{"contacts_dropped": their number}, after a warning if there are any."""
+        if warning := dropped_warning(self._contacts, self._steps):
+            progress.note(warning)
+        told = {"contacts_dropped": self._contacts}
+        self._contacts, self._steps = 0.0, 0
+        return told
+
+
 def training_world(config: Config) -> WorldConfig:
     """The world with the exploring starts that only training has."""
     teacher = config.teacher
@@ -213,10 +237,8 @@ def _start(config: Config, env: AutoReset, saved: Checkpoints, progress: Progres
     return state
 
 
-def _log(i: int, metrics, control_steps: int, progress: Progress, task) -> None:
+def _log(i: int, metrics, progress: Progress, task) -> None:
     values = {name: float(value) for name, value in metrics.items()}
-    if warning := dropped_warning(values["contacts_dropped"], control_steps):
-        progress.note(warning)
     progress.scalars(i, **values)
     task.advance(0, success=values["success"])
 

@@ -36,6 +36,8 @@ class Trials:
     velocity_rad_s: Float[np.ndarray, "T N 7"]
     """Velocities of the joints at the end of each step."""
     success: Bool[np.ndarray, " N"]
+    dropped: int
+    """Contacts that the physics backend could not hold, of all episodes."""
 
 
 def episode_keys(env: GraspEnv, per_object: int, seed: int) -> UInt32[np.ndarray, "objects per_object 2"]:
@@ -62,6 +64,7 @@ def record(env: GraspEnv, policy: TeacherPolicy, keys: UInt32[np.ndarray, "N 2"]
         action=kept["action"],
         velocity_rad_s=kept["velocity_rad_s"],
         success=seen.success,
+        dropped=seen.dropped,
     )
 
 
@@ -83,9 +86,13 @@ def measure(
 
     Returns:
       What `ppo.evaluate.evaluate` returns, its motion rows with `visible_object_pixels_mean` and `_min`
-      (pixels of the object in the student's crop, over all steps before the first contact) added; and
-      (5, H, W, 3) uint8 pictures per object of one episode at `ppo.visible.MOMENTS`.
+      (pixels of the object in the student's crop, over all steps before the first contact) and the
+      `contacts_dropped` of their episodes added; and (5, H, W, 3) uint8 pictures per object of one episode at
+      `ppo.visible.MOMENTS`.
+
+    Raises UserError for a renderer that cannot run here, before any episode.
     """
+    watcher = Watcher(env)
     recorded: list[Trials] = []
     keys = episode_keys(env, trials, seed)
     with progress.task("episodes", keys[..., 0].size) as task:
@@ -93,7 +100,7 @@ def measure(
             recorded.append(record(env, policy, some))
             task.advance(trials)
     watch = [_first(some, min(watched, trials)) for some in recorded]
-    watcher, pixels, pictures = Watcher(env), [], {}
+    pixels, pictures = [], {}
     for i, some in enumerate(progress.track(watch, "pictures")):
         before = some.running & ~some.touched
         pixels.append(watcher.visible_pixels(some.qpos, some.params, i, before, seed))
@@ -107,6 +114,7 @@ def measure(
         "objects": counts,
         "saturated_actions": rows[-1]["saturated_actions"],
         "motion": rows,
+        "contacts_dropped": rows[-1]["contacts_dropped"],
     }
     return result, pictures
 
@@ -120,11 +128,12 @@ def _story(watcher: Watcher, watched: Trials, index: int) -> np.ndarray:
 
 
 def _first(trials: Trials, count: int) -> Trials:
-    """The first `count` episodes."""
+    """The first `count` episodes; contacts dropped stay those of all."""
     per_step = ("qpos", "touched", "running", "action", "velocity_rad_s")
     return Trials(
         params=jax.tree.map(lambda leaf: leaf[:count], trials.params),
         success=trials.success[:count],
+        dropped=trials.dropped,
         **{name: getattr(trials, name)[:, :count] for name in per_step},
     )
 
@@ -136,7 +145,9 @@ def _row(name: str, recorded: Sequence[Trials], pixels: Sequence[np.ndarray]) ->
     seen = np.concatenate(pixels)
     motion = motion_metrics(joined("velocity_rad_s"), joined("action"), joined("running"))
     visible = {"mean": float(seen.mean()), "min": int(seen.min())}
-    return {"object": name} | motion | {f"visible_object_pixels_{k}": v for k, v in visible.items()}
+    pixels_by_name = {f"visible_object_pixels_{k}": v for k, v in visible.items()}
+    dropped = sum(some.dropped for some in recorded)
+    return {"object": name} | motion | pixels_by_name | {"contacts_dropped": dropped}
 
 
 def _count(success: np.ndarray) -> dict[str, int]:

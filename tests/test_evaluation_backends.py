@@ -2,8 +2,10 @@
 
 import pytest
 
+from app.commands.teacher import TeacherCompare
 from ddgrasp import artifacts
 from ddgrasp.config import Config
+from ddgrasp.files import atomic_write_json, read_json
 from evaluation import backends
 from evaluation.report.run_page import render_html
 from evaluation.report.summary import build_report, summary_rows
@@ -15,12 +17,13 @@ def counts(successes, n):
     return {"successes": successes, "n": n}
 
 
-def result(successes, n):
+def result(successes, n, dropped=0):
     objects = {
         "cube": counts(successes // 2, n // 2),
         "apple": counts(successes - successes // 2, n - n // 2),
     }
-    return {"success": counts(successes, n), "objects": objects, "saturated_actions": 0.1, "motion": []}
+    motion = {"saturated_actions": 0.1, "motion": []}
+    return {"success": counts(successes, n), "objects": objects, "contacts_dropped": dropped} | motion
 
 
 @pytest.fixture
@@ -50,6 +53,27 @@ def test_backends_add_up_until_the_teacher_is_made_anew(teacher):
     assert backends.table(teacher, "cpu")[0]["drop_points"] == pytest.approx(20.0)
     artifacts.finish(teacher, "teacher", CONFIG, seconds=2, metrics={}, origin="trained")
     assert backends.load(teacher) == []
+
+
+def test_contacts_dropped_are_kept_and_shown_and_were_not_always(teacher):
+    path = backends.save(teacher, {"jax": result(40, 50, dropped=313), "cpu": result(50, 50)}, seed=0)
+    assert [row["contacts_dropped"] for row in backends.table(teacher, "cpu")] == [313, 0]
+    page = render_html(build_report(teacher.parent), teacher.parent)
+    assert "contacts_dropped" in page and "313" in page
+    saved = read_json(path)
+    del saved["backends"][0]["contacts_dropped"]
+    atomic_write_json(path, saved)
+    assert [row["contacts_dropped"] for row in backends.table(teacher, "cpu")] == [None, 0]
+
+
+def test_the_command_says_how_many_contacts_were_dropped(teacher, monkeypatch, capsys):
+    monkeypatch.setattr("ppo.policy.load_policy", lambda directory: None)
+    measured = [("cpu", result(96, 100)), ("jax", result(45, 50, dropped=1313))]
+    monkeypatch.setattr("ppo.backends.evaluate_backends", lambda *_: iter(measured))
+    TeacherCompare(teacher.parent).run()
+    cpu, jax, _ = capsys.readouterr().out.splitlines()
+    assert cpu == "cpu    96.0 % of 100 (90.2 to 98.4), 0 contacts dropped"
+    assert jax == "jax    90.0 % of 50 (78.6 to 95.7), 1,313 contacts dropped"
 
 
 def test_the_report_shows_them(teacher):

@@ -1,6 +1,7 @@
 """The frozen depth features, and the command that trains such an extractor, at a size that takes seconds."""
 
 import shutil
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -109,6 +110,13 @@ def test_training_freezes_an_extractor_that_loads(tmp_path):
     assert extractor(scene()).shape == (1, depth_features.FEATURES)
     with pytest.raises(UserError, match="finished extractor"):
         training.train(TINY, tmp_path / "made", quiet=True)
+
+
+def test_training_begun_with_other_settings_is_refused(tmp_path):
+    training._check_begun(TINY, tmp_path / training.WORK)
+    training._check_begun(TINY, tmp_path / training.WORK)
+    with pytest.raises(UserError, match="begun with other settings: use those, another --out, or delete it"):
+        training.train(replace(TINY, width_px=48), tmp_path, quiet=True)
 
 
 class Interrupting(Progress):

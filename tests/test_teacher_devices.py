@@ -138,7 +138,10 @@ def test_minibatches_must_be_whole_on_every_device():
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        ({"coordinator": "host"}, "hosts.coordinator is 'host'; expected host:port, or auto"),
+        ({"coordinator": "host"}, "coordinator is 'host'; expected host:port with a port of 1 to 65535, or"),
+        ({"coordinator": "localhost:99999"}, "coordinator is 'localhost:99999'; expected host:port"),
+        ({"coordinator": "localhost:0"}, "coordinator is 'localhost:0'; expected host:port"),
+        ({"coordinator": "localhost:²"}, "coordinator is 'localhost:²'; expected host:port"),
         ({"processes": 2}, "hosts.processes is 2, hosts.process 0, hosts.coordinator '': give the address"),
         ({"coordinator": "a:1", "processes": 0}, "hosts.processes is 0; expected at least 1"),
         ({"coordinator": "a:1", "processes": 2, "process": 2}, "hosts.process is 2; expected 0 to 1"),

@@ -206,21 +206,128 @@ def test_a_step_size_below_the_least_is_not_raised_by_a_large_divergence(kl):
     assert rate == pytest.approx(2e-5 if kl > 0.02 else 3e-5)
 
 
+SETTLING = dataclasses.replace(TEACHER, start="guide", settle_from=0.5, target_kl=4.0, learning_rate=2e-4)
+"""Of its four iterations the first two explore, the last settles wholly."""
+
+
+class _Asked(AutoReset):
+    """No environments: keeps what share of exploring starts `refresh` is asked for."""
+
+    def __init__(self):
+        self.exploring: list[float] = []
+
+    def refresh(self, state, exploring=1.0):
+        self.exploring.append(float(exploring))
+        return state
+
+
+def test_episodes_start_as_the_worlds_do_once_training_settles():
+    env, state = _Asked(), learner_without_envs(SETTLING)
+    for iteration in range(SETTLING.iterations):
+        learner.refresh(SETTLING, env, replace(state, iteration=jnp.asarray(iteration)))
+    assert env.exploring == [1, 1, 0, 0]
+
+
+def _experience(config: TeacherConfig, state: learner.LearnerState) -> types.Transition:
+    """Eight stretches of four steps, made up, in which the policy of `state` acted."""
+    key, steps = state.key, jnp.ones((8, 4))
+    seen = jax.random.normal(key, (8, 4, 40))
+    policy = (state.normalizer, state.params.policy)
+    action, extras = ppo_networks.make_inference_fn(learner.make_networks(config))(policy)(seen, key)
+    return types.Transition(
+        observation=seen, action=action, reward=jax.random.normal(key, (8, 4)), discount=steps,
+        next_observation=seen,
+        extras={"policy_extras": extras, "state_extras": {"truncation": 0 * steps}},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def settled() -> dict[int, tuple[learner.LearnerState, learner.LearnerState, float]]:
+    """Iteration -> learner before and after it, divergence: of a policy that moved as far as `target_kl`."""
+    state = learner_without_envs(SETTLING)
+    data = _experience(SETTLING, state)
+    layers = state.params.policy["params"]
+    last = layers["hidden_1"]
+    means = last["bias"].at[:8].add(SETTLING.action_std)  # each by about its deviation: 8 x 1 / 2 nats
+    policy = {"params": layers | {"hidden_1": last | {"bias": means}}}
+    moved = learner.with_policy(state, policy, state.normalizer)
+    improve = jax.jit(lambda state: learner.improve(SETTLING, devices.make_mesh(), state, data, {})[:2])
+    made = {}
+    for iteration in (0, SETTLING.iterations - 1):
+        before = replace(moved, iteration=jnp.asarray(iteration))
+        after, metrics = improve(before)
+        made[iteration] = before, after, float(metrics["policy/kl"])
+    return made
+
+
+def test_settling_wants_a_tenth_of_the_divergence_and_allows_a_tenth_of_the_least_step_size(settled):
+    for iteration, rate in ((0, 2e-4), (SETTLING.iterations - 1, 2e-4 / 1.5**2)):  # two minibatches
+        _, after, divergence = settled[iteration]
+        assert 0.5 < divergence / SETTLING.target_kl < 2  # alone no reason to change anything
+        assert float(optax.tree_utils.tree_get(after.opt_state, "learning_rate")) == pytest.approx(rate)
+
+
+def test_a_policy_that_acts_already_keeps_its_normaliser(settled):
+    before, after, _ = settled[0]
+    for name in ("mean", "std"):
+        kept, now = (getattr(state.normalizer, name) for state in (before, after))
+        np.testing.assert_array_equal(kept, now)
+
+
+def test_exploring_starts_reach_training_alone(tmp_path, monkeypatch):
+    shares = {"pregrasp_share": 0.5, "pregrasp_turn_rad": 1.0, "held_share": 0.25}
+    config = dataclasses.replace(CONFIG, teacher=dataclasses.replace(TEACHER, **shares))
+    worlds = {}
+
+    def compiled(_, env):
+        worlds["training"] = env.env.config
+        return lambda state: pytest.fail("nothing is left to do")
+
+    def evaluated(env, *_):
+        worlds["evaluation"] = env.config
+        return 1.0
+
+    done = replace(learner_without_envs(TEACHER), good_evaluations=jnp.asarray(2))
+    monkeypatch.setattr(ppo_train, "compile_iteration", compiled)
+    monkeypatch.setattr(ppo_train, "_start", lambda *_: done)
+    monkeypatch.setattr(ppo_train, "_evaluate", evaluated)
+    ppo_train.train(config, tmp_path, Progress(quiet=True))
+    random = dataclasses.replace(CONFIG.world.random, **shares)
+    assert worlds == {
+        "training": dataclasses.replace(CONFIG.world, random=random), "evaluation": CONFIG.world,
+    }  # fmt: skip
+
+
+def test_contacts_that_were_dropped_are_told_of_every_iteration(tmp_path, monkeypatch):
+    """At the fifth, and after the seventh, which an evaluation makes the last of more."""
+    teacher = dataclasses.replace(TEACHER, total_steps=20 * 8 * 4, eval_every=6, stop_at=0.9)
+    dropped, said = iter([3, 0, 4, 0, 0, 1, 5]), []
+
+    def iterate(state):
+        curves = {"success": jnp.zeros(()), "contacts_dropped": jnp.float32(next(dropped))}
+        good = jnp.asarray(2 if state.iteration == 6 else 0)
+        return replace(state, iteration=state.iteration + 1, good_evaluations=good), curves, {}
+
+    monkeypatch.setattr(ppo_train, "_start", lambda *_: learner_without_envs(teacher))
+    monkeypatch.setattr(ppo_train, "compile_iteration", lambda *_: iterate)
+    monkeypatch.setattr(ppo_train, "_evaluate", lambda *_: 0.0)
+    progress = Progress(tmp_path, quiet=True)
+    monkeypatch.setattr(progress, "note", said.append)
+    with Checkpoints(tmp_path / "checkpoints") as saved:
+        config = dataclasses.replace(CONFIG, teacher=teacher)
+        ppo_train._train(config, tmp_path, object.__new__(AutoReset), saved, progress)
+    told = [note for note in said if "contacts" in note]
+    assert len(told) == 2
+    assert "7 contacts in 160 control steps" in told[0] and "6 contacts in 64 control steps" in told[1]
+    assert read_curves(tmp_path)["contacts_dropped"] == [(5, 7.0)]
+
+
 def test_an_actor_that_does_not_learn_yet_keeps_its_optimiser():
     """While the critic warms up the policy stands still: its KL says nothing of its step size, and an Adam
     that counts the steps without gradients would take the first ones with them several times too large."""
     config = dataclasses.replace(TEACHER, target_kl=0.02, learning_rate=2e-5, critic_warmup=2)
     mesh, state = devices.make_mesh(), learner_without_envs(config)
-    key, networks = state.key, learner.make_networks(config)
-    seen = jax.random.normal(key, (8, 4, 40))
-    act = ppo_networks.make_inference_fn(networks)((state.normalizer, state.params.policy))
-    action, extras = act(seen, key)
-    steps = jnp.ones((8, 4))
-    data = types.Transition(
-        observation=seen, action=action, reward=jax.random.normal(key, (8, 4)), discount=steps,
-        next_observation=seen,
-        extras={"policy_extras": extras, "state_extras": {"truncation": 0 * steps}},
-    )  # fmt: skip
+    data = _experience(config, state)
     improve = jax.jit(lambda state: learner.improve(config, mesh, state, data, {})[:2])
     rates = []
     for _ in range(3):
@@ -230,3 +337,4 @@ def test_an_actor_that_does_not_learn_yet_keeps_its_optimiser():
     actor, critic = (state.opt_state.inner_states[name] for name in ("policy", "value"))
     steps = [{int(count) for _, count in tree_get_all_with_path(part, "count")} for part in (actor, critic)]
     assert steps == [{2}, {6}]
+    assert int(state.normalizer.count) == 3 * 8 * 4  # from nothing, what was seen counts

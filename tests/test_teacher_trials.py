@@ -12,6 +12,7 @@ import pytest
 from app import cli
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Config, PictureConfig, StudentConfig, WorldConfig
+from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from evaluation import teacher_trials
 from evaluation.report.run_page import render_html
@@ -23,6 +24,7 @@ from mjx_envs.objects import get_object
 from mjx_envs.render import raycast_numpy
 from ppo import policy as teacher_policy
 from ppo import trials
+from ppo.rollout import roll_out
 from ppo.visible import MOMENTS, Watcher, moments
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained" / "teacher"
@@ -36,8 +38,11 @@ def env() -> GraspEnv:
 
 @pytest.fixture(scope="module")
 def measured(env):
-    policy = teacher_policy.load(PRETRAINED)
-    return trials.measure(env, policy, trials=4, watched=2, seed=3, progress=Progress(quiet=True))
+    """As if physics had left contacts out, three with the cubes and four with the lemons."""
+    policy, dropped = teacher_policy.load(PRETRAINED), iter([3, 4])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trials, "roll_out", lambda *given: replace(roll_out(*given), dropped=next(dropped)))
+        return trials.measure(env, policy, trials=4, watched=2, seed=3, progress=Progress(quiet=True))
 
 
 def test_keys_take_each_object_equally_often_and_reset_agrees(env):
@@ -58,9 +63,19 @@ def test_measure_counts_the_trials_of_every_object(measured):
     assert both[name] == min(cube[name], lemon[name])
     # 4 to 7 cm objects, 0.85 m away, at 80 pixels per unit of tangent: some 4 to 7 pixels a side
     assert 4 < both["visible_object_pixels_mean"] < 80
+    assert [row["contacts_dropped"] for row in result["motion"]] == [3, 4, 7]
+    assert result["contacts_dropped"] == 7
     assert pictures["cube"].shape == (len(MOMENTS), 300, 300, 3)
     assert pictures["cube"].dtype == np.uint8
     assert np.abs(pictures["cube"][0].astype(int) - pictures["cube"][2]).max() > 50  # the arm came into view
+
+
+@pytest.mark.skipif(any(d.platform == "gpu" for d in jax.devices()), reason="Warp's renderer runs here")
+def test_a_renderer_that_cannot_run_is_refused_before_any_episode(monkeypatch):
+    monkeypatch.setattr(trials, "record", lambda *_: pytest.fail("an episode began"))
+    policy, env = teacher_policy.load(PRETRAINED), GraspEnv(replace(WORLD, renderer="warp"))
+    with pytest.raises(UserError, match="renderer 'warp' needs "):
+        trials.measure(env, policy, trials=4, watched=2, seed=3, progress=Progress(quiet=True))
 
 
 def test_visible_pixels_are_those_of_the_numpy_ray_caster(env):
@@ -137,7 +152,7 @@ def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     assert [row["object"] for row in report["teacher"]["trials"]] == ["cube", "lemon", "all"]
     page = render_html(report, tmp_path)
     assert 'alt="episodes" src="data:image/png' in page
-    assert "visible_object_pixels_min" in page
+    assert "visible_object_pixels_min" in page and "contacts_dropped" in page
     elsewhere = {**summary["world"], "episode_steps": 25}
     for change in ({"teacher": "another"}, {"world": elsewhere}):
         teacher_trials.save(directory, summary | change, pictures, MOMENTS)

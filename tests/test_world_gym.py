@@ -13,7 +13,9 @@ from gymnasium.vector import AutoresetMode  # noqa: E402
 
 from ddgrasp.config import WorldConfig  # noqa: E402
 from ddgrasp.errors import UserError  # noqa: E402
+from mjx_envs.gym.env import PickEnv  # noqa: E402
 from mjx_envs.gym.spaces import action_space, check_shape  # noqa: E402
+from mjx_envs.gym.vector import PickVectorEnv  # noqa: E402
 from ppo import policy  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
@@ -98,7 +100,7 @@ def test_an_action_that_is_not_finite_ends_the_episode_where_it_stands():
     action = np.zeros(8, np.float32)
     action[3] = np.nan
     _, reward, terminated, truncated, _ = env.step(action)
-    assert np.isfinite(reward) and (terminated, truncated) == (True, False)
+    assert reward == 0 and (terminated, truncated) == (True, False)
     np.testing.assert_array_equal(np.asarray(env._scenes.state.data.qpos), before)
 
 
@@ -157,6 +159,9 @@ def test_the_depth_picture_is_the_window_of_the_cameras():
 def test_wrong_options_are_refused():
     with pytest.raises(UserError, match="observation 'dept'.*Did you mean 'depth'"):
         gymnasium.make(ID, observation="dept")
+    for environment in (PickEnv, PickVectorEnv):
+        with pytest.raises(UserError, match="render_mode 'human'.* Known: rgb_array"):
+            environment(render_mode="human")
     with pytest.raises(UserError, match="num_envs is 0"):
         gymnasium.make_vec(ID, num_envs=0)
     with pytest.raises(UserError, match="3 seeds"):

@@ -5,6 +5,7 @@ import os
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +87,11 @@ def test_the_poses_of_links_are_computed_once(all_optimizations):
     ours, theirs = _cpu_seconds(lambda: jax.block_until_ready(hands(start))), _cpu_seconds(c_engine)
     print(f"hands of {BATCH}: {ours * 1e3:.2f} ms, C engine {theirs * 1e3:.2f} ms")
     assert ours < SLOWER_THAN_C * theirs
+
+
+def test_the_guard_is_documented_as_it_is():
+    page = (Path(__file__).parents[1] / "docs" / "physics.md").read_text()
+    assert f"the bound is {SLOWER_THAN_C:g} times that" in page
 
 
 def test_poses_are_those_of_the_c_engine():

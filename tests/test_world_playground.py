@@ -59,6 +59,9 @@ def test_the_configuration_is_the_worlds_under_playgrounds_names():
     assert (env.observation_size, env.action_size, env.dt, env.n_substeps) == (40, 8, 0.1, 20)
     with pytest.raises(UserError, match="ctrl_dt is 0.02"):
         registry.load(playground_env.NAME, config_overrides={"ctrl_dt": 0.02})
+    for ours, theirs in playground_env._PLAYGROUND_NAMES.items():
+        with pytest.raises(UserError, match=f"'{ours}' has Playground's name here: write '{theirs}'"):
+            playground_env.PickEnv(config_overrides={ours: WorldConfig().__dict__[ours]})
     with config.unlocked():
         config.sim_dtt = 0.005
     with pytest.raises(UserError, match="'sim_dtt'. Did you mean 'sim_dt'"):

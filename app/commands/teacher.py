@@ -115,7 +115,8 @@ class TeacherCompare:
         policy = load_policy(directory)
         for name, result in evaluate_backends(config.world, policy, self.backends, self.trials, self.seed):
             success = wilson.success(result["success"]["successes"], result["success"]["n"])
-            print(f"{name:<6} {wilson.describe(success)}", flush=True)
+            dropped = f"{result['contacts_dropped']:,} contacts dropped"
+            print(f"{name:<6} {wilson.describe(success)}, {dropped}", flush=True)
             results[name] = result
             measured.save(directory, results, self.seed)
         print(f"{directory / measured.BACKENDS_FILE}: `ddgrasp report {self.run_dir}` shows it.")

@@ -135,8 +135,8 @@ class HostsConfig(Section, name="hosts"):
         """See `Section.check`."""
         named = self.coordinator not in ("", "auto")
         host, _, port = self.coordinator.rpartition(":")
-        if named and not (host and port.isdigit()):
-            raise self.error("coordinator", "host:port, or auto")
+        if named and not (host and port.isdecimal() and 0 < int(port) < 65536):
+            raise self.error("coordinator", "host:port with a port of 1 to 65535, or auto")
         if not named and (self.processes, self.process) != (1, 0):
             raise UserError(
                 f"hosts.processes is {self.processes}, hosts.process {self.process}, hosts.coordinator "

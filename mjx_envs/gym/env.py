@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from ddgrasp import contract
 from ddgrasp.config import WorldConfig
 from mjx_envs.gym.simulator import Scenes, draw_keys, simulator
-from mjx_envs.gym.spaces import action_space, check_shape
+from mjx_envs.gym.spaces import RENDER_MODES, action_space, check_render_mode, check_shape
 
 
 class PickEnv(gymnasium.Env):
@@ -22,11 +22,12 @@ class PickEnv(gymnasium.Env):
       render_mode: rgb_array, or None for no pictures.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": round(contract.CONTROL_HZ)}
+    metadata = {"render_modes": [*RENDER_MODES], "render_fps": round(contract.CONTROL_HZ)}
 
     def __init__(
         self, world: WorldConfig | None = None, observation: str = "state", render_mode: str | None = None
     ):
+        check_render_mode(render_mode)
         self._simulator = simulator(world or WorldConfig())
         self.observation_space, self._kind = self._simulator.space(observation), observation
         self.action_space = action_space()

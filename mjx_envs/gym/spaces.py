@@ -7,10 +7,12 @@ from gymnasium import spaces
 from jaxtyping import Float
 
 from ddgrasp import contract
+from ddgrasp.errors import unknown_name
 from ddgrasp.layout import OBSERVATION, STATE, Layout
 
 KINDS = ("state", "depth")
 """Observations: the teacher's (40,), or the student's depth picture and joints."""
+RENDER_MODES = ("rgb_array",)
 FAR_M = 2.0
 """Depth farther than this is no reading."""
 
@@ -29,6 +31,12 @@ def check_shape(action: Any, space: spaces.Space) -> None:
     gripper by a joint's number."""
     if np.shape(action) != space.shape:
         raise ValueError(f"the action has shape {np.shape(action)}; expected {space.shape}")
+
+
+def check_render_mode(mode: str | None) -> None:
+    """UserError for a mode that is neither None nor one of RENDER_MODES."""
+    if mode is not None and mode not in RENDER_MODES:
+        raise unknown_name("render_mode", mode, RENDER_MODES)
 
 
 def action_space() -> spaces.Box:

@@ -19,7 +19,7 @@ from ddgrasp.config import WorldConfig
 from ddgrasp.errors import UserError
 from mjx_envs.gym.env import PickEnv
 from mjx_envs.gym.simulator import Scenes, draw_keys, simulator
-from mjx_envs.gym.spaces import action_space, check_shape
+from mjx_envs.gym.spaces import action_space, check_render_mode, check_shape
 
 Seeds = SupportsIndex | Sequence[SupportsIndex | None] | np.ndarray | None
 Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
@@ -47,6 +47,7 @@ class PickVectorEnv(VectorEnv):
     ):
         if num_envs < 1:
             raise UserError(f"num_envs is {num_envs}; expected 1 or more.")
+        check_render_mode(render_mode)
         self._simulator = simulator(world or WorldConfig())
         self._mode = AutoresetMode(autoreset_mode)
         self.metadata = PickEnv.metadata | {"autoreset_mode": self._mode}

@@ -1,0 +1,102 @@
+"""What a control step counts and calls a success, and which episode comes next: physics that stand still."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mujoco_playground import State
+
+from ddgrasp import contract
+from ddgrasp.config import WorldConfig
+from ddgrasp.layout import QPOS
+from mjx_envs.grasp_env import AutoReset, GraspEnv
+
+WORLD = WorldConfig(objects=("cube",), episode_steps=6)
+CLOSE, OPEN = (jnp.zeros(8).at[7].set(command) for command in (1.0, -1.0))
+HELD_M, BESIDE_M = np.add(contract.LIFT_TARGET_M, (0, 0.04, 0)), np.add(contract.LIFT_TARGET_M, (0, 0.06, 0))
+
+
+class Still:
+    """Physics in which nothing moves and both pads press; a joint faster than 1e6 rad/s blows them up."""
+
+    def step(self, params, state, ctrl):
+        """The state as it was."""
+        return replace(state, qvel=jnp.where(state.qvel > 1e6, jnp.nan, 0.0), touch=jnp.ones(2))
+
+
+@pytest.fixture(scope="module")
+def env() -> GraspEnv:
+    env = GraspEnv(WORLD)
+    env.physics = Still()
+    return env
+
+
+@pytest.fixture(scope="module")
+def first(env) -> State:
+    return jax.jit(env.reset)(jax.random.PRNGKey(0))
+
+
+@pytest.fixture(scope="module")
+def stepped(env, first) -> Callable[..., State]:
+    """(object's place, m; action; the one before; speed of the joints, rad/s; counters of the episode) -> the
+    state a step later."""
+    step = jax.jit(env.step)
+
+    def after(place_m, action=CLOSE, last=CLOSE, speed_rad_s=0.0, **counters: int) -> State:
+        qpos = first.data.qpos.at[QPOS.object_pos].set(place_m)
+        data = replace(first.data, qpos=qpos, qvel=jnp.full(15, speed_rad_s), touch=jnp.ones(2))
+        counted = {name: jnp.asarray(value, jnp.int32) for name, value in counters.items()}
+        episode = replace(first.info["episode"], action=last, **counted)
+        return step(first.replace(data=data, info=first.info | {"episode": episode}), action)
+
+    return after
+
+
+@pytest.mark.parametrize(
+    ("place_m", "action", "before", "after"),
+    [(HELD_M, CLOSE, 3, 4), (HELD_M, CLOSE, 0, 1), (BESIDE_M, CLOSE, 3, 0), (HELD_M, OPEN, 3, 0)],
+)
+def test_holding_is_counted_while_it_goes_on(stepped, place_m, action, before, after):
+    assert int(stepped(place_m, action, hold_count=before).info["episode"].hold_count) == after
+
+
+@pytest.mark.parametrize(("held", "steps", "success"), [(3, 5, 0), (4, 5, 1), (5, 5, 1), (4, 4, 0)], ids=str)
+def test_success_is_an_object_held_for_the_last_five_steps(stepped, held, steps, success):
+    assert (contract.HOLD_STEPS, WORLD.episode_steps) == (5, 6)
+    state = stepped(HELD_M, hold_count=held, steps=steps)
+    assert (state.metrics["success"], state.done) == (success, steps == 5)
+
+
+def test_an_episode_whose_physics_blow_up_at_its_end_has_not_succeeded(stepped):
+    state = stepped(HELD_M, speed_rad_s=1e9, hold_count=5, steps=5)
+    assert state.info["episode"].hold_count == 6
+    assert (state.metrics["success"], state.done, state.info["truncation"]) == (0, 1, 0)
+
+
+@pytest.mark.parametrize(("last", "reward"), [(CLOSE, -WORLD.reward.toggle), (OPEN, 0.0)])
+def test_an_action_that_is_not_finite_counts_as_zeros_which_open_the_gripper(stepped, first, last, reward):
+    state = stepped(first.data.qpos[QPOS.object_pos], CLOSE.at[3].set(jnp.nan), last)
+    assert state.done == 1 and float(state.reward) == pytest.approx(reward)
+
+
+def test_joint_actions_beyond_95_percent_are_saturated(stepped):
+    action = CLOSE.at[:3].set(jnp.array([0.96, -0.96, 0.94]))
+    assert float(stepped(HELD_M, action).metrics["saturated"]) == pytest.approx(2 / 7)
+
+
+def test_a_new_episode_is_drawn_by_each_refresh_and_follows_the_one_that_ends(env, first):
+    batch, refresh = AutoReset(env), jax.jit(AutoReset(env).refresh)
+    state = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), first)
+    episode = replace(state.info["episode"], steps=jnp.array([4, 5]))  # of six
+    info = state.info | {"rng": jax.random.split(jax.random.PRNGKey(1)), "episode": episode}
+    once = refresh(state.replace(info=info))
+    twice = refresh(once)
+    earlier, later = (np.asarray(some.info["next"][1]) for some in (once, twice))
+    assert (np.abs(later - earlier).max(axis=1) > 1e-3).all()
+    stepped = jax.jit(batch.step)(twice, jnp.zeros((2, 8)))
+    assert stepped.done.tolist() == [0, 1] and stepped.info["episode"].steps.tolist() == [5, 0]
+    begun = (np.asarray(stepped.obs) == later).all(axis=1)
+    assert begun.tolist() == [False, True]
