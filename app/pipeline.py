@@ -15,12 +15,13 @@ import os
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from ddgrasp import artifacts, config_file
+from ddgrasp.alone import alone_in
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
@@ -79,6 +80,8 @@ def make(
 ) -> Artifact:
     """Makes the stage in `run_dir / stage.name`, or returns the finished one if `resume` is on.
 
+    Raises UserError if another process is making it.
+
     Args:
       parents: what it is made from; by default the finished stages in `run_dir` that its row names.
       inputs: material from outside the run (`Job.inputs`). An attempt with other inputs is not continued.
@@ -93,15 +96,26 @@ def make(
         _refuse_occupied(run_dir, [stage.name])
     progress = Progress(directory if leads else None, stage.name, quiet=quiet or not leads)
     job = Job(stage, config, directory, progress, parents, inputs or {})
-    if artifacts.is_finished(directory):
-        artifact = artifacts.read_artifact(directory)
-        artifacts.check_config(artifact, config)
-        artifacts.check_inputs(directory, {name: job.identity()[name] for name in job.inputs})
-        progress.note(f"finished before ({artifact.manifest.seconds:.0f} s{_origin(artifact)})")
-    else:
-        artifact = _work(job, leads)
+    artifact = _finished(job) or _made(job, leads)
     _check_parents(artifact, parents)
     return artifact
+
+
+def _finished(job: Job) -> Artifact | None:
+    """What an earlier attempt has finished. UserError if it was made otherwise."""
+    if not artifacts.is_finished(job.directory):
+        return None
+    artifact = artifacts.read_artifact(job.directory)
+    artifacts.check_config(artifact, job.config)
+    artifacts.check_inputs(job.directory, {name: job.identity()[name] for name in job.inputs})
+    job.progress.note(f"finished before ({artifact.manifest.seconds:.0f} s{_origin(artifact)})")
+    return artifact
+
+
+def _made(job: Job, leads: bool) -> Artifact:
+    """The stage, made by no other process meanwhile. UserError if one is at it."""
+    with alone_in(job.directory) if leads else nullcontext():
+        return _finished(job) or _work(job, leads)
 
 
 def _work(job: Job, leads: bool) -> Artifact:

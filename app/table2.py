@@ -17,6 +17,8 @@ from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text, read_json, to_json
 from ddgrasp.progress import Progress
 from ddgrasp.stages import get_stage
+from deploy.policy import POLICY_FILE
+from evaluation import rig_trials
 from evaluation.rig_trials import Series
 from evaluation.table2 import results
 from evaluation.table2.results import PAPER, SHARED, STUDENTS
@@ -58,10 +60,21 @@ def check_shared(config: Config, out: Path, resume: bool) -> None:
 
 
 def check_place(study: Study, resume: bool) -> None:
-    """Marks the folder as this study's. UserError if it holds one and `resume` is off, or another one."""
+    """Marks the folder as this study's. UserError if it holds one and `resume` is off, another one, or trials
+    of a row that were begun otherwise."""
     check_shared(study.config, study.out, resume)
     pipeline.create(study.out)
     artifacts.begin(study.out, LAST_STAGE, study.config)
+    for name in study.rows:
+        _check_trials(study, name)
+
+
+def _check_trials(study: Study, name: str) -> None:
+    """UserError if the row's trials could not go on; without its policy nobody can say."""
+    exported = study.out / STUDENTS / ROWS[name].student / "export"
+    if artifacts.is_finished(exported):
+        series, folder = _trials(study, name)
+        rig_trials.check_place(study.row_config(ROWS[name]), exported / POLICY_FILE, series, folder)
 
 
 def run(study: Study) -> dict[str, Any]:
@@ -98,11 +111,7 @@ def _student(study: Study, row: Row, common: Mapping[str, Artifact]) -> Artifact
 
 
 def _try(study: Study, name: str, config: Config, exported: Artifact) -> None:
-    from deploy.policy import POLICY_FILE
-    from evaluation import rig_trials
-
-    series = replace(study.series, depth=ROWS[name].depth)
-    folder = results.row_folder(study.out, results.set_name(series), name)
+    series, folder = _trials(study, name)
     progress = Progress(name=f"trials, {name}")
     try:
         policy = exported.directory / POLICY_FILE
@@ -112,6 +121,12 @@ def _try(study: Study, name: str, config: Config, exported: Artifact) -> None:
             f"Interrupted in the trials of row {name!r}. Finished ones are kept: the same command with "
             "--resume goes on."
         ) from None
+
+
+def _trials(study: Study, name: str) -> tuple[Series, Path]:
+    """A row's trials, and where they lie."""
+    series = replace(study.series, depth=ROWS[name].depth)
+    return series, results.row_folder(study.out, results.set_name(series), name)
 
 
 def write(study: Study) -> dict[str, Any]:

@@ -47,18 +47,24 @@ class TrialLog:
             os.fsync(file.fileno())
 
     def _read(self) -> dict[tuple[int, bool], TrialResult]:
-        header, results = read_log(self._path)
-        if results and header != self._header:
-            others = ", ".join(artifacts.differences(header, self._header))
-            raise UserError(
-                f"{self._path} was begun otherwise: {others}. Choose another --out, or delete "
-                f"{self._path.parent} and its {len(results)} trials."
-            )
-        return {result.key: result for result in results}
+        return {result.key: result for result in read_own(self._path, self._header)}
 
     def _write(self) -> None:
         lines = [self._header, *map(asdict, self.results.values())]
         atomic_write_text(self._path, "".join(map(_line, lines)))
+
+
+def read_own(path: Path, header: dict[str, Any]) -> list[TrialResult]:
+    """The finished trials in a log. Raises UserError, which says what differs, if they belong to something
+    else than `header` says."""
+    there, results = read_log(path)
+    if results and there != header:
+        others = ", ".join(artifacts.differences(there, header))
+        raise UserError(
+            f"{path} was begun otherwise: {others}. Choose another --out, or delete {path.parent} and its "
+            f"{len(results)} trials."
+        )
+    return results
 
 
 def read_log(path: Path) -> tuple[dict[str, Any], list[TrialResult]]:

@@ -111,35 +111,26 @@ def run(
     series = replace(series, rig="development")
     config = one_pose(series.configured(config, policy))
     trials = series.plan()
+    belong_to = rig_trials.made_with(config, policy) | {"number": series.number, "seconds": series.seconds}
+    headers = {name: belong_to | {"row": name} for name in names}
+    for name, header in headers.items():
+        rig_trials.check_log(out / name, header)
     made: dict[str, Any] = {}
     for place, name in enumerate(names, 1):
         folder, progress = out / name, Progress(name=name)
         progress.note(f"row {place} of {len(names)}: {ROWS[name].title}")
-        header = rig_trials.made_with(config, policy) | _said(folder, name, series)
         known = len(_known(folder))
         begun = time.monotonic()
         rig_trials.run_missing(
-            config, policy, trials, ROWS[name].make(), header, folder, workers, progress, _FILMED_FAILURES
-        )
+            config, policy, trials, ROWS[name].make(), headers[name], folder, workers, progress,
+            _FILMED_FAILURES,
+        )  # fmt: skip
         new = len(_known(folder)) - known
         if new:
             seconds = (time.monotonic() - begun) / new
             atomic_write_json(folder / TIMES_FILE, {"seconds_per_trial": seconds, "workers": workers})
         made = write(out, {"number": series.number, "policy": str(policy)})
     return made
-
-
-def _said(folder: Path, row: str, series: Series) -> dict[str, Any]:
-    """A row's own part of its log's header.
-
-    Without the seconds where a log of before 2026-11-28 goes on, which does not name them: the hash of its
-    configuration has them.
-    """
-    said = {"row": row, "number": series.number, "seconds": series.seconds}
-    had = read_log(folder / rig_trials.TRIALS_FILE)[0]
-    if had and "seconds" not in had:
-        del said["seconds"]
-    return said
 
 
 def one_pose(config: Config) -> Config:
@@ -166,7 +157,7 @@ def table(out: Path) -> list[dict[str, Any]]:
 
     Keys: row, cause, change; success with its Wilson interval; objects; faults; seconds_per_trial; against
     and the pairs (`evaluation.paired.compared`), None without a common trial; p_holm, corrected for all that
-    have any.
+    have any; differs, in what it was tried otherwise than `against`, and so has no pairs.
     """
     tried = {name: {r.index: r.success for r in _known(out / name)} for name in ROWS}
     rows = [_row(out, name, tried) for name in ROWS if tried[name]]
@@ -179,7 +170,9 @@ def table(out: Path) -> list[dict[str, Any]]:
 def _row(out: Path, name: str, tried: Mapping[str, Mapping[int, bool]]) -> dict[str, Any]:
     row, counts = ROWS[name], rig_trials.tabulate(_known(out / name))
     times = out / name / TIMES_FILE
-    pairs = paired.compared(tried[row.against] if name != REFERENCE else {}, tried[name])
+    against = {} if name == REFERENCE else tried[row.against]
+    differs = _differing(out / name, out / row.against) if against else []
+    pairs = paired.compared({} if differs else against, tried[name])
     return {
         "row": name,
         "cause": row.cause,
@@ -190,7 +183,16 @@ def _row(out: Path, name: str, tried: Mapping[str, Mapping[int, bool]]) -> dict[
         "seconds_per_trial": read_json(times)["seconds_per_trial"] if times.exists() else None,
         "against": row.against if pairs["n"] else None,
         "pairs": pairs if pairs["n"] else None,
+        "differs": differs,
     }
+
+
+def _differing(one: Path, other: Path) -> list[str]:
+    """In what two rows were tried otherwise, policy and configuration included."""
+    headers = [dict(read_log(folder / rig_trials.TRIALS_FILE)[0]) for folder in (one, other)]
+    for header in headers:
+        header.pop("seconds", None)  # not in all logs of before 2026-11-28, and in the configuration's hash
+    return rig_trials.differing(*headers, alike=("policy_sha256", "config_hash"))
 
 
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -199,7 +201,7 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     lines = [head, "|---|---|---|---|---|---|---|"]
     for row in rows:
         pairs, seconds = row["pairs"], row["seconds_per_trial"]
-        against = ROWS[row["against"]].title if pairs else ""
+        against = ROWS[row["against"]].title if pairs else "tried otherwise" if row["differs"] else ""
         flips = f"{pairs['only_reference']}, {pairs['only_row']} of {pairs['n']}" if pairs else ""
         p = f"{pairs['p_holm']:.3f}" if pairs else ""
         took = f"{seconds:.0f}" if seconds is not None else ""

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ddgrasp import artifacts, contract
+from ddgrasp.alone import alone_in
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
-from ddgrasp.files import atomic_write_bytes, atomic_write_text
+from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from ddgrasp.progress import Progress
 from deploy.changes import Change
 from deploy.fr3_lab import Shapes, stopping_at
@@ -21,7 +22,7 @@ from deploy.policy import OnnxPolicy
 from deploy.recorded import RecordedBench, episode_folder
 from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
-from deploy.trial_log import TrialLog, read_log
+from deploy.trial_log import TrialLog, read_log, read_own
 from deploy.trials import RULES, Bench, Rig, Trial, TrialResult, lasting, run_trials
 from evaluation import failure_modes, wilson
 from evaluation.treatments import RECORDED, TreatmentName, make_treatment
@@ -31,6 +32,12 @@ from rig.film import Film, contact_sheet
 RigName = Literal["development", "fr3"]
 TRIALS_FILE, TABLE_FILE, EPISODES = "trials.jsonl", "table.json", "episodes"
 EVERYTHING = "all"
+_SAME = ("rig", "shapes", "split", "number", "seconds", "ends", "rules")
+"""What the headers of two logs agree on where trial i of an object is the same trial, besides `_DRAWS`."""
+_DRAWS = "draws_hash"
+_ADDED = ("seconds", _DRAWS)
+"""What older headers do not name, those of `study causes` the seconds, and what `config_hash` covers: a log
+goes on without."""
 
 
 @dataclass(frozen=True)
@@ -149,21 +156,39 @@ def run_missing(
 
     Args:
       make: what makes a bench in every worker.
-      header: what the trials belong to. UserError if `out` has trials of something else.
+      header: what the trials belong to. UserError if `out` has trials of something else, or another process
+        is at work there.
     """
     out.mkdir(parents=True, exist_ok=True)
-    log = TrialLog(out / TRIALS_FILE, header)
-    todo = [trial for trial in trials if (trial.index, False) not in log.results]
-    with progress.task("trials", len(trials)) as task:
-        task.start_at(len(trials) - len(todo))
-        for result, film in run_trials(config, policy, todo, workers, make):
-            alike = [(r.object_name, r.success) for r in log.results.values()]
-            shown = alike.count((result.object_name, result.success))
-            log.append(result)
-            if film.steps and shown < (1 if result.success else failures):
-                _keep(out, result, film)
-            task.advance(success=sum(r.success for r in log.results.values()) / len(log.results))
+    with alone_in(out):
+        log = TrialLog(out / TRIALS_FILE, _as_begun(out, header))
+        todo = [trial for trial in trials if (trial.index, False) not in log.results]
+        with progress.task("trials", len(trials)) as task:
+            task.start_at(len(trials) - len(todo))
+            for result, film in run_trials(config, policy, todo, workers, make):
+                alike = [(r.object_name, r.success) for r in log.results.values()]
+                shown = alike.count((result.object_name, result.success))
+                log.append(result)
+                if film.steps and shown < (1 if result.success else failures):
+                    _keep(out, result, film)
+                task.advance(success=sum(r.success for r in log.results.values()) / len(log.results))
     return [log.results[trial.index, False] for trial in trials]
+
+
+def check_place(config: Config, policy: Path, series: Series, out: Path) -> None:
+    """UserError if `out` has trials of something else than `run` would add to them. Writes nothing."""
+    check_log(out, _header(series.configured(config, policy), policy, series))
+
+
+def check_log(out: Path, header: dict[str, Any]) -> None:
+    """UserError if `out` has trials that belong to something else than `header` says. Writes nothing."""
+    read_own(out / TRIALS_FILE, _as_begun(out, header))
+
+
+def _as_begun(out: Path, header: dict[str, Any]) -> dict[str, Any]:
+    """`header` without what that of `out`'s log, begun before, does not name yet."""
+    had, results = read_log(out / TRIALS_FILE)
+    return {key: value for key, value in header.items() if not results or key in had or key not in _ADDED}
 
 
 def _check_recorded(out: Path) -> None:
@@ -237,9 +262,29 @@ def shown(header: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in header.items() if name not in other}
 
 
+def differing(one: Mapping[str, Any], other: Mapping[str, Any], alike: Sequence[str] = ()) -> list[str]:
+    """What tells the trials of two logs apart, by their headers: "rules is 1, not 2"; empty where trial i of
+    an object is the same trial in both.
+
+    Policy, camera, contact limit, retry and treatment are what logs are compared for, unless `alike` names
+    them. A header of before, which does not name what trials are drawn from, may be of any.
+    """
+    one, other = shown(one), shown(other)
+    known = (_DRAWS,) if _DRAWS in one and _DRAWS in other else ()
+    pairs = {key: (one.get(key), other.get(key)) for key in (*_SAME, *known, *alike)}
+    return [f"{key} is {here}, not {there}" for key, (here, there) in pairs.items() if here != there]
+
+
 def made_with(config: Config, policy: Path) -> dict[str, Any]:
     """Policy, configuration and rule in the header of a log of trials."""
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),
+        _DRAWS: _draws_hash(config),
     } | RULES
+
+
+def _draws_hash(config: Config) -> str:
+    """Stands for what trials are drawn from: where camera, joints and object are, sizes, camera noise."""
+    drawn_from = to_json((config.world.random, config.record.stereo))
+    return hashlib.sha256(json.dumps(drawn_from, sort_keys=True).encode()).hexdigest()[:8]

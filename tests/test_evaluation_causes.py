@@ -98,6 +98,34 @@ def test_logs_of_other_lengths_are_not_paired_and_old_ones_without_go_on(tmp_pat
         causes.run(CONFIG, policy, (causes.REFERENCE,), long, tmp_path / "again", 0)
 
 
+def test_a_row_that_was_begun_otherwise_is_said_before_any_is_tried(tmp_path, policy):
+    names = causes.chosen(("ideal", "off_10mm"))
+    short = replace(SERIES, objects=("cube",))
+    causes.run(CONFIG, policy, names, short, tmp_path, 0)
+    log = tmp_path / "off_10mm" / rig_trials.TRIALS_FILE
+    log.write_text(log.read_text().replace('"rules": ', '"rules": 9', 1))
+    for name in ("development", "ideal"):
+        (tmp_path / name / rig_trials.TRIALS_FILE).unlink()
+    with pytest.raises(UserError, match=r"off_10mm/trials.jsonl was begun otherwise: rules is 9\d there"):
+        causes.run(CONFIG, policy, names, short, tmp_path, 0)
+    assert not list(tmp_path.glob("development/*.jsonl"))
+
+
+def test_rows_that_were_tried_otherwise_are_not_compared(tmp_path, policy):
+    names = causes.chosen(("ideal",))
+    causes.run(CONFIG, policy, names, SERIES, tmp_path, 0)
+    log, kept = tmp_path / "ideal" / rig_trials.TRIALS_FILE, (tmp_path / "ideal" / "trials.jsonl").read_text()
+    log.write_text(kept.replace(', "seconds": 0.5', "", 1))  # of before, which had them in the hash alone
+    assert causes.table(tmp_path)[1]["pairs"]["n"] == 2
+    for key in ("config_hash", "policy_sha256", "rules"):
+        header, *lines = kept.splitlines(keepends=True)
+        log.write_text("".join([json.dumps({**json.loads(header), key: "other"}) + "\n", *lines]))
+        _, ideal = causes.table(tmp_path)
+        assert ideal["pairs"] is None and ideal["success"]["n"] == 2
+        assert ideal["differs"][0].startswith(f"{key} is other, not ")
+        assert causes.markdown([ideal]).splitlines()[2].split("|")[4].strip() == "tried otherwise"
+
+
 def test_pairs_and_holm_are_those_of_the_outcomes(tmp_path, policy):
     names = causes.chosen(("ideal",))
     causes.run(CONFIG, policy, names, SERIES, tmp_path, 0)

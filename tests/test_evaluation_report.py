@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import matplotlib
 import numpy as np
 import pytest
 
@@ -26,6 +27,7 @@ from evaluation.report.stage import write_report
 from evaluation.report.summary import build_report, print_summary, summary_rows
 from evaluation.report.targets import targets
 from report_support import unexplained
+from rig.film import INVALID_RGB, colored
 
 CONFIG = Config(preset="debug")
 ROOT = Path(__file__).parents[1]
@@ -244,10 +246,20 @@ def test_every_number_of_a_whole_run_has_a_meaning_and_a_unit_where_it_needs_one
 def test_invalid_depth_has_a_colour_that_no_depth_has():
     depth = np.linspace(0.5, 2.0, 1000, dtype=np.float32).reshape(20, 50)
     depth[3, 4] = 0.0
-    rgb = figures.color_depth(depth, 0.5, 2.0)
-    np.testing.assert_array_equal(rgb[3, 4], figures.INVALID_RGB)
+    rgb = figures.color_depth(depth, 0.5, 2.0).astype(int)
+    np.testing.assert_array_equal(rgb[3, 4], INVALID_RGB)
     rgb[3, 4] = rgb[3, 5]
-    assert np.abs(rgb - figures.INVALID_RGB).max(axis=-1).min() > 0.3
+    assert np.abs(rgb - INVALID_RGB).max(axis=-1).min() > 75
+
+
+def test_depth_looks_as_in_films_and_as_the_scale_beside_it_says():
+    depth = np.linspace(0.4, 2.1, 1000, dtype=np.float32).reshape(20, 50)
+    depth[3, 4] = 0.0
+    rgb = figures.color_depth(depth, 0.5, 2.0)
+    np.testing.assert_array_equal(rgb, colored((depth * 1000).round().astype(np.uint16), 500, 2000))
+    scale = matplotlib.colormaps[figures.DEPTH_COLORS](np.clip((depth - 0.5) / 1.5, 0, 1))[..., :3]
+    off = np.abs(rgb - 255 * scale)[depth > 0]
+    assert off.max() < 4  # of 255: the nearest millimetre, the nearest of 256 colours
 
 
 def test_millimetres_and_metres_look_alike():

@@ -13,10 +13,12 @@ from app.commands.study import StudyTable2
 from ddgrasp import artifacts
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
+from ddgrasp.shipped import PRETRAINED
 from demos.stage import STORE
 from demos.store import EpisodeStore
 from deploy.trial_log import TrialLog
 from deploy.trials import TrialResult
+from deploy_support import write_policy
 from evaluation import paired, rig_trials
 from evaluation.failure_modes import MODES
 from evaluation.rig_trials import Series
@@ -173,11 +175,12 @@ def outcome(index: int, name: str, success: bool) -> TrialResult:
     return TrialResult(index, name, False, success, 60, 0, 0, {}, [], *([] for _ in range(5)))
 
 
-def write_row(out: Path, series: Series, row: str, wins: dict[str, list[bool]]) -> None:
+def write_row(out: Path, series: Series, row: str, wins: dict[str, list[bool]], **header) -> None:
     """The trials of a row as `rig_trials.run` leaves them."""
     folder = results.row_folder(out, results.set_name(series), row)
     folder.mkdir(parents=True)
-    header = {"policy_sha256": hashlib.sha256(row.encode()).hexdigest(), "rig": series.rig, "seconds": 6.0}
+    belong_to = {"policy_sha256": hashlib.sha256(row.encode()).hexdigest(), "rig": series.rig, "seconds": 6.0}
+    header = belong_to | header
     log = TrialLog(folder / rig_trials.TRIALS_FILE, header)
     for place, (name, successes) in enumerate(wins.items()):
         for i, success in enumerate(successes):
@@ -242,6 +245,72 @@ def test_trials_of_another_policy_than_the_row_has_now_are_not_shown(study, tmp_
         policy.write_bytes(made)
     (of,) = results.collect(tmp_path)["sets"].values()
     assert set(of["rows"]) == {"ddg", "sim_gt"} and len(of["tables"]["main"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("otherwise", "differs"),
+    [
+        ({"rules": 1}, "rules is 1, not 2"),
+        ({"seconds": 12.0}, "seconds is 12.0, not 6.0"),
+        ({"contact": 100.0}, "contact is 100.0, not 30.0"),
+        ({"retry": False}, "retry is False, not True"),
+        ({"camera": "ideal"}, "camera is ideal, not stereo"),
+        ({"draws_hash": "cd"}, "draws_hash is cd, not ab"),
+    ],
+)
+def test_rows_that_were_tried_otherwise_are_not_compared_which_is_said(tmp_path, otherwise, differs):
+    alike = {"rules": 2, "contact": 30.0, "retry": True, "camera": "stereo", "draws_hash": "ab"}
+    series = Series("fr3")
+    for row, header in (("ddg", alike), ("sim_gt", alike), ("rand_noise", alike | otherwise)):
+        write_row(tmp_path, series, row, {"apple": [True, False]}, **header)
+    about = {"preset": "laptop", "created": "now", "machine": {"processor": "x"}, "left_out": {}}
+    study = {**about, **results.collect(tmp_path)}
+    (of,) = study["sets"].values()
+    assert set(of["rows"]) == {"ddg", "sim_gt", "rand_noise"}, "its own success is shown"
+    assert [test["row"] for test in of["tables"]["main"]] == ["sim_gt"]
+    assert of["tables"]["main"][0]["p_holm"] == of["tables"]["main"][0]["p"]
+    said = f"Rand Noise was tried otherwise than DDG and is not compared with it: {differs}."
+    assert said in page.render(study, b"") and said in page.describe(study, results.set_name(series))
+    assert of["apart"]["grafting"] == [] and of["trials"]["seconds"] == 6.0
+
+
+def test_where_the_reference_was_not_tried_the_first_row_says_what_is_otherwise(tmp_path):
+    series = Series("development")
+    for row, rules in (("sim_gt", 1), ("rand_noise", 2), ("paper_ddg", 2), ("paper_ddg_no_graft", 2)):
+        write_row(tmp_path, series, row, {"apple": [True]}, rules=rules, contact=100.0 * rules)
+    (of,) = results.collect(tmp_path)["sets"].values()
+    assert of["apart"]["main"] == [
+        {"row": "rand_noise", "against": "sim_gt", "differs": ["rules is 2, not 1"]}
+    ]
+    assert [test["row"] for test in of["tables"]["grafting"]] == ["paper_ddg_no_graft"]
+    (tmp_path / "two").mkdir()
+    write_row(tmp_path / "two", series, "ddg", {"apple": [True]}, rules=2)
+    write_row(tmp_path / "two", series, "sim_gt", {"apple": [True]}, rules=1, seconds=9.0)
+    (of,) = results.collect(tmp_path / "two")["sets"].values()
+    assert of["trials"]["seconds"] == 6.0, "as the main table's reference was"
+
+
+KEPT = PRETRAINED / "table2" / "trials"
+
+
+@pytest.mark.skipif(not KEPT.is_dir(), reason="a wheel has no table2")
+@pytest.mark.parametrize(
+    ("kept", "rows_and_p"),
+    [
+        ("development-9", {"sim_gt": (499, 3), "rand_noise": (62, 37), "inpaint": (141, 28),
+                           "ddg_no_graft": (26, 34), "upper_bound": (24, 42)}),
+        ("fr3-test-3", {"sim_gt": (51, 3), "rand_noise": (4, 3), "inpaint": (10, 5),
+                        "ddg_no_graft": (9, 3), "upper_bound": (7, 3)}),
+    ],
+)  # fmt: skip
+def test_the_kept_logs_give_the_pairs_of_the_page(tmp_path, kept, rows_and_p):
+    """docs/table2.md."""
+    trials = tmp_path / results.TRIALS / "kept-split-0"
+    trials.parent.mkdir()
+    trials.symlink_to(KEPT / kept, target_is_directory=True)
+    (of,) = results.collect(tmp_path)["sets"].values()
+    assert {t["row"]: (t["only_reference"], t["only_row"]) for t in of["tables"]["main"]} == rows_and_p
+    assert not any(of["apart"].values())
 
 
 def test_a_study_without_trials_has_a_page(tmp_path):
@@ -367,6 +436,30 @@ def test_a_study_is_continued_only_with_its_own_configuration(tmp_path):
     other = command("--out", str(tmp_path), "--rows", "ddg", "--demos.episodes", "9").planned()
     with pytest.raises(UserError, match=r"begun with another configuration .* demos.episodes is 4 there, 9"):
         table2.check_place(other, resume=True)
+
+
+def test_trials_that_were_begun_otherwise_are_said_before_anything_is_made(tmp_path):
+    from app import table2
+
+    study = command("--out", str(tmp_path), "--rows", "sim_gt", "ddg", "--trials", "1").planned()
+    exported = tmp_path / results.STUDENTS / ROWS["ddg"].student / "export"
+    exported.mkdir(parents=True)
+    policy = write_policy(exported / "policy.onnx")
+    series, folder = table2._trials(study, "ddg")
+    config = study.row_config(ROWS["ddg"])
+    header = rig_trials._header(series.configured(config, policy), policy, series)
+    folder.mkdir(parents=True)
+    log = folder / rig_trials.TRIALS_FILE
+    TrialLog(log, header | {"rules": 1}).append(outcome(0, "apple", True))
+    before = log.read_bytes()
+    table2.check_place(study, resume=True)  # a policy that may be made anew says nothing yet
+    artifacts.finish(exported, "export", config, seconds=1.0, metrics={})
+    with pytest.raises(UserError, match=r"ddg/trials.jsonl was begun otherwise: rules is 1 there, \d here"):
+        table2.check_place(study, resume=True)
+    assert log.read_bytes() == before
+    log.unlink()
+    TrialLog(log, header).append(outcome(0, "apple", True))
+    table2.check_place(study, resume=True)
 
 
 def test_without_out_a_study_has_a_folder_of_its_own():

@@ -1,7 +1,9 @@
 """The pipeline with two small stages of its own: order, resume, refusals, interruption, time."""
 
 import dataclasses
+import errno
 import operator
+import os
 import signal
 import subprocess
 import sys
@@ -13,6 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from app import pipeline
 from ddgrasp import artifacts
+from ddgrasp.alone import alone_in
 from ddgrasp.config import Config, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress, read_curves
@@ -252,6 +255,106 @@ def test_an_interrupt_that_a_destructor_drops_still_ends_the_work_and_lets_it_cl
 def test_an_interrupt_that_arrives_in_a_gc_callback_ends_the_work(tmp_path):
     _, errors = _interrupt(COLLECTS_GARBAGE_MOST_OF_THE_TIME, tmp_path, signal.SIGINT)
     assert errors == [INTERRUPTED]
+
+
+WORKS = """
+def work(job):
+    print("working", flush=True)
+    time.sleep(60)
+"""
+HAS_WORKERS = """
+import multiprocessing, os
+
+def work(job):
+    for kind in ("fork", "spawn"):
+        multiprocessing.get_context(kind).Process(target=time.sleep, args=(60,)).start()
+    children = multiprocessing.active_children()
+    print(" ".join(str(child.pid) for child in children), flush=True)
+    time.sleep(60)
+"""
+
+
+def _begin(work: str, run_dir: Path) -> tuple[subprocess.Popen, str]:
+    """A process that works in the run's stage `teacher`, and its first line."""
+    code = [sys.executable, "-c", SLOW.format(work=work, run_dir=str(run_dir))]
+    process = subprocess.Popen(code, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    return process, process.stdout.readline()
+
+
+def test_two_processes_do_not_make_one_stage_but_may_make_two(stages, tmp_path):
+    run_dir, (teacher, record) = tmp_path / "run", stages
+    other, line = _begin(WORKS, run_dir)
+    try:
+        assert line == "working\n"
+        with pytest.raises(UserError) as refused:
+            pipeline.make(teacher, CONFIG, run_dir, resume=True, quiet=True)
+        about = {"resume": True, "quiet": True, "parents": {}}
+        made = pipeline.make(record, CONFIG, run_dir, **about)
+        assert pipeline.make(record, CONFIG, run_dir, **about) == made
+    finally:
+        other.kill()
+        other.wait()
+    assert str(refused.value) == (
+        f"another process is at work in {run_dir / 'teacher'}: wait for it, or choose another --out."
+    )
+    assert _log(run_dir) == ["record"] and not list(run_dir.rglob("*lock*"))
+    pipeline.make(teacher, CONFIG, run_dir, resume=True, quiet=True)
+    assert _log(run_dir) == ["record", "teacher"]
+
+
+def test_workers_that_outlive_a_killed_process_do_not_keep_the_stage(stages, tmp_path):
+    other, line = _begin(HAS_WORKERS, tmp_path)
+    workers = [int(pid) for pid in line.split()]
+    assert len(workers) == 2
+    try:
+        with pytest.raises(UserError, match="another process is at work in"):
+            pipeline.make(stages[0], CONFIG, tmp_path, resume=True, quiet=True)
+        other.kill()
+        other.wait()
+        for pid in workers:
+            os.kill(pid, 0)  # is there still
+        pipeline.make(stages[0], CONFIG, tmp_path, resume=True, quiet=True)
+    finally:
+        for pid in workers:
+            os.kill(pid, signal.SIGKILL)
+    assert _log(tmp_path) == ["teacher"]
+
+
+def test_a_stage_that_fails_is_let_go_of(stages, tmp_path):
+    (tmp_path / "fail_teacher").touch()
+    for _ in range(2):
+        with pytest.raises(OSError, match="No space left"):
+            pipeline.make(stages[0], CONFIG, tmp_path, resume=True, quiet=True)
+
+
+def test_a_stage_that_ended_meanwhile_is_not_made_again(stages, tmp_path, monkeypatch):
+    """Another process ends it between the look and the lock."""
+    lock = pipeline.alone_in
+
+    def later(directory):
+        artifacts.finish(directory, "teacher", CONFIG, seconds=1.0, metrics={"by": "another"})
+        return lock(directory)
+
+    monkeypatch.setattr(pipeline, "alone_in", later)
+    made = pipeline.make(stages[0], CONFIG, tmp_path, resume=True, quiet=True)
+    assert made.manifest.metrics == {"by": "another"} and not (tmp_path / "log.txt").exists()
+
+
+def test_of_several_that_make_a_stage_together_one_holds_it(stages, tmp_path):
+    (tmp_path / "teacher").mkdir()
+    with alone_in(tmp_path / "teacher"):
+        pipeline.make(stages[0], CONFIG, tmp_path, resume=True, quiet=True, leads=False)
+    assert _log(tmp_path) == ["teacher"]
+
+
+def test_where_a_file_system_has_no_locks_on_folders_nobody_is_kept_out(tmp_path, monkeypatch):
+    def none(descriptor, operation):
+        raise OSError(errno.EBADF, "Bad file descriptor")
+
+    monkeypatch.setattr("ddgrasp.alone.fcntl.flock", none)
+    with alone_in(tmp_path):
+        assert tmp_path.is_dir()
 
 
 def test_curves_count_a_repeated_step_once_and_skip_a_torn_line(tmp_path):

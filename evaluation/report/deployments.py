@@ -14,9 +14,10 @@ from evaluation.report.html import REPORT_HTML, contents, film, heading, page, t
 
 _HEADER = ("deployment", "policy", "robot", "camera", "ended", "steps", "missed", "holds", "frame to command")
 _NOTE = (
-    "<p class=note>Missed: control steps left out since the one before took too long. Holds: steps in which "
-    "the arm stood still for want of a frame or a state. Frame to command: from a frame in hand to the "
-    "command sent.</p>"
+    "<p class=note>Success: of deployments that were judged, and of those that a fault ended, which failed "
+    "unless report.json says otherwise. Dry runs do not count, nor what was interrupted and never judged. "
+    "Missed: control steps left out since the one before took too long. Holds: steps in which the arm stood "
+    "still for want of a frame or a state. Frame to command: from a frame in hand to the command sent.</p>"
 )
 
 _FIELDS = ("steps", "holds", "missed_deadlines", "fault", "events", "latency_ms")
@@ -31,11 +32,24 @@ class Deployment:
     report: Mapping[str, Any]
 
     @property
+    def is_driven(self) -> bool:
+        """Whether the arm was to move."""
+        return not self.report.get("dry_run")
+
+    @property
+    def success(self) -> bool | None:
+        """As judged; a fault that nobody judged is a failure, as on the rigs. None counts for nothing."""
+        judged = self.report["success"]
+        faulted = self.report["fault"] and self.is_driven and not self.report["interrupted"]
+        return False if judged is None and faulted else judged
+
+    @property
     def ended(self) -> str:
         """In a few words."""
         if self.report["fault"]:
-            return f"fault: {self.report['fault']}"
-        if self.report.get("dry_run"):
+            judged = f"{ENDED[True]}, then " if self.success else ""
+            return f"{judged}fault: {self.report['fault']}"
+        if not self.is_driven:
             return "dry run"
         return "interrupted" if self.report["interrupted"] else ENDED[self.report["success"]]
 
@@ -82,14 +96,16 @@ def render(deployments: Sequence[Deployment]) -> str:
 
 
 def verdict(deployments: Sequence[Deployment]) -> str:
-    """How many of those that somebody judged succeeded, what ended by a fault, deadlines missed; without dry
-    runs."""
-    judged = [d.report["success"] for d in deployments if d.report["success"] is not None]
-    rate = wilson.describe(wilson.success(sum(judged), len(judged))) if judged else "none was judged"
-    driven = _driven(deployments)
-    faults = sum(bool(report["fault"]) for report in driven)
-    missed = sum(report["missed_deadlines"] for report in driven)
-    steps = sum(report["steps"] for report in driven)
+    """How many succeeded of those that count, how many nobody judged, what ended by a fault, deadlines
+    missed; without dry runs."""
+    driven = [deployment for deployment in deployments if deployment.is_driven]
+    outcomes = [deployment.success for deployment in driven if deployment.success is not None]
+    rate = wilson.describe(wilson.success(sum(outcomes), len(outcomes))) if outcomes else "none was judged"
+    unjudged = len(driven) - len(outcomes)
+    rate += f", {unjudged} not judged" if outcomes and unjudged else ""
+    faults = sum(bool(deployment.report["fault"]) for deployment in driven)
+    missed = sum(deployment.report["missed_deadlines"] for deployment in driven)
+    steps = sum(deployment.report["steps"] for deployment in driven)
     dry = len(deployments) - len(driven)
     beside = f" Beside them {dry} dry run{'s' * (dry > 1)}." if dry else ""
     return f"Success {rate}. Ended by a fault: {faults}. Missed deadlines: {missed} in {steps} steps.{beside}"
@@ -119,10 +135,5 @@ def _title(deployment: Deployment) -> str:
 
 def _alarm(deployments: Sequence[Deployment]) -> str:
     """Red where a deadline was missed or a robot failed."""
-    bad = any(report["missed_deadlines"] or report["fault"] for report in _driven(deployments))
-    return "missed" if bad else "verdict"
-
-
-def _driven(deployments: Sequence[Deployment]) -> list[Mapping[str, Any]]:
-    """Reports of all but dry runs."""
-    return [d.report for d in deployments if not d.report.get("dry_run")]
+    driven = (deployment.report for deployment in deployments if deployment.is_driven)
+    return "missed" if any(report["missed_deadlines"] or report["fault"] for report in driven) else "verdict"

@@ -5,19 +5,18 @@ import io
 import textwrap
 from collections.abc import Mapping, Sequence
 
-import matplotlib
 import numpy as np
-from jaxtyping import Float, Float32, Real
+from jaxtyping import Float, Float32, Real, UInt8
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from ddgrasp.depth import to_metres
+from ddgrasp.depth import to_metres, to_millimetres
+from rig.film import INVALID_RGB, colored
 
 DEPTH_COLORS = "viridis_r"
-INVALID_RGB = (1.0, 0.0, 1.0)
-"""Magenta: no depth is drawn in it."""
+"""What `rig.film.colored` draws depth in, for scales beside pictures."""
 MAX_FRAMES = 8
 """Most frames in one film strip."""
 TITLE_IN, GAP_IN, SCALE_IN, SCALE_HIGH_IN = 0.3, 0.06, 0.85, 1.6
@@ -45,12 +44,9 @@ def depth_range_m(depths: Sequence[Float[np.ndarray, "..."]]) -> tuple[float, fl
 
 def color_depth(
     depth_m: Float[np.ndarray, "*b H W"], near_m: float, far_m: float
-) -> Float[np.ndarray, "*b H W 3"]:
-    """(..., H, W) metres to (..., H, W, 3) RGB in [0, 1]; invalid pixels take INVALID_RGB."""
-    scaled = np.clip((depth_m - near_m) / (far_m - near_m), 0.0, 1.0)
-    rgb = matplotlib.colormaps[DEPTH_COLORS](scaled)[..., :3]
-    rgb[depth_m <= 0] = INVALID_RGB
-    return rgb
+) -> UInt8[np.ndarray, "*b H W 3"]:
+    """`rig.film.colored` of depth in metres: (..., H, W) to (..., H, W, 3) uint8."""
+    return colored(to_millimetres(depth_m), 1000.0 * near_m, 1000.0 * far_m)
 
 
 def draw_panels(panels: Mapping[str, Real[np.ndarray, "..."]]) -> bytes:
@@ -173,8 +169,9 @@ def _depth_legend(figure: Figure, near_m: float, far_m: float) -> None:
     bar = figure.colorbar(ScalarMappable(Normalize(near_m, far_m), DEPTH_COLORS), cax=figure.add_axes(box))
     bar.set_label("depth (m)", fontsize=8)
     bar.ax.tick_params(labelsize=7)
+    red, green, blue = (level / 255 for level in INVALID_RGB)
     figure.legend(
-        handles=[Patch(color=INVALID_RGB, label="no depth")],
+        handles=[Patch(color=(red, green, blue), label="no depth")],
         loc="lower right", fontsize=8, frameon=False, borderpad=0.0, handlelength=1.0,
     )  # fmt: skip
 

@@ -14,14 +14,12 @@ from evaluation import failure_modes, paired, wilson
 from evaluation.report import success_chart
 from evaluation.report.comparison import COMPARISON_HTML, COMPARISON_PNG
 from evaluation.report.html import REPORT_HTML, contents, film, heading, image, page, table
-from evaluation.rig_trials import TRIALS_FILE, shown, tabulate
+from evaluation.rig_trials import TRIALS_FILE, differing, shown, tabulate
 from evaluation.treatments import RECORDED
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
 _KINDS = ("rig", "row")
 """The header of a log has one of them: of `deploy trials`, or of `study causes`."""
-_SAME = ("rig", "shapes", "split", "number", "seconds", "ends", "rules")
-"""What two series agree on where trial i of an object is the same trial."""
 _QUALITY = 75
 """The films' WebP takes a sixth of the PNG files that they are made from."""
 
@@ -149,7 +147,7 @@ def _pairs(first: Trials, others: Sequence[Trials]) -> list[str]:
 
 def _compared(first: Trials, other: Trials) -> dict[str, Any] | None:
     """None for trials of two kinds, or without one in common."""
-    if any(first.belong_to.get(key) != other.belong_to.get(key) for key in _SAME):
+    if differing(first.belong_to, other.belong_to):
         return None
     pair = paired.compared(_outcomes(first), _outcomes(other))
     return pair if pair["n"] else None

@@ -47,6 +47,15 @@ def _p(value: float) -> str:
     return "< 0.0001" if value < 1e-4 else f"{value:.4f}"
 
 
+def apart(study: Mapping[str, Any], set_of_trials: str, name: str) -> list[str]:
+    """A sentence for each row that one table for one set of trials does not compare, and why."""
+    return [
+        f"{ROWS[row['row']].title} was tried otherwise than {ROWS[row['against']].title} and is not compared "
+        f"with it: {', '.join(row['differs'])}."
+        for row in study["sets"][set_of_trials]["apart"][name]
+    ]
+
+
 def object_rows(study: Mapping[str, Any], set_of_trials: str) -> tuple[list[str], list[list[str]]]:
     """(objects, lines) of successes by object: title, then "k of n" per object."""
     tried = study["sets"][set_of_trials]["rows"]
@@ -76,7 +85,8 @@ def render(study: Mapping[str, Any], picture: bytes) -> str:
         f"<h1>{title}</h1>",
         "<p class=note>Success: rate of n trials, Wilson 95 % interval. p: McNemar's exact test on the same "
         "trials (seed, object, camera), two-sided, against the table's reference; Holm: corrected for all "
-        "rows of the table that were tried. Both rigs are simulated; no real robot was used. "
+        "rows of the table that were tried as the reference was. Both rigs are simulated; no real robot was "
+        "used. "
         f"{escape(study['created'])}, {escape(study['machine']['processor'])}.</p>",
         *(
             f"<p>{escape(ROWS[row].title)} left out: {escape(why)}</p>"
@@ -89,6 +99,7 @@ def render(study: Mapping[str, Any], picture: bytes) -> str:
             of = TABLES[key]
             body.append(f"<h3>{of.title}, reference {ROWS[of.reference].title}</h3>")
             body.append(table(_COLUMNS, table_rows(study, name, key)))
+            body += [f"<p class=missed>{escape(line)}</p>" for line in apart(study, name, key)]
         objects, lines = object_rows(study, name)
         body.append("<h3>By object</h3>" + table(["row", *objects], lines))
         body.append(f"<h3>Failures by mode</h3><p class=note>{NOTE}</p>")
@@ -108,6 +119,7 @@ def describe(study: Mapping[str, Any], set_of_trials: str) -> str:
             if line[4] != "not tried":
                 p = f"p (Holm) {line[9]}" if line[9] else ""
                 lines.append(f"  {line[0]:<36} {line[6]:<36} {line[7]:<18} {p}".rstrip())
+        lines += [f"  {line}" for line in apart(study, set_of_trials, name)]
     return "\n".join(lines)
 
 

@@ -26,6 +26,9 @@ SHARED, PAPER, STUDENTS, TRIALS = "shared", "paper", "students", "trials"
 SIMULATED = {"clean": "student_clean", "own": "student_ddg"}
 """Depth in simulation -> what the student's manifest calls the success on it (own: as in its training)."""
 
+_ALIKE = ("camera", "contact", "retry")
+"""What the rows of a table agree on besides their trials."""
+
 
 def set_name(series: Series) -> str:
     """Folder of the trials that are paired: one rig, one split, one seed."""
@@ -53,8 +56,9 @@ def collect(out: Path) -> dict[str, Any]:
 
     Keys: `rows.<row>` = {title, training, deployment, generator_from (empty if it was fitted in the study),
     ripple_px, student: {name, seconds, simulation}}, of rows whose student is finished; `sets.<set>` =
-    {trials: how they were run, rows: each as `evaluation.rig_trials.tabulate` gives it, tables: see
-    `compare`}. A success rate is {rate, n, successes, low, high}.
+    {trials: how the main table's reference was tried, or the first row that was, rows: each as
+    `evaluation.rig_trials.tabulate` gives it, tables: see `compare`, apart: rows that are left out of their
+    table's comparisons, see `tried_otherwise`}. A success rate is {rate, n, successes, low, high}.
     """
     rows = {
         name: _describe(row, artifacts.read_artifact(out / STUDENTS / row.student / "student"))
@@ -87,18 +91,45 @@ def _describe(row: Row, student: Artifact) -> dict[str, Any]:
 
 def _set(folder: Path) -> dict[str, Any]:
     logs = {name: read_log(folder / name / rig_trials.TRIALS_FILE) for name in ROWS}
-    tried = {
-        name: results
+    logs = {
+        name: (belong_to, results)
         for name, (belong_to, results) in logs.items()
         if results and not _outdated(folder, name, belong_to)
     }
-    belong_to = next((logs[name][0] for name in tried), {})
+    headers = {name: belong_to for name, (belong_to, _) in logs.items()}
+    tried = {name: results for name, (_, results) in logs.items()}
+    apart = {name: tried_otherwise(table, headers) for name, table in TABLES.items()}
     same = ("rig", "split", "number", "shapes", "camera", "seconds", "contact")
+    belong_to = headers.get(TABLES["main"].reference) or next(iter(headers.values()), {})
     return {
         "trials": {key: value for key, value in rig_trials.shown(belong_to).items() if key in same},
         "rows": {name: rig_trials.tabulate(results) for name, results in tried.items()},
-        "tables": {name: compare(table, tried) for name, table in TABLES.items()},
+        "tables": {name: compare(table, _without(apart[name], tried)) for name, table in TABLES.items()},
+        "apart": apart,
     }
+
+
+def tried_otherwise(table: Table, headers: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of `table` that were not tried as its reference was, or, without it, as the first that was tried.
+
+    Args:
+      headers: row -> header of its log; of those that were tried.
+
+    Keys: row; against, what it is set beside; differs, in what. Policy and treatment may differ: they are
+    what the rows are tried for.
+    """
+    names = [name for name in (table.reference, *table.rows) if name in headers]
+    return [
+        {"row": name, "against": names[0], "differs": differs}
+        for name in names[1:]
+        if (differs := rig_trials.differing(headers[name], headers[names[0]], _ALIKE))
+    ]
+
+
+def _without(apart: Sequence[Mapping[str, Any]], tried: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of `tried` that are not `apart`."""
+    left_out = {row["row"] for row in apart}
+    return {name: results for name, results in tried.items() if name not in left_out}
 
 
 def _outdated(folder: Path, row: str, belong_to: Mapping[str, Any]) -> bool:
@@ -112,7 +143,7 @@ def compare(table: Table, tried: Mapping[str, Sequence[TrialResult]]) -> list[di
     """A row of `table` each, but its reference: the reference against it on the trials that both had.
 
     Args:
-      tried: row -> what came of its trials.
+      tried: row -> what came of its trials; of those that were tried as the reference was.
 
     Keys: row; n, pairs of trials; only_reference, only_row, pairs in which one alone succeeded; p, McNemar's
     exact two-sided one; p_holm, the same corrected for all rows of the table that were tried; difference, the

@@ -1,0 +1,61 @@
+"""What of a folder of deployments counts as success, and what the page says of the rest."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from evaluation.report import deployments
+from evaluation.report.deployments import Deployment
+
+REFLEX = "the arm stopped itself: reflex"
+
+
+def deployment(success: bool | None = None, fault: str = "", **about) -> Deployment:
+    report = {"steps": 10, "holds": 0, "missed_deadlines": 0, "events": [], "interrupted": False}
+    report |= {"success": success, "fault": fault, "latency_ms": {"p50": None, "p99": None}}
+    return Deployment(Path("20261128-120000"), {**report, **about})
+
+
+def test_a_fault_that_nobody_judged_is_a_failure():
+    made = [deployment(True), deployment(True), *(deployment(fault=REFLEX) for _ in range(3))]
+    assert deployments.verdict(made) == (
+        "Success 40.0 % of 5 (11.8 to 76.9). Ended by a fault: 3. Missed deadlines: 0 in 50 steps."
+    )
+
+
+@pytest.mark.parametrize(
+    ("made", "counts", "ended"),
+    [
+        (deployment(True), True, "lifted and held"),
+        (deployment(False), False, "failed"),
+        (deployment(), None, "not judged"),
+        (deployment(fault=REFLEX), False, f"fault: {REFLEX}"),
+        (deployment(True, REFLEX), True, f"lifted and held, then fault: {REFLEX}"),
+        (deployment(fault=REFLEX, dry_run=True), None, f"fault: {REFLEX}"),
+        (deployment(fault=REFLEX, interrupted=True), None, f"fault: {REFLEX}"),
+        (deployment(interrupted=True), None, "interrupted"),
+        (deployment(dry_run=True), None, "dry run"),
+    ],
+)
+def test_what_counts(made, counts, ended):
+    assert (made.success, made.ended) == (counts, ended)
+
+
+def test_who_was_not_judged_is_named_and_dry_runs_stand_beside():
+    made = [deployment(True), deployment(fault=REFLEX), deployment(), deployment(interrupted=True)]
+    made += [deployment(dry_run=True), deployment(True, dry_run=True)]
+    said = deployments.verdict(made)
+    assert said.startswith("Success 50.0 % of 2 (") and "), 2 not judged. Ended by a fault: 1. " in said
+    assert said.endswith(" in 40 steps. Beside them 2 dry runs.")
+    assert deployments.verdict(made[2:4]).startswith("Success none was judged. Ended by a fault: 0.")
+
+
+def test_the_page_says_what_counts(tmp_path):
+    folder = tmp_path / "20261128-120000"
+    folder.mkdir()
+    (folder / "steps.jsonl").touch()
+    (folder / "report.json").write_text(json.dumps(deployment(fault=REFLEX).report))
+    page = deployments.write(tmp_path, deployments.find(tmp_path)).read_text()
+    assert "Success 0.0 % of 1" in page
+    assert "those that a fault ended, which failed unless report.json says otherwise" in page

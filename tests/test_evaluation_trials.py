@@ -1,0 +1,233 @@
+"""Trials of a policy on a rig: what it is shown, which logs are of the same trials, who works in a folder."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app import table2
+from ddgrasp import artifacts
+from ddgrasp.config import Config
+from ddgrasp.errors import UserError
+from ddgrasp.presets import get_preset
+from ddgrasp.progress import Progress
+from deploy import treatment
+from deploy.policy import POLICY_FILE, OnnxPolicy
+from deploy.trial_log import read_log
+from deploy_support import constant_bias, describe, write_policy
+from evaluation import rig_trials
+from evaluation.report import trials_page
+from evaluation.rig_trials import Series, differing
+from evaluation.table2.rows import ROWS
+from foundation import store
+from sensors.inpainting import inpainted
+from weights_support import depth_anything_v2_small
+
+CONFIG = get_preset("debug")
+PROFILE = CONFIG.world.profile
+SERIES = Series("development", ("cube",), trials=1, seconds=0.5)
+QUIET = Progress(quiet=True)
+
+
+@pytest.fixture
+def policy(tmp_path) -> Path:
+    info = describe(depth_height=PROFILE.height_px, depth_width=PROFILE.width_px)
+    return write_policy(tmp_path / "policy.onnx", info, bias=constant_bias(0.0))
+
+
+@pytest.fixture
+def seen(monkeypatch) -> list[np.ndarray]:
+    """Every frame that a policy is given from here on, in this process."""
+    frames, act = [], OnnxPolicy.act
+
+    def watched(self, depth, state):
+        frames.append(depth.copy())
+        return act(self, depth, state)
+
+    monkeypatch.setattr(OnnxPolicy, "act", watched)
+    return frames
+
+
+@pytest.fixture
+def small_network(tmp_path_factory, monkeypatch) -> Config:
+    """A configuration with which the monocular network, with random weights, takes little time."""
+    depth_anything_v2_small(tmp_path_factory.getbasetemp())
+    monkeypatch.setattr(store, "WEIGHTS_DIR", tmp_path_factory.getbasetemp())
+    prior = replace(CONFIG.ddg.prior, input_px=28)
+    return replace(CONFIG, ddg=replace(CONFIG.ddg, prior=prior))
+
+
+def holes(frames: list[np.ndarray]) -> list[int]:
+    return [int((frame == 0).sum()) for frame in frames]
+
+
+# --- what the policy is shown --------------------------------------------------------------------
+
+
+def test_a_policy_is_shown_depth_as_recorded_or_inpainted(tmp_path, policy, seen):
+    rig_trials.run(CONFIG, policy, SERIES, tmp_path / "recorded", 0, QUIET)
+    recorded = [*seen]
+    assert len(recorded) == 5 and min(holes(recorded)) > 100
+    seen.clear()
+    rig_trials.run(CONFIG, policy, replace(SERIES, depth="inpaint"), tmp_path / "inpaint", 0, QUIET)
+    assert holes(seen) == [0] * 5
+    np.testing.assert_array_equal(seen[0], inpainted(recorded[0]))
+
+
+def test_a_policy_is_shown_the_monocular_network_s_depth(tmp_path, policy, seen, small_network):
+    rig_trials.run(small_network, policy, replace(SERIES, depth="monocular"), tmp_path / "out", 0, QUIET)
+    assert len(seen) == 5 and holes(seen) == [0] * 5
+
+
+@pytest.mark.flaky(reruns=2, only_rerun=["UDP receive: Timeout"])
+def test_so_it_is_on_the_test_rig(tmp_path, policy, seen, open_gl, monkeypatch):
+    pytest.importorskip("franky_sim", reason="needs pip install -e '.[fr3]'")
+    pytest.importorskip("franky", reason="needs pip install -e '.[fr3]'")
+    recorded = []
+
+    def kept(depth, radius_px):
+        recorded.append(depth.copy())
+        return inpainted(depth, radius_px)
+
+    monkeypatch.setattr(treatment, "inpainted", kept)
+    fr3 = replace(SERIES, rig="fr3", shapes="primitive", camera="coarse", depth="inpaint")
+    rig_trials.run(CONFIG, policy, fr3, tmp_path, 0, QUIET)
+    assert min(holes(recorded)) > 100 and holes(seen) == [0] * 5
+
+
+@pytest.mark.parametrize("row", ["inpaint", "monocular"])
+def test_so_it_is_in_table_2(tmp_path, policy, seen, small_network, row):
+    assert ROWS[row].depth == row
+    exported = artifacts.finish(tmp_path / "export", "export", small_network, seconds=0.0, metrics={})
+    policy.rename(exported.directory / POLICY_FILE)
+    study = table2.Study(small_network, tmp_path / "study", (row,), SERIES, 0, {})
+    table2._try(study, row, small_network, exported)
+    assert len(seen) == 5 and holes(seen) == [0] * 5
+
+
+# --- which trials are the same -------------------------------------------------------------------
+
+HEADER = {"rig": "fr3", "shapes": "mesh", "split": "test", "number": 3, "seconds": 12.0, "rules": 2}
+HEADER |= {
+    "ends": "with success",
+    "draws_hash": "ab",
+    "camera": "stereo",
+    "contact": 30.0,
+    "retry": True,
+    "policy_sha256": "1",
+}
+
+
+def beside(tmp_path: Path, **changes) -> str:
+    """What the page says of a log with this header beside HEADER's."""
+    made = []
+    for name, header in (("one", HEADER), ("other", {**HEADER, **changes})):
+        lines = [{key: value for key, value in header.items() if value is not None}, TRIAL]
+        (tmp_path / name).mkdir()
+        (tmp_path / name / rig_trials.TRIALS_FILE).write_text("".join(json.dumps(v) + "\n" for v in lines))
+        assert (trials := trials_page.find(tmp_path / name)) is not None
+        made.append(trials)
+    return trials_page.compare(made)[1][-1][-1]
+
+
+TIMES = ("sense_s", "infer_s", "act_s", "latency_s", "period_s")
+TRIAL = {"index": 0, "object_name": "cube", "realtime": False, "success": True, "steps": 1, "holds": 0}
+TRIAL |= {"missed_deadlines": 0, "safety": {}, "events": [], **dict.fromkeys(TIMES, [])}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rig": "development"}, {"shapes": "primitive"}, {"split": "development"}, {"number": 4},
+        {"seconds": 6.0}, {"rules": 1}, {"rules": None}, {"ends": "when the time is over"},
+        {"draws_hash": "cd"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_logs_of_other_trials_are_not_paired(tmp_path, change):
+    assert beside(tmp_path, **change) == "other trials"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"policy_sha256": "2"}, {"camera": "ideal"}, {"contact": 100.0}, {"retry": False}, {"depth": "inpaint"},
+     {"draws_hash": None}],
+    ids=str,
+)  # fmt: skip
+def test_logs_of_the_same_trials_tried_otherwise_are_paired(tmp_path, change):
+    assert beside(tmp_path, **change) == "0 won, 0 lost of 1, p 1"
+
+
+def test_headers_say_in_what_they_differ():
+    assert differing(HEADER, HEADER) == []
+    other = {**HEADER, "rules": 1, "contact": 100.0}
+    assert differing(other, HEADER) == ["rules is 1, not 2"]
+    assert differing(other, HEADER, ("contact",)) == ["rules is 1, not 2", "contact is 100.0, not 30.0"]
+    development = {"rig": "development"}  # whose arm does not stop itself
+    assert differing({**HEADER, **development}, {**other, **development, "rules": 2}, ("contact",)) == []
+
+
+def test_a_header_says_what_the_policy_sees_and_what_its_trials_are_drawn_from(policy):
+    def header(config: Config = CONFIG, **changes) -> dict:
+        series = replace(SERIES, **changes)
+        return rig_trials._header(series.configured(config, policy), policy, series)
+
+    assert header(depth="inpaint")["depth"] == "inpaint" and "depth" not in header()
+    assert differing(header(depth="inpaint"), header()) == []
+    for section, changed in (
+        ("world", replace(CONFIG.world, random=replace(CONFIG.world.random, camera_position_m=0.03))),
+        ("world", replace(CONFIG.world, random=replace(CONFIG.world.random, joint_rad=0.0))),
+        ("record", replace(CONFIG.record, stereo=replace(CONFIG.record.stereo, lens_blur_px=1.0))),
+    ):
+        (found,) = differing(header(replace(CONFIG, **{section: changed})), header())
+        assert found.startswith("draws_hash is ")
+    trained_otherwise = replace(CONFIG, student=replace(CONFIG.student, depth_source="ideal"))
+    assert differing(header(trained_otherwise), header()) == []
+
+
+def test_a_log_of_before_goes_on_and_keeps_its_header(tmp_path, policy):
+    rig_trials.run(CONFIG, policy, SERIES, tmp_path, 0, QUIET)
+    log = tmp_path / rig_trials.TRIALS_FILE
+    header, *trials = log.read_text().splitlines(keepends=True)
+    before = {key: value for key, value in json.loads(header).items() if key != "draws_hash"}
+    log.write_text("".join([json.dumps(before) + "\n", *trials]))
+    rig_trials.run(CONFIG, policy, replace(SERIES, trials=2), tmp_path, 0, QUIET)
+    assert read_log(log)[0] == before and len(read_log(log)[1]) == 2
+    other = replace(CONFIG, world=replace(CONFIG.world, random=replace(CONFIG.world.random, joint_rad=0.0)))
+    with pytest.raises(UserError, match="begun otherwise: config_hash is"):
+        rig_trials.run(other, policy, SERIES, tmp_path, 0, QUIET)
+
+
+# --- one process at a time -----------------------------------------------------------------------
+
+WORKS = """
+import sys, time
+from pathlib import Path
+from ddgrasp.alone import alone_in
+with alone_in(Path(sys.argv[1])):
+    print("at work", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_series_that_runs_already_is_not_run_twice(tmp_path, policy, seen):
+    out = tmp_path / "out"
+    out.mkdir()
+    command = [sys.executable, "-c", WORKS, str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout and other.stdout.readline() == "at work\n"
+        try:
+            with pytest.raises(UserError) as refused:
+                rig_trials.run(CONFIG, policy, SERIES, out, 0, QUIET)
+            rig_trials.run(CONFIG, policy, SERIES, tmp_path / "elsewhere", 0, QUIET)
+        finally:
+            other.kill()
+    assert str(refused.value) == (
+        f"another process is at work in {out}: wait for it, or choose another --out."
+    )
+    assert len(seen) == 5 and not any(out.iterdir())
+    assert rig_trials.run(CONFIG, policy, SERIES, out, 0, QUIET)["all"]["n"] == 1
