@@ -75,7 +75,7 @@ class Frames:
 
 def frames_bytes(config: DDGConfig, count: int) -> int:
     """Bytes of the arrays of `Frames` with `count` frames, and of the priors a second time as they are put
-    together."""
+    together. To read them takes no more, with a built-in prior."""
     return count * config.depth.height_px * config.depth.width_px * (4 + 4 + 2 + 2)
 
 
@@ -93,8 +93,27 @@ def load_frames(
     pictures = sum(1 for folder in folders for _ in (folder / "depth").glob("*.png"))
     host = frames_bytes(config, pictures if max_frames is None else min(pictures, max_frames))
     memory.check(memory.Need("ddg", 0, host, remedy="the number of recordings"), root)
-    depth, priors, index, skipped, refused = [], [], [], 0, []
-    left = sys.maxsize if max_frames is None else max_frames
+    most = sys.maxsize if max_frames is None else max_frames
+    depth, priors, skipped, refused = _read_all(folders, config, prior, seed, progress, most)
+    if not depth:
+        raise UserError(
+            f"{root}: none of its {len(folders)} recording(s) can be used. The first: {refused[0]}"
+        )
+    if skipped or refused:
+        progress.note(f"left out {skipped} frame(s), and {len(refused)} of {len(folders)} recording(s)")
+    index = np.concatenate([np.full(len(frames), number) for number, frames in depth.items()])
+    noisy = np.concatenate(list(depth.values()))
+    depth.clear()  # as large as all that follows
+    surface = surfaces(noisy, config.depth.surface, progress)
+    return Frames(noisy, surface, np.concatenate(priors), index, skipped, len(refused))
+
+
+def _read_all(
+    folders: list[Path], config: DDGConfig, prior: Prior, seed: int, progress: Progress, left: int
+) -> tuple[dict[int, np.ndarray], list[np.ndarray], int, list[UserError]]:
+    """Depth of each recording that can be used, by its number, among the first `left` frames; their priors;
+    number of frames left out of them; why the other recordings were."""
+    depth, priors, skipped, refused = {}, [], 0, []
     for number, folder in enumerate(progress.track(folders, "reading recordings")):
         if not left:
             break
@@ -112,26 +131,10 @@ def load_frames(
             progress.note(f"left out: {error}")
             continue
         skipped += left_out
-        c = prior.from_recording(frames, rgb, np.random.default_rng((seed, number)))
-        priors.append(c.astype(np.float16))
-        depth.append(frames)
-        index.append(np.full(len(frames), number))
-    if not depth:
-        raise UserError(
-            f"{root}: none of its {len(folders)} recording(s) can be used. The first: {refused[0]}"
-        )
-    if skipped or refused:
-        progress.note(f"left out {skipped} frame(s), and {len(refused)} of {len(folders)} recording(s)")
-    noisy = np.concatenate(depth)
-    depth.clear()  # as large as all that follows
-    return Frames(
-        noisy,
-        surfaces(noisy, config.depth.surface, progress),
-        np.concatenate(priors),
-        np.concatenate(index),
-        skipped,
-        len(refused),
-    )
+        rng = np.random.default_rng((seed, number))
+        priors.append(prior.from_recording(frames, rgb, rng).astype(np.float16))
+        depth[number] = frames
+    return depth, priors, skipped, refused
 
 
 def surfaces(

@@ -22,6 +22,7 @@ from ddgrasp import depth
 from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
 from ddgrasp.job import Job
+from demos.store import STORE as DEMOS
 from demos.store import EpisodeStore
 from mjx_envs.views import Views
 
@@ -117,7 +118,7 @@ def run(job: Job) -> Artifact:
     """
     config, directory, progress = job.config, job.directory, job.progress
     generator = Generator.load(job.parents["ddg"].directory)
-    clean = EpisodeStore(job.parents["demos"].directory / "episodes.zarr")
+    clean = EpisodeStore(job.parents["demos"].directory / DEMOS)
     noisy = EpisodeStore(directory / STORE, create=True)
     ends = np.concatenate([[0], clean.ends])
     if generator.prior.needs_sim_rgb and "rgb" not in clean.fields:

@@ -19,4 +19,7 @@ def normalise(inverse: Float[np.ndarray, "T H W"]) -> Float32[np.ndarray, "T H W
     sample = inverse.reshape(-1)[::STATISTICS_STRIDE]
     shift = np.median(sample)
     scale = 2 * np.mean(np.abs(sample - shift)) + 1e-6
-    return np.clip((inverse - shift) / scale, -NORMALISED_LIMIT, NORMALISED_LIMIT).astype(np.float32)
+    made = np.empty(inverse.shape, np.float32)
+    for into, frame in zip(made, inverse, strict=True):  # a long sequence's temporary arrays are as long
+        into[:] = np.clip((frame - shift) / scale, -NORMALISED_LIMIT, NORMALISED_LIMIT)
+    return made

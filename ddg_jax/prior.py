@@ -11,7 +11,8 @@ smoothing; with planes, large ones are made flat besides, since what the camera 
 and never does in simulation.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import chain
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -82,16 +83,17 @@ class InverseDepthPrior:
         rgb: UInt8[np.ndarray, "T h w 3"] | None,
         rng: np.random.Generator,
     ) -> Float32[np.ndarray, "T H W"]:
-        """See `Prior`; `rng` chooses the frames filled under decoy holes and their shapes."""
-        inverse = invert(depth_m)
-        holes = inverse == 0
-        for t in np.flatnonzero(rng.random(len(inverse)) < self.decoy_share):
-            inverse[t][decoy_holes(holes[rng.integers(len(holes))], rng)] = 0
+        """See `Prior`; `rng` chooses the frames filled under decoy holes and their shapes.
+
+        Frame by frame: each stage of a whole recording's would be as large as the recording.
+        """
+        inverse = self._with_decoys(depth_m, rng)
         if self.surface == PIECEWISE:
-            return self._scaled(self._blurred([piecewise_smooth(frame) for frame in inverse]))
-        filled = np.stack([fill_from_background(frame) for frame in inverse])
-        smooth = map(smooth_surface, smooth_in_time(filled))
-        return self._scaled(self._blurred(map(on_planes, smooth) if self.surface == PLANES else smooth))
+            return self._scaled(self._blurred(map(piecewise_smooth, inverse), depth_m.shape))
+        smooth = map(smooth_surface, smooth_in_time(map(fill_from_background, inverse)))
+        if self.surface == PLANES:
+            smooth = map(on_planes, smooth)
+        return self._scaled(self._blurred(smooth, depth_m.shape))
 
     def from_sim(
         self, depth_m: Float[np.ndarray, "T H W"], rgb: UInt8[np.ndarray, "T h w 3"] | None = None
@@ -100,15 +102,26 @@ class InverseDepthPrior:
         inverse = invert(depth_m)
         # Filters that edges do not survive whole are passed by both sides.
         seen = inverse if self.surface == PIECEWISE else map(smooth_surface, inverse)
-        return self._scaled(self._blurred(seen))
+        return self._scaled(self._blurred(seen, depth_m.shape))
+
+    def _with_decoys(self, depth_m: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
+        """Inverse depth of each frame, of some with another frame's holes besides."""
+        for frame, decoy in zip(depth_m, rng.random(len(depth_m)) < self.decoy_share, strict=True):
+            inverse = invert(frame)
+            if decoy:
+                holes = invert(depth_m[rng.integers(len(depth_m))]) == 0
+                inverse[decoy_holes(holes, rng)] = 0
+            yield inverse
 
     def _scaled(self, inverse: np.ndarray) -> np.ndarray:
+        """c of inverse depth that nobody else needs."""
         return normalise(inverse)
 
-    def _blurred(self, inverse: Iterable[np.ndarray]) -> np.ndarray:
-        if self.blur_px > 0:
-            inverse = (cv2.GaussianBlur(frame, (0, 0), self.blur_px) for frame in inverse)
-        return np.stack(list(inverse))
+    def _blurred(self, inverse: Iterable[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+        made = np.empty(shape, np.float32)
+        for into, frame in zip(made, inverse, strict=True):
+            into[:] = cv2.GaussianBlur(frame, (0, 0), self.blur_px) if self.blur_px > 0 else frame
+        return made
 
 
 class MetricInverseDepthPrior(InverseDepthPrior):
@@ -121,7 +134,10 @@ class MetricInverseDepthPrior(InverseDepthPrior):
     name = "metric_inverse_depth"
 
     def _scaled(self, inverse: np.ndarray) -> np.ndarray:
-        return 2 * np.minimum(inverse, 1 / NEAREST_M) - 2
+        np.minimum(inverse, 1 / NEAREST_M, out=inverse)
+        inverse *= 2
+        inverse -= 2
+        return inverse
 
 
 _BUILT_IN = {kind.name: kind for kind in (InverseDepthPrior, MetricInverseDepthPrior)}
@@ -141,11 +157,19 @@ def decoy_holes(holes: Bool[np.ndarray, "H W"], rng: np.random.Generator) -> Boo
     return np.roll(holes, shift, axis=(0, 1))
 
 
-def smooth_in_time(inverse: Float[np.ndarray, "T H W"]) -> Float[np.ndarray, "T H W"]:
-    """Mean over each frame and its two neighbours (T, H, W), of pixels that still see the same surface."""
+def smooth_in_time(inverse: Iterable[Float[np.ndarray, "H W"]]) -> Iterator[Float[np.ndarray, "H W"]]:
+    """Mean over each frame (H, W) and its two neighbours, of pixels that still see the same surface."""
+    before, now = None, None
+    for after in chain(inverse, (None,)):
+        if now is not None:
+            yield _mean_of_surface(now, [frame for frame in (before, after) if frame is not None])
+        before, now = now, after
+
+
+def _mean_of_surface(inverse: np.ndarray, others: Iterable[np.ndarray]) -> np.ndarray:
     total, count = inverse.copy(), np.ones_like(inverse)
-    for here, there in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
-        same = np.abs(inverse[there] - inverse[here]) < SAME_SURFACE * inverse[here]
-        total[here] += np.where(same, inverse[there], 0)
-        count[here] += same
+    for other in others:
+        same = np.abs(other - inverse) < SAME_SURFACE * inverse
+        total += np.where(same, other, 0)
+        count += same
     return total / count

@@ -257,7 +257,7 @@ def grafted(
     parts = []
     for start in range(0, len(depth_m), size):
         now = slice(start, start + size)
-        made = _graft(config, _filled_up(depth_m[now], size), _filled_up(sized[now], size))
+        made = _graft(config, _batch(depth_m[now], size), _batch(sized[now], size))
         parts.append([np.asarray(part)[: len(depth_m[now])] for part in made])
     return Generated(*map(np.concatenate, zip(*parts, strict=True)))
 
@@ -303,9 +303,9 @@ def predict(
             config,
             key,
             params,
-            jax.device_put(_filled_up(c[now], size), split),
-            jnp.asarray(number) if number.ndim == 0 else jax.device_put(_filled_up(number[now], size), split),
-            jax.device_put(_filled_up(frame[now], size), split),
+            jax.device_put(_batch(c[now], size), split),
+            jnp.asarray(number) if number.ndim == 0 else jax.device_put(_batch(number[now], size), split),
+            jax.device_put(_batch(frame[now], size), split),
             steps=steps or config.sampling.steps,
         )
         made.append(x)
@@ -314,9 +314,14 @@ def predict(
     return np.concatenate([np.asarray(x) for x in made])[: len(c)]
 
 
-def _filled_up(values: np.ndarray, size: int) -> np.ndarray:
-    """`values` (n <= size, ...) with zeros behind them up to `size`; float32 if floating."""
-    values = np.asarray(values, np.float32 if np.issubdtype(values.dtype, np.floating) else np.int32)
+def _batch(values: np.ndarray, size: int) -> np.ndarray:
+    """`filled_up` as float32, or int32 of whole numbers."""
+    floats = np.issubdtype(values.dtype, np.floating)
+    return filled_up(np.asarray(values, np.float32 if floats else np.int32), size)
+
+
+def filled_up(values: np.ndarray, size: int) -> np.ndarray:
+    """`values` (n <= size, ...) with zeros behind them up to `size`."""
     return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype)])
 
 

@@ -151,7 +151,7 @@ def flicker_fraction(valid: Bool[np.ndarray, "N H W"], recording: Int[np.ndarray
     recording (N,). nan if every frame is from another one.
     """
     same = recording[1:] == recording[:-1]
-    return float(np.mean((valid[1:] != valid[:-1])[same])) if same.any() else float("nan")
+    return float(np.mean(stats.validity_changes(valid)[same])) if same.any() else float("nan")
 
 
 def deviation_statistics(

@@ -6,16 +6,18 @@ Imports no JAX, so that a command can say it before it begins.
 from operator import attrgetter
 from pathlib import Path
 
+from ddg_jax.network_prior import NETWORKS, weights_folder
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import holding, shipped
+from foundation import store
 
 _THE_SAME = (
     "depth.height_px", "depth.width_px", "depth.representation", "training.hole_loss", "depth.surface",
-    "depth.near_m", "depth.far_m", "prior.source", "unet.space_to_depth", "unet.widths", "unet.blocks",
-    "unet.attention_heads", "unet.position", "diffusion.steps", "diffusion.schedule",
-    "diffusion.log_snr_shift",
+    "depth.near_m", "depth.far_m", "prior.source", "prior.blur_px", "prior.input_px", "prior.noise",
+    "unet.space_to_depth", "unet.widths", "unet.blocks", "unet.attention_heads", "unet.position",
+    "diffusion.steps", "diffusion.schedule", "diffusion.log_snr_shift",
 )  # fmt: skip
 """Values that a fitted network cannot be used without: its shape, and what its numbers stand for."""
 
@@ -30,11 +32,27 @@ def check(config: DDGConfig) -> None:
     `config`."""
     source = folder(config)
     artifacts.check_stage("ddg.init_from", source, "ddg")
-    fitted = artifacts.config_from_json(artifacts.read_manifest(source).config).ddg
+    manifest = artifacts.read_manifest(source)
+    fitted = artifacts.config_from_json(manifest.config).ddg
+    network = config.prior.source in NETWORKS
+    unused = "prior.blur_px" if network else "prior.input_px"
     for name in _THE_SAME:
         there, here = map(attrgetter(name), (fitted, config))
-        if there != here:
+        if there != here and name != unused:
             raise UserError(
                 f"The generator in {source} has ddg.{name} {there!r}, this configuration {here!r}: "
                 "use the same value, or fit a new one (name none to begin with)."
             )
+    if network:
+        _check_weights(source, manifest.metrics.get("prior_source"), weights_folder(config))
+
+
+def _check_weights(source: Path, fitted_on: object, weights: Path) -> None:
+    """UserError if the prior's `weights` are not of the file that the generator in `source` was fitted on."""
+    here = store.read_manifest(weights).source_sha256
+    there = fitted_on.get("source_sha256", here) if isinstance(fitted_on, dict) else here
+    if there != here:
+        raise UserError(
+            f"The generator in {source} was fitted on a prior by weights of SHA-256 {there[:8]}, those in "
+            f"{weights} are of {here[:8]}: give the same (ddg.prior.weights), or fit a new one."
+        )

@@ -6,6 +6,7 @@ keyed by seed, phase and step, so a resumed plan goes the way an uninterrupted o
 stopped while it put away the episodes of a round of DAgger: those that are missing are acted anew.
 """
 
+import contextlib
 import json
 import shutil
 from collections.abc import Callable
@@ -96,21 +97,31 @@ class Trainer:
         measured = work()
         self._done.append(name)
         self.history.append({"phase": name, "frames": self.frame_count} | measured)
-        save_params(self._directory / PARAMS_FILE, self.params)
+        # Under the name of its phase until the plan has it: who is killed in between does not train it twice.
+        save_params(self._directory / _made_by(name), self.params)
         atomic_write_json(self._directory / PLAN, {"done": self._done, "history": self.history})
+        self._take_over(name)
         shutil.rmtree(self._directory / CHECKPOINTS, ignore_errors=True)
+
+    def _take_over(self, phase: str) -> None:
+        """Makes the parameters of a finished phase the student's, unless they are."""
+        with contextlib.suppress(FileNotFoundError):
+            (self._directory / _made_by(phase)).replace(self._directory / PARAMS_FILE)
 
     def _restore(self) -> None:
         plan = self._directory / PLAN
         if plan.exists():
             state = json.loads(plan.read_text())
             self._done, self.history = state["done"], state["history"]
+            self._take_over(self._done[-1])
             self.params = load_params(self._directory / PARAMS_FILE)
             self._progress.note(f"going on after phase {self._done[-1]!r}")
             return
         self.params = init_params(jax.random.key(self._config.seed), self._student, self._profile)
         if self._student.init_from:
             self.params = start.load(self._student, self.params)
+            if change := start.change_of_pictures(self._student):
+                self._progress.note(change)
         else:
             self.params["encoder"] = pretrained_encoder.load_into(self.params["encoder"], self._student)
 
@@ -194,6 +205,11 @@ class Trainer:
             )
         self.params = frozen | jax.tree.map(np.asarray, state.ema)
         return terms
+
+
+def _made_by(phase: str) -> str:
+    """Name of the file with a phase's parameters until they are the student's."""
+    return f"params-{phase}.msgpack"
 
 
 def _phase_number(phase: str) -> int:

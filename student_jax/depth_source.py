@@ -18,7 +18,7 @@ from jaxtyping import Int, Key, UInt8, UInt16
 
 from ddg_jax.generate import Clip, by_frames, made_mm, noisy_episodes
 from ddg_jax.monocular import MonocularDepth
-from ddg_jax.sample import Generator, generate
+from ddg_jax.sample import Generator, filled_up, generate
 from ddg_jax.sensor import make_sensor
 from ddgrasp.config import BY_COLOUR, Config, DextrahConfig, SensorConfig
 from ddgrasp.depth import to_metres, to_millimetres
@@ -180,7 +180,7 @@ class SenseSource:
                 frame[now],
             )
             count = len(batch[0])
-            sensed = _sensed(self.sense, self.key, *jax.tree.map(_filled_up, batch))
+            sensed = _sensed(self.sense, self.key, *jax.tree.map(partial(filled_up, size=_BATCH), batch))
             parts.append(np.asarray(sensed)[:count])
         return to_millimetres(np.concatenate(parts))
 
@@ -232,8 +232,3 @@ def _sensed(sense: Sense, key, depth_m, rgb, episode, frame):
         return sense(jax.random.fold_in(jax.random.fold_in(key, e), t), depth, picture)
 
     return jax.vmap(one)(depth_m, rgb, jnp.asarray(episode), jnp.asarray(frame))
-
-
-def _filled_up(values: np.ndarray) -> np.ndarray:
-    """`values` (n <= _BATCH, ...) with zeros behind them."""
-    return np.concatenate([values, np.zeros((_BATCH - len(values), *values.shape[1:]), values.dtype)])

@@ -58,10 +58,11 @@ def position_error_mm(config: Config, params: Any, episodes: Episodes, seen: Spo
         length = min(len(seen), int(episodes.length[number]))
         columns = (episodes.state, episodes.action, episodes.observation, episodes.held)
         frames = make_frames([seen.episode(number, length)], *([x[number, :length]] for x in columns))
-        before = np.flatnonzero(frames.held == 0)
-        if not len(before):
+        grasped = np.flatnonzero(frames.held)
+        before = int(grasped[0]) if len(grasped) else length
+        if not before:
             continue
-        at = before[np.linspace(0, len(before) - 1, LOOKS).astype(int)]
+        at = np.linspace(0, before - 1, LOOKS).astype(int)
         aux = perceive(config.student, config.world.profile, params, frames.depth_stack(at), frames.state[at])
         truth = aux_targets(frames.observation[at], frames.held[at])
         away_m = np.asarray(position_to_world(aux.position)) - np.asarray(position_to_world(truth.position))

@@ -6,11 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from ddg_jax import network_prior, sample
+from ddg_jax import network_prior, sample, start
 from ddg_jax.generate import Clip
 from ddg_jax.inverse_depth import NORMALISED_LIMIT, invert, normalise
 from ddg_jax.monocular import MonocularDepth
 from ddg_jax.prior import InverseDepthPrior, make_prior
+from ddgrasp import artifacts
 from ddgrasp.config import (
     Config,
     DDGConfig,
@@ -108,6 +109,26 @@ def test_what_was_used_is_said(weights):
         make_prior(DDGConfig(prior=PriorConfig(source="video_depth_anythin")))
     with pytest.raises(UserError, match="Did you mean 'depth'"):
         make_prior(config(weights, in_sim="deph"))
+
+
+def test_a_generator_starts_with_the_weights_it_was_fitted_on_wherever_they_lie(weights, tmp_path):
+    fitted = config(weights)
+    metrics = {"prior_source": make_prior(fitted).source}
+    artifacts.finish(tmp_path / "ddg", "ddg", Config("test", ddg=fitted), seconds=1.0, metrics=metrics)
+    for name, digest in (("moved", "ab12"), ("other", "cd34")):
+        (tmp_path / name).mkdir()
+        said = (weights / store.MANIFEST).read_text().replace("ab12", digest)
+        (tmp_path / name / store.MANIFEST).write_text(said)
+
+    def starting(folder: str, **prior) -> DDGConfig:
+        given = config(tmp_path / folder)
+        return replace(given, init_from=str(tmp_path / "ddg"), prior=replace(given.prior, **prior))
+
+    start.check(starting("moved", blur_px=3.0, in_sim="rgb"))
+    with pytest.raises(UserError, match="by weights of SHA-256 ab12, those in .*other are of cd34: give"):
+        start.check(starting("other"))
+    with pytest.raises(UserError, match="ddg.prior.input_px 28, this configuration 42"):
+        start.check(starting("moved", input_px=42))
 
 
 def test_prior_and_depth_of_other_aspect_ratios_show_the_same_part():

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from ddg_jax import distil, sample, train
@@ -23,6 +24,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress, read_curves
 from learning import diffusion
 from learning.params import load_params
+from learning.train_state import first_state
 
 TINY = DDGConfig(
     depth=DDGDepthConfig(height_px=16, width_px=24),
@@ -122,6 +124,28 @@ def test_one_step_to_the_target_ends_where_the_teacher_does():
     step = diffusion.ddim_coefficients(made, k, end, x_k)
     np.testing.assert_allclose(diffusion.ddim_step(step, x_k, eps, None), x_end, atol=2e-5)
     np.testing.assert_allclose(x_0[2], x_end[2], atol=1e-6)  # the last step ends at x_0 itself
+
+
+def test_teacher_and_student_see_the_prior_under_the_same_noise(monkeypatch):
+    """Not compiled; in the networks' place what they are given."""
+    given = []
+
+    def clean(config, params, x_k, c, step):
+        given.append(np.asarray(c))
+        return params["w"] * x_k
+
+    monkeypatch.setattr(distil, "predict_clean", clean)
+    monkeypatch.setattr(distil, "updated", lambda state, *_: state)
+    config = dataclasses.replace(DISTILLED, prior=PriorConfig(noise=0.2))
+    params = {"w": jnp.float32(0.5)}
+    state = first_state(params, optax.identity(), jax.random.key_data(jax.random.key(0)))
+    path = distil.teacher_path(100, 4, np.array([0, 1, 2, 3]), "trailing")
+    x_0, c = jnp.zeros((4, 16, 24, 2)), jnp.full((4, 16, 24), 0.7)
+    distil.distil_step.__wrapped__(config, state, params, 1.0, path, x_0, c)
+    assert len(given) == 2
+    np.testing.assert_array_equal(given[0], given[1])
+    off = given[0] - np.float32(0.7)
+    assert off.std() == pytest.approx(0.2, rel=0.05) and abs(off.mean()) < 0.02
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """The built-in prior and the loading of recordings, by value on small pictures."""
 
 import json
+import tracemalloc
 from functools import partial
 
 import cv2
@@ -74,8 +75,33 @@ def test_temporal_smoothing_averages_one_surface_and_keeps_moving_edges():
     inverse = np.ones((3, 1, 2), np.float32)
     inverse[:, 0, 0] = (1.0, 1.03, 1.0)
     inverse[:, 0, 1] = (1.0, 2.0, 1.0)
-    smooth = prior.smooth_in_time(inverse)
-    np.testing.assert_allclose(smooth[1, 0], [1.01, 2.0], atol=1e-6)
+    smooth = list(prior.smooth_in_time(inverse))
+    assert len(smooth) == 3
+    np.testing.assert_allclose(smooth[1][0], [1.01, 2.0], atol=1e-6)
+    np.testing.assert_allclose(smooth[2][0], [1.015, 1.0], atol=1e-6)
+
+
+def test_a_decoy_is_a_hole_moved_anywhere():
+    holes = np.zeros((4, 6), bool)
+    holes[1:3, 2] = True
+    rng = np.random.default_rng(0)
+    moved = [prior.decoy_holes(holes, rng) for _ in range(400)]
+    assert {int(decoy.sum()) for decoy in moved} == {2}
+    assert len({decoy.tobytes() for decoy in moved}) == holes.size
+
+
+@pytest.mark.parametrize(("share", "least", "most"), [(0.0, 0, 0), (0.5, 6, 14), (1.0, 20, 20)])
+def test_a_share_of_the_frames_is_filled_under_a_decoy_too(share, least, most):
+    """A slope, whose filled pixels are flat; in turn so much nearer that no frame is smoothed by the next."""
+    slope = np.broadcast_to(np.linspace(1.0, 2.0, 48, dtype=np.float32), (20, 36, 48))
+    depth = slope * np.where(np.arange(20) % 2, 1.0, 0.6).astype(np.float32)[:, None, None]
+    depth[:, 10:16, 20:28] = 0
+    plain, made = (
+        prior.MetricInverseDepthPrior(0.0, x).from_recording(depth, None, np.random.default_rng(0))
+        for x in (0.0, share)
+    )
+    elsewhere = np.abs(made - plain) > 0.01
+    assert least <= elsewhere.any(axis=(1, 2)).sum() <= most
 
 
 def test_resizing_never_mixes_holes_into_surfaces():
@@ -225,6 +251,18 @@ def test_more_recordings_than_memory_are_refused_before_any_is_read(recordings, 
         load(recordings)
 
 
+def test_one_long_recording_takes_what_is_said_of_it(tmp_path):
+    _record(tmp_path / "long", frames=50, size=(54, 96))
+    config = DDGConfig(depth=DDGDepthConfig(height_px=54, width_px=96))
+    tracemalloc.start()
+    try:
+        frames, _ = load(tmp_path, config)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 1.2 * data.frames_bytes(config, len(frames))
+
+
 def test_colour_of_another_view_is_refused_where_the_prior_comes_from_it(tmp_path):
     class OfColour(prior.InverseDepthPrior):
         needs_rgb = True
@@ -270,3 +308,20 @@ def test_half_of_a_batch_is_upside_down_unless_the_network_knows_where_it_is(pos
     priors = data.make_batch(frames, config, seed=0, step=0).c
     turned = np.mean(priors[:, 0, 0] > 0)
     assert turned == 0.0 if position else 0.3 < turned < 0.7
+
+
+def test_a_batch_s_priors_are_off_in_scale_and_shift_by_the_jitter_at_most():
+    depth = np.ones((1, 8, 12), np.float32)
+    c = np.random.default_rng(0).normal(size=depth.shape).astype(np.float16)
+    config = DDGConfig(
+        prior=PriorConfig(jitter=0.1),
+        unet=UNetConfig(position=True),
+        training=DDGTrainingConfig(batch_size=32),
+    )
+    made = data.make_batch(data.Frames(depth, depth, c, np.zeros(1, int)), config, seed=0, step=0).c
+    straight = np.polyfit(c.ravel().astype(float), made.reshape(32, -1).T, 1)
+    scale, shift = straight
+    for off in (scale - 1, shift):
+        assert 0.08 < np.abs(off).max() <= 0.1 + 1e-6 and 0.04 < off.std() < 0.08
+    line = scale[:, None, None] * c + shift[:, None, None]
+    np.testing.assert_allclose(made, line, atol=1e-5)

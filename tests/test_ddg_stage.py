@@ -1,5 +1,6 @@
 """The stage from recordings on disk to a generator that loads again, at a size that takes seconds."""
 
+import contextlib
 import dataclasses
 
 import cv2
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.commands import parse
-from ddg_jax import stage
+from ddg_jax import stage, start
 from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator, generate, predict
 from ddgrasp.config import (
@@ -167,6 +168,22 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
         other = dataclasses.replace(config, ddg=dataclasses.replace(config.ddg, **change))
         with pytest.raises(UserError, match=message):
             stage.run(make_job("ddg", other, tmp_path / "other", Progress(quiet=True), data=recordings))
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        ({"blur_px": 2.0}, "ddg.prior.blur_px 1.0, this configuration 2.0"),
+        ({"noise": 0.1}, "ddg.prior.noise 0.03, this configuration 0.1"),
+        ({"source": "metric_inverse_depth"}, "ddg.prior.source 'inverse_depth'"),
+        ({"jitter": 0.0, "decoy_holes": 0.0, "in_sim": "rgb", "input_px": 28, "weights": "x"}, ""),
+    ],
+)
+def test_a_generator_starts_with_the_prior_it_was_fitted_on(fitted, prior, message):
+    prior = dataclasses.replace(CONFIG.ddg.prior, **prior)
+    ddg = dataclasses.replace(CONFIG.ddg, init_from=str(fitted.directory), prior=prior)
+    with pytest.raises(UserError, match=message) if message else contextlib.nullcontext():
+        start.check(ddg)
 
 
 def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings, tmp_path):

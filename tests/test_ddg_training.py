@@ -5,6 +5,7 @@ from functools import cache
 
 import jax
 import numpy as np
+import optax
 import pytest
 
 from ddg_jax import sample, train
@@ -27,6 +28,7 @@ from ddgrasp.config import (
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import diffusion as schedule
+from learning.train_state import first_state
 from xla_support import optimized
 
 TINY = DDGConfig(
@@ -126,6 +128,25 @@ def test_cross_entropy_needs_holes_of_their_own_channel():
         )
     with pytest.raises(UserError, match="crossentropy"):
         DDGConfig(training=DDGTrainingConfig(hole_loss="crossentropy"))
+
+
+def test_a_step_puts_the_configured_noise_on_the_prior(monkeypatch):
+    """Not compiled; in the loss's place what the network would be given."""
+    given = []
+
+    def loss(config, params, x_0, c, step, eps):
+        given.append(c)
+        return params["w"]
+
+    monkeypatch.setattr(train, "noise_loss", loss)
+    monkeypatch.setattr(train, "updated", lambda state, *_: state)
+    config = dataclasses.replace(TINY, prior=dataclasses.replace(TINY.prior, noise=0.2))
+    params = {"w": np.float32(1.0)}
+    state = first_state(params, optax.identity(), jax.random.key_data(jax.random.key(0)))
+    x_0, c = np.zeros((8, 16, 24, 2), np.float32), np.full((8, 16, 24), 0.7, np.float32)
+    train.train_step.__wrapped__(config, state, x_0, c)
+    off = np.asarray(given[0]) - c
+    assert off.std() == pytest.approx(0.2, rel=0.05) and abs(off.mean()) < 0.02
 
 
 def test_resume_equals_an_uninterrupted_run(tmp_path):

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from ddgrasp.errors import UserError
+from ddgrasp.layout import ACTION
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from demos import stage
+from demos.rollout import Actor, Scene
 from demos.store import EpisodeStore
 from ppo import policy
 
@@ -22,7 +24,13 @@ QUIET = Progress(quiet=True)
 
 
 @pytest.fixture
-def collect(tmp_path, monkeypatch):
+def actors() -> list[Actor]:
+    """What moved the robots, batch by batch."""
+    return []
+
+
+@pytest.fixture
+def collect(tmp_path, monkeypatch, actors):
     """Collects `episodes` in batches of `parallel`, of which `succeed(batch number, its key)` do; returns
     (tried, stored)."""
 
@@ -31,6 +39,7 @@ def collect(tmp_path, monkeypatch):
 
         def roll(key, actor):
             batches.append(tuple(np.asarray(key).tolist()))
+            actors.append(actor)
             return succeed(len(batches), batches[-1])
 
         def kept(count):
@@ -49,6 +58,16 @@ def collect(tmp_path, monkeypatch):
 
 def test_few_demos_of_a_large_batch_are_enough(collect):
     assert collect(5, 60, lambda *_: 6) == (60, 5)
+
+
+def test_the_teacher_is_disturbed_as_configured(collect, actors):
+    collect(5, 2000, lambda *_: 6)
+    (actor,), settings = actors, get_preset("demo").demos
+    still, picture = np.zeros((2000, 8)), np.zeros((2000, 0, 0), np.uint16)
+    action = actor(Scene(picture, still, still, np.zeros((2000, 40)), np.zeros(2000, bool), 0))
+    pushed = action[:, ACTION.arm].any(axis=1)
+    assert pushed.mean() == pytest.approx(settings.noise_share, rel=0.3)
+    assert action[pushed, ACTION.arm].std() == pytest.approx(settings.action_noise, rel=0.1)
 
 
 def test_a_scene_that_fails_is_not_tried_for_ever(collect):

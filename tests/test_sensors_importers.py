@@ -120,6 +120,36 @@ def test_float_depth_is_metres_unless_its_size_says_otherwise(tmp_path):
     np.testing.assert_array_equal(Recording.open(tmp_path / "right" / "desk").depth_mm(1), depth_mm(1))
 
 
+@pytest.mark.parametrize("unit_m", [1.0, 0.001])
+def test_what_is_lost_of_floating_point_depth_is_said_once(tmp_path, capsys, unit_m):
+    root = make_folder(tmp_path / "desk")
+    for i, file in enumerate(sorted((root / "depth").iterdir())):
+        np.save(file.with_suffix(".npy"), (depth_mm(i).astype(np.float32) + 0.4) / 1000 / unit_m)
+        file.unlink()
+    run(root, "--out", tmp_path / "out", "--depth-unit-m", unit_m)
+    line = f"{tmp_path / 'out' / 'desk'}: floating-point depth was rounded to whole millimetres"
+    assert capsys.readouterr().out.count(line) == 1
+
+
+def test_what_is_hidden_is_no_source(tmp_path, capsys, monkeypatch):
+    """`.desk.partial` is a recording that is not finished, `._desk.bag` what a Mac leaves beside a file."""
+    for name in ("desk", ".desk.partial"):
+        make_folder(tmp_path / "all" / name)
+    (make_folder(tmp_path / "all" / ".grey") / "rgb").rename(tmp_path / "elsewhere")
+    run(tmp_path / "all", "--out", tmp_path / "out")
+    shown = capsys.readouterr().out
+    assert shown.splitlines()[-1] == "1 recordings with 4 frames imported; left out: 0 frames, 0 recordings"
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["desk"]
+    run(tmp_path / "all" / ".desk.partial", "--out", tmp_path / "named")
+    (tmp_path / "all" / "._desk.bag").touch()
+    assert len(importers.find_sources(tmp_path / "all", 0.0, {})[0]) == 1
+    (tmp_path / "all" / "desk.bag").touch()
+    source = importers.folder_source(tmp_path / "all" / "desk", 0.0, {})
+    monkeypatch.setattr("sensors.recordings.realsense.file_source", lambda file: source)
+    sources, refused = importers.find_sources(tmp_path / "all", 0.0, {})
+    assert len(sources) == 1 and [line.split(":")[0] for line in refused] == [str(tmp_path / "all" / "desk")]
+
+
 def test_a_recording_that_is_there_stays(tmp_path):
     root = make_folder(tmp_path / "desk", frames=2)
     run(root, "--out", tmp_path / "out")

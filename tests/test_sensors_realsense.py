@@ -22,8 +22,8 @@ from realsense_support import (
     full_after,
 )
 from sensors.recordings import recording as recording_files
-from sensors.recordings.realsense_live import Pace, frame_count
-from sensors.recordings.recording import Recording
+from sensors.recordings.realsense_live import Pace, Take, frame_count
+from sensors.recordings.recording import Recording, check_fields
 
 SMALL = ("--width", str(SIZE[1]), "--height", str(SIZE[0]))
 TIMEOUT = RuntimeError("Frame didn't arrive within 3000")
@@ -93,7 +93,8 @@ def test_a_live_camera_becomes_a_recording(rs, tmp_path, monkeypatch, capsys):
     )
     meta = Recording.open(tmp_path / "desk").meta
     assert (meta["sensor"], meta["fx_px"], meta["baseline_m"]) == (NAME, FX_PX, 0.095)
-    assert meta["hz"] == (round(50 / (5 + lost), 1) if lost else 10)
+    assert meta["hz"] == (float(f"{50 / (5 + lost):.3g}") if lost else 10)
+    assert meta["consecutive_frames"] == (not lost)
 
 
 def test_a_size_the_camera_does_not_have_is_named(rs, tmp_path, monkeypatch):
@@ -131,7 +132,17 @@ def test_frames_that_writing_was_too_slow_for_are_counted(tmp_path, monkeypatch,
     record(tmp_path, "--frames", 3)
     assert numbers_in(tmp_path / "take") == [16, 23, 30]
     assert "\n2 frames were lost, writing them took too long" in capsys.readouterr().out
-    assert Recording.open(tmp_path / "take").meta["hz"] == 6.0  # 10, but 3 of 5
+    recording = Recording.open(tmp_path / "take")
+    assert recording.meta["hz"] == 6.0 and not recording.consecutive  # 10, but 3 of 5
+
+
+@pytest.mark.parametrize(("take", "hz", "kept"), [
+    (Take(2, 300), 1, 0.00662), (Take(99, 1), 30, 29.7), (Take(7), 30, 30),
+])  # fmt: skip
+def test_the_rate_that_is_left_is_never_none(take, hz, kept):
+    meta = take.meta(hz)
+    assert meta["hz"] == kept
+    check_fields(Path("meta.json"), meta)
 
 
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
@@ -164,13 +175,15 @@ def test_a_camera_that_stops_keeps_what_it_gave(tmp_path, monkeypatch, capsys):
 
 
 def test_a_full_disk_ends_the_take_and_keeps_it(tmp_path, monkeypatch, capsys):
-    library = scripted(monkeypatch, count(1))
+    library = scripted(monkeypatch, [*range(1, 20), *range(28, 40)])  # 22 and 25 are lost before the last
     monkeypatch.setattr(recording_files, "_write", full_after(recording_files._write, files=5))
     with pytest.raises(UserError, match=r"could not be written \(No space left on device\).*kept") as error:
         record(tmp_path, "--frames", 100)
     assert "USB" not in str(error.value) and library.stopped
     assert numbers_in(tmp_path / "take") == [16, 19]
     assert sorted(p.name for p in (tmp_path / "take" / "color").iterdir()) == ["000000.jpg", "000001.jpg"]
+    recording = Recording.open(tmp_path / "take")
+    assert recording.meta["hz"] == 10 and recording.consecutive
     assert capsys.readouterr().out.endswith("take: 2 frames, stopped before the 100 asked for\n")
 
 

@@ -121,6 +121,40 @@ def test_damaged_frames_are_named_and_the_rest_stays_readable(tmp_path):
     np.testing.assert_array_equal(recording.depth_mm(1), _frame(6)[1])
 
 
+@pytest.mark.parametrize(
+    ("damaged", "consecutive"), [((), True), ((6, 7), True), ((11,), True), ((9,), False), ((6, 10), False)]
+)
+def test_a_frame_that_is_left_out_between_others_ends_consecutive_frames(tmp_path, damaged, consecutive):
+    path = _write(tmp_path / "a", frames=6)
+    for index in range(6):  # 6 to 11: in the order of letters 10 comes first
+        (path / "depth" / f"{index:06d}.png").rename(path / "depth" / f"{index + 6}.png")
+        (path / "color" / f"{index:06d}.jpg").rename(path / "color" / f"{index + 6}.jpg")
+    for index in damaged:
+        (path / "color" / f"{index}.jpg").unlink()
+    assert Recording.open(path).consecutive == consecutive
+    _set_meta(path, consecutive_frames=False)
+    assert not Recording.open(path).consecutive
+
+
+@pytest.mark.parametrize("suffix", [".jpeg", ".JPG", ".JPEG", ".PNG"])
+def test_colour_has_the_suffixes_that_can_be_imported(tmp_path, suffix):
+    path = _write(tmp_path / "a", frames=3)
+    for file in sorted((path / "color").iterdir()):
+        named = file.with_suffix(suffix)
+        if suffix == ".PNG":
+            named.write_bytes(cv2.imencode(".png", cv2.imread(str(file)))[1].tobytes())
+        else:
+            shutil.copy(file, named)
+        file.unlink()
+    recording = Recording.open(path)
+    assert len(recording) == 3 and not recording.skipped
+    assert abs(int(recording.rgb(2)[0, 0, 0]) - 80) <= 2
+    (path / "color" / f"000001{suffix}").write_bytes(b"cut off")
+    assert [str(frame) for frame in Recording.open(path).skipped] == [
+        f"000001.png: colour picture 000001{suffix} is truncated or corrupt"
+    ]
+
+
 @pytest.mark.parametrize("names", [("8", "9", "10", "100"), ("9.25", "9.5", "10", "10.125")])
 def test_frames_are_in_time_order_whatever_their_names_widths(tmp_path, names):
     path = _write(tmp_path / "a", frames=len(names))

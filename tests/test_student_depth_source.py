@@ -105,6 +105,28 @@ def training_depth(settings: Config, source, demos: EpisodeStore, folder: Path, 
     return frames.steps("depth_mm")
 
 
+class Numbered:
+    """A depth source that adds a thousand to every picture, and a hundred for each episode before."""
+
+    needs_rgb = needs_views = False
+
+    def episodes(self, lengths, read, first=0):
+        """See `DepthSource`."""
+        for i in range(first, len(lengths)):
+            clip = read(i)
+            assert len(clip.depth_mm) == lengths[i]
+            yield clip.depth_mm + np.uint16(1000 + 100 * clip.number)
+
+
+def test_demos_that_stay_clean_are_no_other_demo_s_noise_also_for_a_stage_that_goes_on(demos, tmp_path):
+    settings = replace(with_source("ideal", clean_share=0.5), seed=9)
+    clean = np.random.default_rng(9).random(len(LENGTHS)) < 0.5
+    assert clean.tolist() == [False, True, False]
+    seen = training_depth(settings, Numbered(), demos, tmp_path, have=2)
+    added = np.repeat([1000, 0, 1200], LENGTHS)[:, None, None]
+    np.testing.assert_array_equal(seen, demos.steps("depth_mm") + added)
+
+
 def test_every_camera_model_is_a_choice_and_a_wrong_name_is_refused_with_them():
     assert set(config.SENSORS) == set(SENSORS)
     assert StudentConfig().depth_source == "learned"

@@ -37,14 +37,16 @@ def params():
     return init_params(jax.random.key(0), STUDENT, PROFILE)
 
 
-def episodes_of(rng: np.random.Generator, lengths=(12, 5)) -> tuple[Episodes, Spool]:
+def episodes_of(
+    rng: np.random.Generator, lengths=(12, 5), grasped: int = 4, lost: int | None = None
+) -> tuple[Episodes, Spool]:
     count, steps = len(lengths), max(lengths)
     seen = Spool()
     for _ in range(steps):
         seen.add(rng.integers(400, 1500, (count, PROFILE.height_px, PROFILE.width_px)).astype(np.uint16))
     state = rng.uniform(-0.5, 0.5, (count, steps, contract.STATE_SIZE)).astype(np.float32)
     held = np.zeros((count, steps), bool)
-    held[:, 4:] = True
+    held[:, grasped:lost] = True
     shape = (count, steps)
     return Episodes(
         state=state, action=np.zeros((*shape, 8), np.float32), observation=np.zeros((*shape, 40), np.float32),
@@ -54,8 +56,9 @@ def episodes_of(rng: np.random.Generator, lengths=(12, 5)) -> tuple[Episodes, Sp
     ), seen  # fmt: skip
 
 
-def test_the_error_is_the_distance_of_the_perceived_grasp_before_it_is_held(params):
-    episodes, seen = episodes_of(np.random.default_rng(0))
+@pytest.mark.parametrize(("lengths", "grasped", "lost"), [((12, 5), 4, None), ((12, 4), 1, 2)])
+def test_the_error_is_the_distance_of_the_perceived_grasp_before_it_is_held(params, lengths, grasped, lost):
+    episodes, seen = episodes_of(np.random.default_rng(0), lengths, grasped, lost)
     off_m = np.array([0.003, 0.0, 0.004])  # 5 mm
     for number, length in enumerate(map(int, episodes.length)):
         depth = seen.episode(number, length)
@@ -65,7 +68,7 @@ def test_the_error_is_the_distance_of_the_perceived_grasp_before_it_is_held(para
             perceived = position_to_world(
                 perceive(STUDENT, PROFILE, params, stack[None], state[[t]]).position
             )
-            wrong_m = 0.5 * (t >= 4)  # while it is held nobody asks
+            wrong_m = 0.5 * (t >= grasped)  # while it is held, or after it was lost, nobody asks
             episodes.observation[number, t, OBSERVATION.grasp_pos] = perceived[0] + off_m + wrong_m
     assert position_error_mm(CONFIG, params, episodes, seen) == pytest.approx(5.0, abs=0.05)
 

@@ -1,9 +1,12 @@
 """What perception reports of all frames, which the action head learns from last."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from ddgrasp.config import (
     Config,
@@ -16,9 +19,10 @@ from ddgrasp.config import (
     WorldConfig,
 )
 from ddgrasp.progress import Progress
+from learning.params import save_params
 from student_jax import head, train
-from student_jax.data import Frames, make_frames, random_crops
-from student_jax.policy import init_params
+from student_jax.data import Frames, make_frames, random_crops, sharpen_gripper
+from student_jax.policy import HEAD_PARAMS, Aux, Seen, feature_count, init_params
 
 CONFIG = Config(
     preset="test",
@@ -70,6 +74,53 @@ def test_samples_of_both_kinds_are_joined_column_by_column():
         assert both.shape == (9, *first.shape[1:])
         np.testing.assert_array_equal(both[:4], first)
         np.testing.assert_array_equal(both[4:], second)
+
+
+@pytest.mark.parametrize("with_poses", [False, True])
+def test_what_the_head_learns_from_belongs_together_and_is_not_yet_held(tmp_path, monkeypatch, with_poses):
+    """Not compiled: a frame's features are its number, and steps keep what they are given."""
+    frames, samples = frames_of((40, 30)), []
+    count = len(frames)
+    aux = Aux(*(np.zeros((count, *size), np.float32) for size in ((3,), (2,), ())))
+    features = np.arange(count, dtype=np.float32)[:, None].repeat(feature_count(CONFIG.student), 1)
+
+    def step(config, steps, state, drawn):
+        samples.append(drawn)
+        return state, {"loss": jnp.zeros(())}
+
+    monkeypatch.setattr(head, "_encode_all", lambda *_: Seen(features, aux))
+    monkeypatch.setattr(head, "_step", step)
+    training = replace(CONFIG.student.training, held_weight=1e-9)
+    settings = replace(CONFIG.student.head, train_steps=3, batch_size=200, chunk=3)
+    config = replace(CONFIG, student=replace(CONFIG.student, training=training, head=settings))
+    poses = _save_poses(tmp_path / head.POSES) if with_poses else None
+    params = {name: {"w": np.ones(2, np.float32)} for name in HEAD_PARAMS}
+    head.fit_on_perception(config, params, frames, tmp_path, Progress(quiet=True))
+    assert len(samples) == 3
+    first = 100 if with_poses else 200
+    for seen, joints, chunks in samples:
+        assert len(seen.features) == len(joints) == len(chunks) == 200
+        _check_rows(frames, seen.features[:first, 0].astype(int), joints[:first], chunks[:first])
+        if poses is not None:
+            nearest = np.abs(joints[first:, None] - poses.state).sum(axis=2).argmin(axis=1)
+            _check_rows(poses, nearest, joints[first:], chunks[first:])
+            assert np.mean(seen.aux.held_logit[first:] < 0) > 0.9
+
+
+def _check_rows(frames: Frames, index: np.ndarray, joints: np.ndarray, chunks: np.ndarray) -> None:
+    assert len(np.unique(index)) > 20 and not frames.held[index].any()
+    np.testing.assert_array_equal(joints, frames.state[index])
+    np.testing.assert_array_equal(chunks, sharpen_gripper(frames.action_chunks(index, 3)))
+
+
+def _save_poses(path: Path) -> Frames:
+    """Pictureless episodes as the rounds on poses leave them."""
+    rng, lengths = np.random.default_rng(1), (50, 30)
+    columns = {name: rng.normal(size=(80, width)) for name, width in (("state", 8), ("action", 8))}
+    columns |= {"observation": rng.normal(size=(80, 40)), "held": rng.random(80) > 0.5}
+    columns = {name: values.astype(np.float32) for name, values in columns.items()}
+    save_params(path, columns | {"lengths": np.array(lengths)})
+    return make_frames([], *([part[:50], part[50:]] for part in columns.values()))
 
 
 def _samples(frames: Frames, seed: int) -> head.Samples:

@@ -259,6 +259,23 @@ def test_the_head_learns_from_poses_and_all_else_stays(teacher, roller, params, 
     check_rows(poses, roller.made)
 
 
+def test_the_head_takes_over_from_the_teacher_round_by_round(teacher, roller, params, tmp_path, monkeypatch):
+    given = []
+
+    class Told:
+        def __init__(self, head, config, profile, rng, count, teacher_share):
+            given.append((head is None, teacher_share))
+
+        def __call__(self, scene):
+            return scene.expert
+
+    monkeypatch.setattr(head, "PoseActor", Told)
+    poses = PosesConfig(rounds=4, episodes=COUNT, steps=0)
+    config = replace(CONFIG, student=replace(CONFIG.student, poses=poses))
+    head.fit_on_poses(config, teacher, params, tmp_path, Progress(quiet=True))
+    assert given == [(True, 1.0), (False, 0.5), (False, 0.25), (False, 0.0)]
+
+
 def check_rows(poses: Frames, made: list[Episodes]) -> None:
     """Every column is that of the episodes, and no chunk of actions goes on into the next one."""
     each = [(episodes, i) for episodes in made for i in range(COUNT)]

@@ -7,12 +7,13 @@ import jax
 import numpy as np
 import pytest
 
+from ddgrasp import artifacts
 from ddgrasp.config import Config, EncoderConfig, HandViewConfig, HeadConfig, StudentConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning.params import save_params
 from ppo.policy import TeacherPolicy
-from student_jax import start
+from student_jax import dagger, start
 from student_jax.dagger import Trainer
 from student_jax.depth_source import make_source
 from student_jax.policy import PARAMS_FILE, init_params, param_shapes
@@ -60,3 +61,41 @@ def test_a_start_of_another_width_is_refused(changed, where, run):
     with pytest.raises(UserError, match=f"does not fit this configuration's network .*{where}") as error:
         start.load(other, param_shapes(other, PROFILE))
     assert "\n" not in str(error.value)
+
+
+@pytest.fixture
+def finished(run) -> StudentConfig:
+    """A student that starts from the one of `run`, whose training is known."""
+    artifacts.finish(run / "student", "student", CONFIG, seconds=1.0, metrics={})
+    return replace(STUDENT, init_from=str(run))
+
+
+@pytest.mark.parametrize(
+    ("name", "there", "here"),
+    [("height_px", 112, 56), ("width_px", 144, 72), ("min_depth_m", 0.1, 0.2), ("max_depth_m", 2.5, 2.0)],
+)
+def test_a_start_that_has_seen_other_pictures_is_refused(finished, name, there, here):
+    start._check_meaning(finished)
+    other = replace(finished, picture=replace(finished.picture, **{name: here}))
+    with pytest.raises(UserError, match=f"student.picture.{name} {there}, this configuration {here}: use"):
+        start._check_meaning(other)
+
+
+def test_a_start_whose_holes_were_left_open_is_taken_and_that_is_said(
+    finished, params, tmp_path, monkeypatch
+):
+    class Notes(Progress):
+        said: list[str] = []
+
+        def note(self, text: str) -> None:
+            self.said.append(text)
+
+    monkeypatch.setattr(dagger, "init_params", lambda *_: params)
+    still = TeacherPolicy(np.zeros(40), np.ones(40), [(np.zeros((40, 16)), np.zeros(16))])
+    for filled in (False, True):
+        student = replace(finished, picture=replace(finished.picture, fill_holes=filled))
+        start._check_meaning(student)
+        config = replace(CONFIG, student=student)
+        Trainer(config, still, make_source(config, tmp_path), tmp_path / str(filled), Notes())._restore()
+    (said,) = Notes.said
+    assert "trained with student.picture.fill_holes False, here it is True" in said

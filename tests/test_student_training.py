@@ -6,6 +6,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from ddgrasp import contract
@@ -18,6 +19,7 @@ from ddgrasp.config import (
     StudentConfig,
     StudentTrainingConfig,
 )
+from ddgrasp.depth import to_metres
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json
 from ddgrasp.gripper import WidthChange
@@ -25,16 +27,17 @@ from ddgrasp.layout import OBSERVATION, closes
 from ddgrasp.progress import Progress
 from demos.rollout import Scene
 from demos.store import EpisodeStore
-from learning.params import save_params
+from learning.params import load_params, save_params
+from learning.train_state import first_state
 from mjx_envs.camera import nominal_camera
-from student_jax import train
+from student_jax import dagger, train
 from student_jax.act import StudentActor, keep_clean
 from student_jax.augment import disparity_noise, unseen_objects
 from student_jax.dagger import ACTED, CHECKPOINTS, PLAN, Trainer, _steps_before
 from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gripper, with_change
 from student_jax.depth_source import make_source
 from student_jax.frames_io import useful_steps
-from student_jax.policy import PARAMS_FILE, Aux, init_params, position_to_world
+from student_jax.policy import PARAMS_FILE, Aux, Seen, init_params, position_to_world
 from student_jax.preprocess import table_depth
 from student_jax.privileged import PoseActor, noisy_seen
 
@@ -154,6 +157,82 @@ def test_a_training_step_is_pure_and_learns(action_weight):
     assert ("action" in last) == bool(action_weight)
 
 
+def test_a_batch_is_cropped_by_the_configured_shift():
+    index, rng = np.arange(5).repeat(4), np.random.default_rng(0)
+    batch = train.make_batch(frames_of(), index, rng, CONFIG, PROFILE)
+    shift_px = CONFIG.training.crop_shift_px
+    np.testing.assert_array_equal(
+        batch.crop_rc, random_crops(np.random.default_rng(0), 20, PROFILE, shift_px)
+    )
+    assert np.ptp(np.asarray(batch.crop_rc), axis=0).min() > shift_px > 0
+
+
+class _Blind:
+    """In the network's place, so that no step is compiled: keeps the depth that it is shown, and takes the
+    object to be where its only parameter says."""
+
+    shown: list[np.ndarray] = []
+
+    def __init__(self, config, profile):
+        pass
+
+    def apply(self, variables, depth_m, state, crop_rc, method):
+        """See `StudentPolicy.encode`."""
+        self.shown.append(np.asarray(depth_m))
+        place = variables["params"]["encoder"] * jnp.ones((len(depth_m), 3))
+        return Seen(jnp.zeros((len(depth_m), 1)), Aux(place, place[:, :2], place[:, 0]))
+
+
+def _blind_step(monkeypatch, **training) -> tuple[train.Batch, np.ndarray, float]:
+    """(batch, the depth that the network was shown, its gradient) of a step of a `_Blind` one."""
+    grads = []
+    monkeypatch.setattr(train, "StudentPolicy", _Blind)
+    monkeypatch.setattr(_Blind, "shown", [])
+    monkeypatch.setattr(train, "updated", lambda state, optimizer, grad, decay: grads.append(grad) or state)
+    config = dataclasses.replace(CONFIG, training=dataclasses.replace(CONFIG.training, **training))
+    batch = train.make_batch(frames_of(), np.arange(4), np.random.default_rng(0), config, PROFILE)
+    key = jax.random.key_data(jax.random.key(0))
+    state = first_state({"encoder": np.float32(0.5)}, optax.identity(), key)
+    train.train_step.__wrapped__(config, PROFILE, 5, state, {}, batch)
+    return batch, _Blind.shown[0], float(grads[0]["encoder"])
+
+
+PLAIN = {"disparity_noise_px": 0.0, "edge_noise_px": 0.0, "unseen_share": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, lambda depth_m: depth_m),
+        ({"disparity_noise_px": 0.25}, lambda depth_m: depth_m + 1.0),
+        ({"edge_noise_px": 0.6}, lambda depth_m: depth_m + 1.0),
+        ({"unseen_share": 0.25}, lambda depth_m: 2.0 * depth_m),
+        ({"disparity_noise_px": 0.25, "unseen_share": 0.25}, lambda depth_m: 2.0 * (depth_m + 1.0)),
+    ],
+)
+def test_a_step_shows_the_network_depth_with_noise_and_without_unseen_objects(
+    monkeypatch, settings, expected
+):
+    """Both (tests of their own are below) as marks that can be told apart."""
+    grasps = []
+
+    def unseen(key, depth_m, grasp_m, profile, config):
+        grasps.append(grasp_m)
+        return 2.0 * depth_m
+
+    monkeypatch.setattr(train, "disparity_noise", lambda key, depth_m, profile, config: depth_m + 1.0)
+    monkeypatch.setattr(train, "unseen_objects", unseen)
+    batch, shown, _ = _blind_step(monkeypatch, **PLAIN | settings)
+    np.testing.assert_array_equal(shown, expected(to_metres(batch.depth_mm)))
+    for grasp_m in grasps:
+        np.testing.assert_allclose(grasp_m[:, 0], 0.4 + np.arange(4) / 50, atol=1e-5)
+
+
+def test_the_privileged_losses_count_by_their_weight(monkeypatch):
+    none, one, two = (_blind_step(monkeypatch, **PLAIN, aux_weight=weight)[2] for weight in (0.0, 1.0, 2.0))
+    assert none == 0.0 and abs(one) > 0.1 and two == pytest.approx(2 * one, rel=1e-5)
+
+
 class _StopsAt(Progress):
     """Ctrl-C at so many updates of bars and curves."""
 
@@ -176,11 +255,7 @@ def test_a_fit_interrupted_and_resumed_ends_as_an_uninterrupted_one(tmp_path):
     def trainer(name, progress):
         made = Trainer(config, cast(Any, None), cast(Any, None), tmp_path / name, progress)
         if made.frame_count == 0:
-            for episode in columns_of((6, 6)):
-                steps = dict(
-                    zip(("depth_mm", "state", "action", "observation", "held"), episode, strict=True)
-                )
-                made._store.append(steps, {"from_demo": np.bool_(True)})
+            _with_frames(made)
         made.params = init_params(jax.random.key(0), CONFIG, PROFILE)
         return made
 
@@ -194,6 +269,58 @@ def test_a_fit_interrupted_and_resumed_ends_as_an_uninterrupted_one(tmp_path):
     again._phase("demos", lambda: again._fit("demos", 5))
     jax.tree.map(np.testing.assert_array_equal, again.params, whole.params)
     assert again.history == whole.history and not folder.exists()
+
+
+def _with_frames(trainer: Trainer) -> Trainer:
+    for episode in columns_of((6, 6)):
+        steps = dict(zip(("depth_mm", "state", "action", "observation", "held"), episode, strict=True))
+        trainer._store.append(steps, {"from_demo": np.bool_(True)})
+    return trainer
+
+
+def test_a_fit_on_pictures_draws_steps_with_the_object_in_the_hand_by_their_weight(tmp_path, monkeypatch):
+    drawn = []
+
+    def step(config, profile, steps, state, frozen, batch):
+        drawn.append(batch.aux.held_logit)
+        zeros = {name: jnp.zeros(()) for name in ("position_error_mm", "yaw", "held")}
+        return state.replace(step=state.step + 1), zeros
+
+    monkeypatch.setattr(train, "train_step", step)
+    training = dataclasses.replace(CONFIG.training, held_weight=1e-9, batch_size=16)
+    config = Config("test", student=dataclasses.replace(CONFIG, training=training))
+    trainer = Trainer(config, cast(Any, None), cast(Any, None), tmp_path, Progress(quiet=True))
+    _with_frames(trainer).params = {"encoder": {"w": np.ones(2, np.float32)}}
+    trainer._fit("dagger-1", 2)
+    assert np.shape(drawn) == (2, 16) and not np.any(drawn)  # 10 of 12 steps are
+
+
+@pytest.mark.parametrize("killed_at", ["atomic_write_json", "_take_over"])
+def test_a_phase_is_done_with_its_parameters_or_not_at_all(tmp_path, monkeypatch, killed_at):
+    config = Config("test", student=CONFIG)
+
+    def trainer() -> Trainer:
+        return Trainer(config, cast(Any, None), cast(Any, None), tmp_path, Progress(quiet=True))
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    first = trainer()
+    first.params = {"a": np.zeros(3)}
+    first._phase("poses", dict)
+    with monkeypatch.context() as patch:
+        patch.setattr(dagger if killed_at == "atomic_write_json" else Trainer, killed_at, killed)
+        first.params = {"a": np.ones(3)}
+        with pytest.raises(KeyboardInterrupt):
+            first._phase("head", dict)
+    again = trainer()
+    again._restore()
+    done = killed_at == "_take_over"
+    assert again._done == ["poses", "head"][: 1 + done]
+    np.testing.assert_array_equal(again.params["a"], np.full(3, float(done)))
+    again._phase("head", lambda: again.params.update(a=np.full(3, 2.0)) or {})
+    assert sorted(path.name for path in tmp_path.glob("*.msgpack")) in ([PARAMS_FILE],)
+    np.testing.assert_array_equal(load_params(tmp_path / PARAMS_FILE)["a"], np.full(3, 1.0 if done else 2.0))
 
 
 @pytest.mark.parametrize(("number", "before"), [(0, 0), (1, 500), (2, 540), (3, 580)])
@@ -261,6 +388,26 @@ def test_pose_errors_shrink_near_the_object():
     error = np.asarray(position_to_world(seen.aux.position))
     np.testing.assert_allclose(error, [[0.002] * 3, [0.010] * 3], atol=1e-6)
     assert np.abs(seen.aux.held_logit).tolist() == [6.0, 6.0]
+
+
+def test_who_acts_from_poses_takes_the_first_of_a_chunk_and_is_pushed_now_and_then(monkeypatch):
+    """In the network's place a chunk whose actions can be told apart."""
+    count, chunk = 4000, (0.1, 0.9)
+
+    def chosen(config, profile, head, seen, state, noise):
+        return np.broadcast_to(np.array(chunk)[None, :, None], (count, 2, 8))
+
+    monkeypatch.setattr(train, "act_on_seen", chosen)
+    actor = PoseActor({}, CONFIG, PROFILE, np.random.default_rng(0), count, teacher_share=0.25)
+    still, observation = np.zeros((count, 8), np.float32), np.zeros((count, 40), np.float32)
+    empty = np.zeros((count, 0, 0), np.uint16)
+    action = actor(Scene(empty, still, np.full((count, 8), -0.5), observation, np.zeros(count, bool), 0))
+    taught = action[:, 7] < 0  # a push does not move the gripper
+    assert taught.mean() == pytest.approx(0.25, abs=0.03) and set(action[:, 7]) == {-0.5, chunk[0]}
+    off = action[:, :7] - np.where(taught, -0.5, chunk[0])[:, None]
+    pushed = np.any(np.abs(off) > 1e-9, axis=1)
+    assert pushed.mean() == pytest.approx(0.15, abs=0.02)
+    assert off[pushed].std() == pytest.approx(0.3, rel=0.05)
 
 
 def test_training_and_whoever_acts_are_told_the_same_change_of_width():

@@ -26,12 +26,11 @@ from sensors.recordings.recording import (
     RecordingWriter,
     check_fields,
 )
-from sensors.recordings.sources import RawFrame, Source, in_time
+from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, in_time
 
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 _COLOR_NAMES = ", ".join(f"{name}/" for name in COLOR_FOLDERS)
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
-COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 REALSENSE_SUFFIXES = (".bag", ".db3")
 KEPT_META = (
     "sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth",
@@ -72,6 +71,7 @@ def import_recording(source: Source, path: Path) -> Imported:
     if path.exists():
         raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
     skipped, medians_m, size, frames, gaps, last = [], [], None, 0, False, False
+    loss = ""
     with RecordingWriter(path, source.meta) as writer:
         for frame in source.frames():
             medians_m += _median_m(frame, source.depth_unit_m)
@@ -82,6 +82,7 @@ def import_recording(source: Source, path: Path) -> Imported:
                 continue
             gaps, last = gaps or not (last or not frames), True
             size = depth_mm.shape
+            loss = loss or _loss(frame, source.depth_unit_m)
             try:
                 writer.add(frame.rgb, depth_mm)
             except OSError as error:
@@ -102,13 +103,15 @@ def import_recording(source: Source, path: Path) -> Imported:
                 f"{source.path}: none of its {len(skipped)} frames can be used "
                 f"({skipped[0] if skipped else 'it is empty'})."
             )
-    return Imported(path, frames, tuple(skipped), _loss(source.depth_unit_m))
+    return Imported(path, frames, tuple(skipped), loss)
 
 
-def _loss(unit_m: float) -> str:
-    if unit_m >= DEPTH_UNIT_M:
+def _loss(frame: RawFrame, unit_m: float) -> str:
+    floats = frame.depth is not None and frame.depth.dtype.kind == "f"
+    if unit_m >= DEPTH_UNIT_M and not floats:
         return ""
-    return f"depth in units of {unit_m:g} m was rounded to whole millimetres, which recordings here have"
+    kind = "floating-point depth" if floats else f"depth in units of {unit_m:g} m"
+    return f"{kind} was rounded to whole millimetres, which recordings here have"
 
 
 def import_all(
@@ -202,17 +205,20 @@ def _check_unit(source: Source, medians_m: list[float]) -> None:
 def folder_sources(root: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple[list[Source], list[str]]:
     """`root` if it has depth/ and a colour folder, else every folder in it that does; why others are refused.
 
+    A name that begins with a dot is passed over: a recording that is not finished has one.
+
     Raises:
         UserError: neither, or every one was refused.
     """
-    folders = [root] if _is_pair(root) else sorted(p for p in root.iterdir() if _is_pair(p))
+    inside = _visible(root)
+    folders = [root] if _is_pair(root) else [p for p in inside if _is_pair(p)]
     if not folders:
         raise UserError(
             f"{root}: no depth/ beside one of {_COLOR_NAMES} in it or in its folders; put the pictures "
             "there, named alike."
         )
     sources, refused = _each(folders, lambda folder: folder_source(folder, depth_unit_m, meta))
-    without = (p for p in sorted(root.iterdir()) if (p / "depth").is_dir() and not _is_pair(p))
+    without = (p for p in inside if (p / "depth").is_dir() and not _is_pair(p))
     passed_over = (f"{p}: depth/ without one of {_COLOR_NAMES} beside it." for p in without)
     return sources, [*refused, *(() if folders == [root] else passed_over)]
 
@@ -264,6 +270,10 @@ def _own_meta(file: Path) -> dict[str, Any]:
     return meta
 
 
+def _visible(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+
+
 def _is_pair(folder: Path) -> bool:
     return (folder / "depth").is_dir() and any((folder / name).is_dir() for name in COLOR_FOLDERS)
 
@@ -307,7 +317,7 @@ def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple
         )
     if path.is_file() and path.suffix not in REALSENSE_SUFFIXES:
         raise UserError(f"{path}: a file of type {path.suffix!r}; expected a RealSense .bag or .db3.")
-    inside = [path] if path.is_file() else sorted(path.iterdir())
+    inside = [path] if path.is_file() else _visible(path)
     files = [file for file in inside if file.suffix in REALSENSE_SUFFIXES]
     if not files:
         return folder_sources(path, depth_unit_m, meta)

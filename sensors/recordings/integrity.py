@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from ddgrasp.errors import UserError
-from sensors.recordings.sources import in_time
+from sensors.recordings.sources import COLOR_SUFFIXES, in_time
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_GREY = 0
@@ -35,8 +35,9 @@ def find_depth(path: Path) -> list[Path]:
 
 def find_color(path: Path, depth_file: Path) -> Path:
     """Where the colour picture of a depth picture is, or would be."""
-    png = path / "color" / f"{depth_file.stem}.png"
-    return png if png.is_file() else path / "color" / f"{depth_file.stem}.jpg"
+    suffixes = (spelt for suffix in COLOR_SUFFIXES for spelt in (suffix, suffix.upper()))
+    files = (path / "color" / f"{depth_file.stem}{suffix}" for suffix in suffixes)
+    return next((file for file in files if file.is_file()), path / "color" / f"{depth_file.stem}.jpg")
 
 
 def inspect_frame(depth_file: Path, color_file: Path) -> tuple[str, tuple[int, int]]:
@@ -87,7 +88,7 @@ def _png_header(data: bytes) -> tuple[int, int, int, int] | None:
 
 def _color_complete(file: Path) -> bool:
     data = file.read_bytes()
-    if file.suffix == ".png":
+    if file.suffix.lower() == ".png":
         return _png_header(data) is not None
     # Some cameras pad after the end-of-image marker; look for it near the end.
     return data[:2] == b"\xff\xd8" and b"\xff\xd9" in data[-64:]

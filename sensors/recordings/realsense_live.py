@@ -80,12 +80,14 @@ class Take:
     """Why it ended before its time, and the remedy; empty if it did not."""
 
     def meta(self, hz: int) -> dict[str, Any]:
-        """Fields of meta.json: the rate that came of `hz`."""
-        return {"hz": round(hz * self.frames / (self.frames + self.lost), 1)} if self.lost else {"hz": hz}
+        """Fields of meta.json: the rate that came of `hz`, and whether there are gaps."""
+        if not self.lost:
+            return {"hz": hz}
+        rate = hz * self.frames / (self.frames + self.lost)
+        return {"hz": float(f"{rate:.3g}"), "consecutive_frames": False}
 
     def cut_short(self, error: OSError) -> None:
         """The frame that was given last could not be written."""
-        self.frames -= 1
         self.trouble = (
             f"a frame could not be written ({error.strerror or error}): those before it are kept; make room "
             "on the disk, or give another --out."
@@ -172,9 +174,9 @@ def _kept(
         lost = pace.lost_before((frames.get_depth_frame() or frames).get_frame_number())
         if lost is None:
             continue
-        take.lost += lost
-        take.frames += 1
         yield raw_frame(frames)
+        take.lost += lost  # only now: before a frame that could not be written there is no gap
+        take.frames += 1
         task.advance()
     if not take.frames:
         raise KeyboardInterrupt("Stopped before the first frame: nothing was recorded.")

@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
 from ddgrasp import depth
-from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
+from ddgrasp.contract import CONTRACT_VERSION, D455, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
 from sensors.recordings.integrity import find_color, find_depth, inspect_frame
+from sensors.recordings.sources import in_time
 
 META_FILE = "meta.json"
 JPEG_QUALITY = 95
@@ -33,7 +34,7 @@ NEAREST_MEDIAN_M = 0.08
 FARTHEST_MEDIAN_M = 6.0
 UNIT_CHECK_FRAMES = 5
 
-D4XX_BASELINE_M = {"D435": 0.050, "D415": 0.055, "D455": 0.095}
+D4XX_BASELINE_M = {"D435": 0.050, "D415": 0.055, "D455": D455.baseline_m}
 """Distance between the imagers, from the D400 series datasheet."""
 
 
@@ -134,8 +135,10 @@ class Recording:
 
     @property
     def consecutive(self) -> bool:
-        """Whether the frames follow each other in time (temporal statistics make sense)."""
-        return bool(self.meta.get("consecutive_frames", False))
+        """Whether the frames follow each other in time (temporal statistics make sense), none left out."""
+        first, last = in_time(self.depth_files[0]), in_time(self.depth_files[-1])
+        gaps = any(first < in_time(frame.file) < last for frame in self.skipped)
+        return bool(self.meta.get("consecutive_frames", False)) and not gaps
 
     @property
     def color_aligned(self) -> bool:

@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
+"""Those of colour pictures, in small or capital letters."""
+
 
 @dataclass(frozen=True)
 class RawFrame:

@@ -16,7 +16,6 @@ from sensors.statistics.curves import Curve, Stream
 
 STEPS_PER_PX = 32
 """D4xx cameras report disparity in 1/32 of a native pixel."""
-RANGE_MM = 750.0
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ SCALARS = {
     "left_band_px": "left invalid band, px",
     "left_band_excess_px": "left band beyond the disparity there, px",
     "shadow_invalid": "invalid in occlusion shadows",
-    "temporal_deviation_mm": "deviation over time at 0.75 m, mm",
+    "temporal_deviation_mm": f"deviation over time at {stats.RANGE_MM / 1000:g} m, mm",
     "flicker_fraction": "validity flicker",
     "grid_share": "depths on the 1/32 px grid",
 }
@@ -66,7 +65,7 @@ def measure(camera: str, stream: Stream, steps_per_px: float) -> Figures:
     count = float(np.mean([len(s) for s in sizes]))
     height, width = depth.shape[1:]
     band = float(np.mean([stats.left_band_px(frame) for frame in depth]))
-    deviations = [stats.temporal_deviation_mm(depth[run], RANGE_MM) for run in stream.static]
+    deviations = [stats.temporal_deviation_mm(depth[run]) for run in stream.static]
     scalars = {
         "invalid_fraction": float(np.mean(depth == 0)),
         "hole_components": count,

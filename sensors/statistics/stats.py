@@ -14,6 +14,8 @@ from jaxtyping import Bool, Int, Real, Shaped, UInt16
 Stream = Real[np.ndarray, "T H W"]
 Frame = Real[np.ndarray, "H W"]
 
+RANGE_MM = 750.0
+"""Where temporal deviation is taken, unless told otherwise."""
 RANGE_TOLERANCE = 0.1
 """A pixel belongs to a range if its median depth is within 10 % of it."""
 STEADY_FRACTION = 0.8
@@ -37,14 +39,14 @@ class DepthStatistics:
     """Median over pixels of the standard deviation over time, at `temporal_range_mm` (static scene)."""
     flicker_fraction: float
     """Share of pixels that change validity between consecutive frames."""
-    temporal_range_mm: float = 750.0
+    temporal_range_mm: float = RANGE_MM
 
     def as_dict(self) -> dict[str, float]:
         """Name -> value, for manifests."""
         return asdict(self)
 
 
-def measure(depth_mm: Stream, range_mm: float = 750.0) -> DepthStatistics:
+def measure(depth_mm: Stream, range_mm: float = RANGE_MM) -> DepthStatistics:
     """Statistics of a (T, H, W) stream; the temporal ones assume a static scene and camera."""
     sizes = [hole_sizes_px(frame) for frame in depth_mm]
     every = np.concatenate(sizes) if sizes else np.zeros(0)
@@ -102,7 +104,7 @@ def flicker_fraction(depth_mm: Stream) -> float:
     return float(np.mean(validity_changes(depth_mm))) if len(depth_mm) > 1 else float("nan")
 
 
-def temporal_deviation_mm(depth_mm: Stream, range_mm: float = 750.0) -> float:
+def temporal_deviation_mm(depth_mm: Stream, range_mm: float = RANGE_MM) -> float:
     """Median over pixels near `range_mm` of the deviation over time; nan if there are none."""
     if len(depth_mm) < 2:
         return float("nan")
