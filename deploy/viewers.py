@@ -87,7 +87,7 @@ class Rerun:
         rr.log("robot/joints_rad", rr.Scalars(step.state.q_rad))
         rr.log("robot/width_mm", rr.Scalars(1e3 * step.state.width_m))
         if step.action is not None:
-            rr.log("policy/action", rr.Scalars(step.action))
+            rr.log(f"action/{step.by}", rr.Scalars(step.action))
 
     def end(self, verdict: str) -> None:
         """See `Viewer`."""
@@ -115,7 +115,7 @@ def _layout() -> Any:
         for origin, name in (
             ("robot/joints_rad", "joints (rad)"),
             ("robot/width_mm", "hand's width (mm)"),
-            ("policy/action", "action"),
+            ("action", "action, of policy or retry"),
         )
     ]
     trials = show.TextLogView(origin="trials", name="trials")
