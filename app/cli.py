@@ -11,6 +11,8 @@ import sys
 from collections.abc import Sequence
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_OPEN_GL = ("glGetError", "eglQueryString")
+"""What PyOpenGL looks for in a library that it has not found."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -115,7 +117,7 @@ def _one_line(error: BaseException) -> str | None:
             )
         cause = cause.__cause__ or cause.__context__
     if not isinstance(error, OSError):
-        return _platforms(error)
+        return _open_gl(error) or _platforms(error)
     place = error.filename2 or error.filename  # of a renaming the second is what was asked for
     if place is None:
         return None
@@ -124,6 +126,16 @@ def _one_line(error: BaseException) -> str | None:
     if isinstance(error, (FileExistsError, NotADirectoryError, IsADirectoryError)):
         return f"{place} cannot be written ({error.strerror}): choose another --out."
     return f"{place} cannot be read or written ({error.strerror}): mend that, or give another path."
+
+
+def _open_gl(error: BaseException) -> str | None:
+    """One line if MuJoCo, as it is imported, cannot draw by what the environment names."""
+    asked = os.environ.get("MUJOCO_GL")
+    if asked and "invalid value for environment variable MUJOCO_GL" in str(error):
+        return f"MUJOCO_GL is {asked!r}, which MuJoCo does not know: unset it, or set it to egl or osmesa."
+    if asked and isinstance(error, AttributeError) and getattr(error, "name", "") in _OPEN_GL:
+        return f"MUJOCO_GL is {asked!r}, whose library is not here (Debian: libegl1, libosmesa6): unset it."
+    return None
 
 
 def _platforms(error: BaseException) -> str | None:

@@ -1,5 +1,6 @@
 """How a command ends where a stream, a device or a place to write to is missing: in one line, early."""
 
+import ctypes.util
 import errno
 import io
 import os
@@ -82,6 +83,21 @@ def test_devices_that_are_not_here_are_named_by_their_variable(platforms):
         f"ddgrasp: JAX_PLATFORMS is {platforms!r}, which JAX has no device for here: unset it, or set it to "
         "cpu.\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("value", "why"),
+    [("foo", "which MuJoCo does not know"), ("osmesa", "whose library is not here")],
+)
+def test_what_mujoco_cannot_draw_by_is_named_by_its_variable(value, why):
+    if value == "osmesa" and ctypes.util.find_library("OSMesa"):
+        pytest.skip("OSMesa is installed here")
+    env = {**os.environ, "MUJOCO_GL": value}
+    env.pop("PYOPENGL_PLATFORM", None)
+    command = [sys.executable, "-m", "app.cli", "objects", "list"]
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"ddgrasp: MUJOCO_GL is {value!r}, {why}") and done.stderr.count("\n") == 1
 
 
 def test_another_failed_assertion_keeps_its_traceback(monkeypatch):
