@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_json, atomic_write_text, read_json
-from ddgrasp.install import pip_install
+from ddgrasp.install import FR3, check_fr3
 from ddgrasp.progress import Progress
 from deploy.changes import Change
 from deploy.fr3_trials import Fr3Bench
@@ -28,7 +27,6 @@ from evaluation.rig_trials import Series
 JSON_FILE, TABLE_FILE, TIMES_FILE = "causes.json", "causes.md", "seconds.json"
 EVERYTHING = "all"
 REFERENCE, IDEAL = "development", "ideal"
-_FR3 = ("franky_sim", "franky", "trimesh")
 _FILMED_FAILURES = 1
 
 
@@ -46,7 +44,7 @@ class Row:
     @property
     def needs(self) -> tuple[str, ...]:
         """Modules of the extra [fr3] that it takes."""
-        return _FR3 if isinstance(self.bench, Fr3Bench) else _FR3[2:] if self.bench.world == "meshes" else ()
+        return FR3 if isinstance(self.bench, Fr3Bench) else FR3[2:] if self.bench.world == "meshes" else ()
 
     def make(self) -> Callable[[Config, Path], Bench]:
         """What makes a bench in every worker."""
@@ -94,8 +92,7 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
     for name in asked:
         if name not in ROWS:
             raise unknown_name("row", name, (*ROWS, EVERYTHING))
-        if missing := [module for module in ROWS[name].needs if find_spec(module) is None]:
-            raise UserError(f"row {name!r} needs {' and '.join(missing)}: {pip_install('fr3')}.")
+        check_fr3(f"row {name!r}", ROWS[name].needs)
     needed = {*asked, *(ROWS[name].against for name in asked), REFERENCE}
     return tuple(name for name in ROWS if name in needed)
 
@@ -106,7 +103,8 @@ def run(
     """The table of the rows `names`; writes it after every row. Trials that `out` has are not run again.
 
     Args:
-      series: objects, trials and seed, the same for every row; its other values count for nothing.
+      series: objects, trials, seed, seconds and retry, the same for every row; rig, camera and depth are a
+        row's own and count for nothing. UserError for what rig fr3 alone has: contact, shapes, coarse camera.
     """
     series = replace(series, rig="development")
     config = one_pose(series.configured(config, policy))
@@ -127,8 +125,7 @@ def run(
         )  # fmt: skip
         new = len(_known(folder)) - known
         if new:
-            seconds = (time.monotonic() - begun) / new
-            atomic_write_json(folder / TIMES_FILE, {"seconds_per_trial": seconds, "workers": workers})
+            _add_time(folder, time.monotonic() - begun, new, workers)
         made = write(out, {"number": series.number, "policy": str(policy)})
     return made
 
@@ -155,9 +152,10 @@ def write(out: Path, about: Mapping[str, Any]) -> dict[str, Any]:
 def table(out: Path) -> list[dict[str, Any]]:
     """A row each of those that were tried.
 
-    Keys: row, cause, change; success with its Wilson interval; objects; faults; seconds_per_trial; against
-    and the pairs (`evaluation.paired.compared`), None without a common trial; p_holm, corrected for all that
-    have any; differs, in what it was tried otherwise than `against`, and so has no pairs.
+    Keys: row, cause, change; success with its Wilson interval; objects; faults; seconds_per_trial, which one
+    takes a worker; against and the pairs (`evaluation.paired.compared`), None without a common trial; p_holm,
+    corrected for all that have any; differs, in what it was tried otherwise than `against`, and so has no
+    pairs.
     """
     tried = {name: {r.index: r.success for r in _known(out / name)} for name in ROWS}
     rows = [_row(out, name, tried) for name in ROWS if tried[name]]
@@ -169,7 +167,6 @@ def table(out: Path) -> list[dict[str, Any]]:
 
 def _row(out: Path, name: str, tried: Mapping[str, Mapping[int, bool]]) -> dict[str, Any]:
     row, counts = ROWS[name], rig_trials.tabulate(_known(out / name))
-    times = out / name / TIMES_FILE
     against = {} if name == REFERENCE else tried[row.against]
     differs = _differing(out / name, out / row.against) if against else []
     pairs = paired.compared({} if differs else against, tried[name])
@@ -180,7 +177,7 @@ def _row(out: Path, name: str, tried: Mapping[str, Mapping[int, bool]]) -> dict[
         "success": counts["all"],
         "objects": counts["objects"],
         "faults": counts["faults"],
-        "seconds_per_trial": read_json(times)["seconds_per_trial"] if times.exists() else None,
+        "seconds_per_trial": _seconds_per_trial(out / name),
         "against": row.against if pairs["n"] else None,
         "pairs": pairs if pairs["n"] else None,
         "differs": differs,
@@ -189,9 +186,7 @@ def _row(out: Path, name: str, tried: Mapping[str, Mapping[int, bool]]) -> dict[
 
 def _differing(one: Path, other: Path) -> list[str]:
     """In what two rows were tried otherwise, policy and configuration included."""
-    headers = [dict(read_log(folder / rig_trials.TRIALS_FILE)[0]) for folder in (one, other)]
-    for header in headers:
-        header.pop("seconds", None)  # not in all logs of before 2026-11-28, and in the configuration's hash
+    headers = [read_log(folder / rig_trials.TRIALS_FILE)[0] for folder in (one, other)]
     return rig_trials.differing(*headers, alike=("policy_sha256", "config_hash"))
 
 
@@ -203,11 +198,35 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
         pairs, seconds = row["pairs"], row["seconds_per_trial"]
         against = ROWS[row["against"]].title if pairs else "tried otherwise" if row["differs"] else ""
         flips = f"{pairs['only_reference']}, {pairs['only_row']} of {pairs['n']}" if pairs else ""
-        p = f"{pairs['p_holm']:.3f}" if pairs else ""
+        p = paired.describe_p(pairs["p_holm"]) if pairs else ""
         took = f"{seconds:.0f}" if seconds is not None else ""
         cells = (row["cause"], row["change"], wilson.describe(row["success"]), against, flips, p, took)
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _add_time(folder: Path, seconds: float, trials: int, workers: int) -> None:
+    """Adds what a session took, `trials` by that many workers, to those before it."""
+    before = _times(folder)
+    made = {
+        "worker_seconds": before["worker_seconds"] + seconds * max(1, min(workers, trials)),
+        "trials": before["trials"] + trials,
+    }
+    atomic_write_json(folder / TIMES_FILE, made)
+
+
+def _seconds_per_trial(folder: Path) -> float | None:
+    times = _times(folder)
+    return times["worker_seconds"] / times["trials"] if times["trials"] else None
+
+
+def _times(folder: Path) -> dict[str, float]:
+    """worker_seconds, of all sessions together, and in how many trials."""
+    path = folder / TIMES_FILE
+    times = read_json(path) if path.exists() else {"worker_seconds": 0.0, "trials": 0}
+    if "seconds_per_trial" in times:  # a session's, as until 2026-11-28; of how many trials it does not say
+        return {"worker_seconds": times["seconds_per_trial"] * max(1, times["workers"]), "trials": 1}
+    return times
 
 
 def _known(folder: Path) -> list[TrialResult]:

@@ -27,6 +27,11 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
     return min(1.0, sum(math.comb(n, i) for i in range(fewer + 1)) / 2 ** (n - 1)) if n else 1.0
 
 
+def describe_p(p: float) -> str:
+    """A p-value as tables show it: '0.0312', '< 0.0001'."""
+    return "< 0.0001" if p < 1e-4 else f"{p:.4f}"
+
+
 def holm(p_values: Sequence[float]) -> list[float]:
     """p-values adjusted for all being asked at once, in the order given.
 

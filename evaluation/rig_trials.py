@@ -267,11 +267,14 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any], alike: Sequence[
     an object is the same trial in both.
 
     Policy, camera, contact limit, retry and treatment are what logs are compared for, unless `alike` names
-    them. A header of before, which does not name what trials are drawn from, may be of any.
+    them. A header of before, which does not name what trials are drawn from, may be of any; nor need it name
+    the seconds where `alike` names the configuration's hash, which covers them.
     """
     one, other = shown(one), shown(other)
     known = (_DRAWS,) if _DRAWS in one and _DRAWS in other else ()
-    pairs = {key: (one.get(key), other.get(key)) for key in (*_SAME, *known, *alike)}
+    covered = ("seconds",) if "config_hash" in alike else ()
+    keys = [key for key in (*_SAME, *known, *alike) if key not in covered]
+    pairs = {key: (one.get(key), other.get(key)) for key in keys}
     return [f"{key} is {here}, not {there}" for key, (here, there) in pairs.items() if here != there]
 
 

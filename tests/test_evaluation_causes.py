@@ -1,7 +1,7 @@
 """Where a policy loses, by cause: which rows there are, and the table that they leave behind."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from ddgrasp.layout import QPOS
 from ddgrasp.presets import get_preset
 from deploy.changes import Change
 from deploy.fr3_trials import Fr3Bench, Fr3Runner
-from deploy.trials import Rig, Trial, drawn
+from deploy.trials import Rig, Trial, TrialResult, drawn
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import causes, rig_trials
 from evaluation.report import trials_page
@@ -141,6 +141,37 @@ def test_pairs_and_holm_are_those_of_the_outcomes(tmp_path, policy):
     log.write_text("".join([header, *other]))  # no trial in common
     _, ideal = causes.table(tmp_path)
     assert ideal["pairs"] is None and ideal["against"] is None
+
+
+def test_p_is_corrected_for_every_row_and_never_said_to_be_0(tmp_path):
+    outcomes = {"development": [True] * 16, "ideal": [True] * 10 + [False] * 6, "meshes": [False] * 16}
+    for name, wins in outcomes.items():
+        times = dict.fromkeys(("sense_s", "infer_s", "act_s", "latency_s", "period_s"), [])
+        lines: list[dict] = [{"row": name}]
+        for index, success in enumerate(wins):
+            trial = TrialResult(index, "cube", False, success, 1, 0, 0, {}, [], **times)
+            lines.append(asdict(trial))
+        (tmp_path / name).mkdir()
+        log = tmp_path / name / rig_trials.TRIALS_FILE
+        log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    rows = causes.table(tmp_path)
+    _, ideal, meshes = (row["pairs"] for row in rows)
+    assert ideal["p"] == ideal["p_holm"] == 2 / 2**6
+    assert (meshes["p"], meshes["p_holm"]) == (2 / 2**16, 2 * 2 / 2**16)
+    shown = [line.split("|")[6].strip() for line in causes.markdown(rows).splitlines()[2:]]
+    assert shown == ["", "0.0312", "< 0.0001"]
+
+
+def test_seconds_a_trial_are_a_worker_s_and_of_every_session(tmp_path):
+    times = tmp_path / causes.TIMES_FILE
+    assert causes._seconds_per_trial(tmp_path) is None
+    causes._add_time(tmp_path, 30.0, 8, 2)
+    causes._add_time(tmp_path, 10.0, 2, 4)  # of which two have nothing to do
+    assert causes._seconds_per_trial(tmp_path) == (30.0 * 2 + 10.0 * 2) / 10
+    times.write_text(json.dumps({"seconds_per_trial": 5.0, "workers": 4}))  # as until 2026-11-28
+    assert causes._seconds_per_trial(tmp_path) == 20.0
+    causes._add_time(tmp_path, 10.0, 1, 0)
+    assert causes._seconds_per_trial(tmp_path) == (20.0 + 10.0) / 2
 
 
 def test_a_trial_of_the_fr3_is_the_development_rig_s(policy, tmp_path):

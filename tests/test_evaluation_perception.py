@@ -1,14 +1,31 @@
 """What perception is off by, from positions and angles set by hand; and what is kept of it."""
 
+from functools import partial
+from pathlib import Path
+
+import jax
 import numpy as np
 import pytest
 
+from app import cli
 from ddgrasp import artifacts
 from ddgrasp.layout import OBSERVATION
 from ddgrasp.presets import PRESETS
-from evaluation import perception, perception_table
+from deploy.policy import POLICY_FILE
+from deploy.trials import drawn
+from deploy_support import constant_bias, describe, write_policy
+from evaluation import perception, perception_table, rig_trials
+from learning.params import save_params
+from rig.world import make_world
 from student_jax.data import YAW_MULTIPLE, aux_targets
-from student_jax.policy import Aux, position_from_world
+from student_jax.policy import (
+    AUX_BESIDE,
+    PARAMS_FILE,
+    POSITION_CENTER_M,
+    Aux,
+    param_shapes,
+    position_from_world,
+)
 
 LAY = np.array([0.5, 0.0, 0.03])
 
@@ -82,3 +99,47 @@ def test_rows_stay_until_the_student_is_made_anew(tmp_path):
     ]
     artifacts.finish(directory, "student", PRESETS["debug"], seconds=2.0, metrics={"other": 1})
     assert perception_table.load(directory) == []
+
+
+@pytest.fixture
+def run_dir(tmp_path) -> Path:
+    """A run whose arm stands still, and whose student sees the object held at POSITION_CENTER_M, always."""
+    config = PRESETS["debug"]
+    profile = config.world.profile
+    params = jax.tree.map(
+        lambda leaf: np.zeros(leaf.shape, leaf.dtype), param_shapes(config.student, profile)
+    )
+    bias = params["aux_output"]["bias"]
+    bias[AUX_BESIDE.held], bias[AUX_BESIDE.near] = 3.0, -30.0
+    (tmp_path / "student").mkdir()
+    save_params(tmp_path / "student" / PARAMS_FILE, params)
+    student = artifacts.finish(tmp_path / "student", "student", config, seconds=1.0, metrics={})
+    (tmp_path / "export").mkdir()
+    info = describe(depth_height=profile.height_px, depth_width=profile.width_px)
+    write_policy(tmp_path / "export" / POLICY_FILE, info, bias=constant_bias(0.0))
+    artifacts.finish(tmp_path / "export", "export", config, seconds=1.0, metrics={}, parents=[student])
+    return tmp_path
+
+
+def test_a_student_is_measured_beside_the_rig_s_truth_and_not_an_earlier_one(run_dir, monkeypatch, capsys):
+    short = partial(rig_trials.Series, seconds=0.5)
+    monkeypatch.setattr(rig_trials, "Series", short)
+    command = ["student", "perception", str(run_dir), "--objects", "cube", "--trials", "1"]
+    assert cli.main(command) == 0
+    rows = perception_table.load(run_dir / "student")
+    assert [(row["camera"], row["trials"], row["hand"], row["steps"]) for row in rows] == [
+        ("stereo", "all", "far", 5),
+        ("stereo", "failure", "far", 5),
+    ]
+    series = short("development", ("cube",), 1)
+    config = series.configured(PRESETS["debug"], run_dir / "export" / POLICY_FILE)
+    world, trial = make_world(config.world), series.plan()[0]
+    world.reset(drawn(config, trial).world_seed, trial.object_name)
+    away_mm = 1e3 * (np.array(POSITION_CENTER_M) - world.observation()[OBSERVATION.grasp_pos])
+    assert [rows[0][f"mean_{axis}_mm"] for axis in "xyz"] == pytest.approx(away_mm, abs=0.1)
+    assert rows[0]["horizontal_mm"] == pytest.approx(np.linalg.norm(away_mm[:2]), abs=0.1)
+    assert rows[0]["held_wrong"] == 1.0
+    artifacts.finish(run_dir / "student", "student", PRESETS["debug"], seconds=2.0, metrics={})
+    capsys.readouterr()
+    assert cli.main(command) == 2
+    assert "export is of an earlier student: delete it" in capsys.readouterr().err

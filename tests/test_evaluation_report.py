@@ -149,7 +149,8 @@ def test_what_an_earlier_parent_led_to_is_left_out(tmp_path):
     assert report["outdated"] == {"export": "student", "deploy": "export"}
     assert "student_rig" not in report and report["student_clean"]["success"]["n"] == 7
     rows = {row[0]: row[3] for row in summary_rows(report) if row[0]}
-    assert rows["export"] == "left out: made of an earlier student than is there now"
+    assert rows["export"] == "left out: made of another student than is here"
+    assert rows["deploy"] == "left out: made of export, which is left out"
 
 
 def test_a_machine_too_slow_for_the_real_clock_is_said(tmp_path):
@@ -290,10 +291,26 @@ def test_two_runs_side_by_side_show_what_differs_alone(run_dir, tmp_path_factory
         artifacts.finish(other / name, name, config, seconds=10, metrics=changed, origin="trained")
     settings, results = differences([build_report(run_dir), build_report(other)])
     assert settings == [("seed", "0", "7"), ("teacher.num_envs", str(CONFIG.teacher.num_envs), "64")]
-    assert results == [("seed", "0", "7"), ("record.frames", "300", "301")]
+    assert results == [("record.frames", "300", "301")]
     parse("report", [str(run_dir), str(other)]).run()
     assert "record.frames" in capsys.readouterr().out
     page = (run_dir / "comparison.html").read_text()
     assert "teacher.num_envs" in page and "student_rig" not in page
     same, nothing = differences([build_report(run_dir)] * 2)
     assert same == nothing == []
+
+
+def test_numbers_that_read_alike_and_differ_are_shown_whole(run_dir):
+    one, other = build_report(run_dir), build_report(run_dir)
+    other["ddg"]["loss"], other["deploy"]["latency_ms"]["p50"] = 0.020000125, None
+    one["student_rig"]["success"], other["student_rig"]["success"] = (
+        wilson.success(k, 10**6) for k in (500_000, 500_001)
+    )
+    assert differences([one, other, one]) == (
+        [],
+        [
+            ("ddg.loss", "0.02", "0.020000125", "0.02"),
+            ("deploy.latency_ms.p50", "12 ms", "", "12 ms"),
+            ("student_rig.success", "500000 of 1000000", "500001 of 1000000", "500000 of 1000000"),
+        ],
+    )

@@ -171,6 +171,14 @@ def test_headers_say_in_what_they_differ():
     assert differing({**HEADER, **development}, {**other, **development, "rules": 2}, ("contact",)) == []
 
 
+def test_seconds_that_an_old_header_lacks_are_in_the_configuration_s_hash():
+    new = {**HEADER, "config_hash": "ab"}
+    old = {key: value for key, value in new.items() if key != "seconds"}
+    assert differing(old, new) == ["seconds is None, not 12.0"]
+    assert differing(old, new, ("config_hash",)) == []
+    assert differing({**old, "config_hash": "cd"}, new, ("config_hash",)) == ["config_hash is cd, not ab"]
+
+
 def test_a_header_says_what_the_policy_sees_and_what_its_trials_are_drawn_from(policy):
     def header(config: Config = CONFIG, **changes) -> dict:
         series = replace(SERIES, **changes)

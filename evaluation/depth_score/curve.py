@@ -47,12 +47,12 @@ def run(job: Job) -> Artifact:
     directory, progress = job.directory, job.progress
     sizes = sorted(set(job.config.score.curve_trajectories))
     config = replace(job.config, score=replace(job.config.score, columns=COLUMNS))
+    extractor = score_features.load(config.score.features[0])  # before hours: it may not be there
     start = Methods(config.score, config.seed, Generator.load(job.parents["ddg"].directory))
     files = score_data.record_rig(
         config, job.parents["teacher"].directory, directory / "data", start.needs_rgb, progress
     )
     loads = [partial(score_data.load_episode, file) for file in files]
-    extractor = score_features.load(config.score.features[0])
     reference = score_episodes(
         start, [extractor], loads, [RAW, FLOOR, "sim_gt"], directory / "reference", progress
     )

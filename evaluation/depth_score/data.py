@@ -92,12 +92,13 @@ def record_rig(
 
 
 def _check_colour(files: Sequence[Path], with_rgb: bool) -> None:
-    """UserError if trajectories were recorded while nothing needed colour, and something does now."""
-    if with_rgb and files and load_episode(files[0]).rgb is None:
-        raise UserError(
-            f"{files[0].parent} was recorded without colour, which the monocular network needs: delete "
-            f"{files[0].parent.parent} to score with it, or take its weights away."
-        )
+    """UserError if a trajectory was recorded while nothing needed colour, and something does now."""
+    for file in files if with_rgb else ():
+        if load_episode(file).rgb is None:
+            raise UserError(
+                f"{file} was recorded without colour, which the monocular network needs: delete "
+                f"{file.parent.parent} to score with it, or take its weights away."
+            )
 
 
 def _rig_recorder(config: Config, teacher: Path, with_rgb: bool) -> Callable[[str, int], Episode]:
@@ -215,11 +216,12 @@ def load_real(root: Path, width_px: int, last: int) -> RealFrames:
     recordings = _of_one_size(root)
     frames = [(number, i) for number, r in enumerate(recordings) for i in range(len(r))]
     numbers = np.array([number for number, _ in frames[-last:]])
-    focal_px, baseline_m = _optics([recordings[number] for number in np.unique(numbers)])
+    scored = [recordings[number] for number in np.unique(numbers)]
+    focal_px, baseline_m = _optics(scored)
+    unaligned = tuple(r.path for r in scored if not r.color_aligned)
     size, chosen = _size(recordings[0], width_px), [(recordings[number], i) for number, i in frames[-last:]]
     depth_mm = np.stack([depth.crop_nearest(r.depth_mm(i), size) for r, i in chosen])
     rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
-    unaligned = tuple(r.path for r in recordings if not r.color_aligned)
     focal_px *= width_px / recordings[0].width_px
     return RealFrames(len(frames), depth_mm, rgb, numbers, focal_px, baseline_m, unaligned)
 

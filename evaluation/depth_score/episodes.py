@@ -3,7 +3,8 @@
 One file per episode, written when complete: a run that was stopped goes on with the next episode.
 """
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -45,17 +46,19 @@ def score_episodes(
     """Files with what every episode says about the domains `names`; those there already are kept, unless they
     are about others: weights may have come, or gone, since."""
     files = [directory / f"{number:04d}.npz" for number in range(len(episodes))]
-    done = [file.exists() and _is_about(file, names) for file in files]
-    if stale := sum(file.exists() for file in files) - sum(done):
+    had = {file: _domains(file) for file in files if file.exists()}
+    done = [file in had and _is_about(had[file], names) for file in files]
+    if stale := len(had) - sum(done):
         progress.note(f"{stale} episode(s) are scored again: what was there is about other columns")
     with progress.task(label, len(files)) as task:
         task.start_at(sum(done))
-        seen: dict[str, int] = {}
+        seen = Counter[str]()
         for load, file, is_done in zip(episodes, files, done, strict=True):
             if is_done:
+                seen.update(_sides(had[file]))
                 continue
             episode = load()
-            seen[episode.side] = seen.get(episode.side, 0) + 1
+            seen[episode.side] += 1
             arrays: dict[str, Any] = _score(
                 methods, extractors, episode, names, seen[episode.side] <= EXAMPLES
             )
@@ -65,10 +68,18 @@ def score_episodes(
     return files
 
 
-def _is_about(file: Path, names: Sequence[str]) -> bool:
-    """Whether an episode's file has all those domains `names` that are of its side, and no others."""
-    had = {key.split("|")[0] for key in _read(file) if key != _GROUP}
-    sides = {DOMAINS[name].side for name in had if name in DOMAINS}
+def _domains(file: Path) -> set[str]:
+    """What an episode's file is about."""
+    return {key.split("|")[0] for key in _read(file) if key != _GROUP}
+
+
+def _sides(had: Set[str]) -> set[str]:
+    return {DOMAINS[name].side for name in had if name in DOMAINS}
+
+
+def _is_about(had: Set[str], names: Sequence[str]) -> bool:
+    """Whether a file about `had` has all those domains `names` that are of its side, and no others."""
+    sides = _sides(had)
     return had == {name for name in names if DOMAINS[name].side in sides}
 
 

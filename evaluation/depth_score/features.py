@@ -29,9 +29,10 @@ class FeatureExtractor:
         return self.function(depth_m)
 
 
-def load(name: str, weights_dir: Path = Path("weights")) -> FeatureExtractor:
-    """The extractor of a name in SCORE_FEATURES; UserError for another, or weights that are not there."""
-    from foundation import catalog, depth_features, features
+def load(name: str, weights_dir: Path | None = None) -> FeatureExtractor:
+    """The extractor of a name in SCORE_FEATURES; UserError for another, or weights that are not there, in
+    `weights_dir`, or where they usually are."""
+    from foundation import catalog, depth_features, features, store
 
     if name == depth_features.NAME:
         extractor = depth_features.load()
@@ -39,7 +40,7 @@ def load(name: str, weights_dir: Path = Path("weights")) -> FeatureExtractor:
     if name not in SCORE_FEATURES:
         raise unknown_name("score.features", name, SCORE_FEATURES)
     published = name in (catalog.FID_INCEPTION, catalog.RESNET18)
-    network = features.load_extractor(weights_dir / name if published else None)
+    network = features.load_extractor((weights_dir or store.WEIGHTS_DIR) / name if published else None)
     return FeatureExtractor(name, network.source, lambda depth_m: network(as_pictures(depth_m)))
 
 

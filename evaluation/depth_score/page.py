@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp import artifacts
+from ddgrasp.progress import PICTURES
+from evaluation.depth_score import curve, samplers
 from evaluation.depth_score import table as score_table
 from evaluation.report.html import image, page, table
 
@@ -38,7 +40,7 @@ def render(result: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
 
 
 def print_result(directory: Path) -> None:
-    """Prints the tables of a finished score or curve, and where the rest is."""
+    """Prints the tables of a finished score, curve or comparison of samplers, and where the rest is."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -53,10 +55,9 @@ def print_result(directory: Path) -> None:
         for row in rows:
             drawn.add_row(*row.values())
         console.print(drawn)
-    for name in (JSON, HTML):
+    for name in (JSON, curve.JSON, samplers.JSON, HTML, PICTURES):
         if (directory / name).exists():
             print(directory / name)
-    print(directory / "pictures")
 
 
 def _tables(metrics: Mapping[str, Any]) -> dict[str, list[dict[str, str]]]:

@@ -13,6 +13,7 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from evaluation.depth_score import data as score_data
+from evaluation.depth_score import features as score_features
 from evaluation.depth_score.domains import Methods
 from evaluation.depth_score.episodes import Load
 from evaluation.depth_score.scoring import score_setting
@@ -59,6 +60,7 @@ def run(job: Job) -> Artifact:
             f"{2 * score_data.BLOCK_FRAMES} frames of one recording; expected {_FEWEST_BLOCKS} or more: give "
             "more frames."
         )
+    extractors = [score_features.load(name) for name in config.score.features]  # before hours of fitting
     fitted = _fit(job, root, fit_frames)
     methods = Methods(config.score, config.seed, Generator.load(fitted.directory))
     episodes = score_data.real_episodes(frames, methods.needs_rgb)
@@ -67,7 +69,7 @@ def run(job: Job) -> Artifact:
     blocks = f"{len(frames.blocks)} runs of {2 * score_data.BLOCK_FRAMES} consecutive frames"
     if len(frames.blocks) < _FEW_BLOCKS:
         blocks += ", of which there are few: the true intervals are wider"
-    return score_setting(replace(job, parents={"ddg": fitted}), text, blocks, methods, loads)
+    return score_setting(replace(job, parents={"ddg": fitted}), text, blocks, methods, extractors, loads)
 
 
 def _fit(job: Job, root: Path, fit_frames: int) -> Artifact:

@@ -43,13 +43,13 @@ def run(job: Job) -> Artifact:
     """Scores every sampler of the generator."""
     directory, progress, fitted = job.directory, job.progress, job.parents["ddg"].directory
     config = replace(job.config, score=replace(job.config.score, columns=("sim_gt", "ddg")))
+    extractor = score_features.load(config.score.features[0])  # before hours: it may not be there
     generators = dict(_generators(fitted))
     start = Methods(config.score, config.seed, generators[_name(*REFERENCE)])
     files = score_data.record_rig(
         config, job.parents["teacher"].directory, directory / "data", start.needs_rgb, progress
     )
     loads = [partial(score_data.load_episode, file) for file in files]
-    extractor = score_features.load(config.score.features[0])
     known = score_episodes(start, [extractor], loads, [RAW, FLOOR, "sim_gt"], directory / "known", progress)
     common, simulated = collect(known), loads[len(loads) // 2 :]
     rows, floor = {}, {}

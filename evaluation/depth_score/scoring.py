@@ -13,27 +13,30 @@ from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text
 from ddgrasp.job import Job
 from ddgrasp.progress import PICTURES, Progress
-from evaluation.depth_score import features as score_features
 from evaluation.depth_score import figures as score_figures
 from evaluation.depth_score import table as score_table
 from evaluation.depth_score import two_samples
 from evaluation.depth_score.domains import COLUMNS, DOMAINS, Methods, wanted_domains
 from evaluation.depth_score.episodes import Load, Scored, collect, score_episodes
+from evaluation.depth_score.features import FeatureExtractor
 from evaluation.depth_score.page import HTML, JSON, render, summary
 from evaluation.report.figures import draw_panels
 
 _EMBED_SEED = 0
 
 
-def score_setting(job: Job, text: str, resampled: str, methods: Methods, loads: Sequence[Load]) -> Artifact:
+def score_setting(
+    job: Job, text: str, resampled: str, methods: Methods, extractors: Sequence[FeatureExtractor],
+    loads: Sequence[Load],
+) -> Artifact:  # fmt: skip
     """Scores the episodes behind `loads`. Ends the stage.
 
     Args:
       text: what is compared, for people.
       resampled: what an episode is, of which the bootstrap draws.
+      extractors: those of `config.score.features`.
     """
     config, directory, progress = job.config, job.directory, job.progress
-    extractors = [score_features.load(name) for name in config.score.features]
     names = available_domains(methods)
     files = score_episodes(methods, extractors, loads, names, directory / "episodes", progress)
     scored = collect(files)

@@ -8,6 +8,7 @@ from functools import partial
 from ddgrasp.artifacts import Artifact
 from ddgrasp.job import Job
 from evaluation.depth_score import data as score_data
+from evaluation.depth_score import features as score_features
 from evaluation.depth_score.domains import Methods
 from evaluation.depth_score.scoring import score_setting
 
@@ -23,9 +24,10 @@ def run(job: Job) -> Artifact:
     from ddg_jax.sample import Generator
 
     config = job.config
+    extractors = [score_features.load(name) for name in config.score.features]  # before hours of recording
     methods = Methods(config.score, config.seed, Generator.load(job.parents["ddg"].directory))
     teacher, data = job.parents["teacher"].directory, job.directory / "data"
     files = score_data.record_rig(config, teacher, data, methods.needs_rgb, job.progress)
     loads = [partial(score_data.load_episode, file) for file in files]
     text = SETTING.format(n=config.score.trajectories)
-    return score_setting(job, text, "trajectories", methods, loads)
+    return score_setting(job, text, "trajectories", methods, extractors, loads)

@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp.files import atomic_write_text
-from evaluation.report.html import contents, flatten, heading, page, table
+from evaluation.report.html import contents, heading, leaves, page, table, text
 from evaluation.report.meanings import explain
 from evaluation.report.targets import targets, verdict
 
 COMPARISON_HTML, COMPARISON_PNG = "comparison.html", "comparison.png"
-_NO_RESULT = {"stages", "outdated", "config", "machine", "versions", "created", "contract_version", "targets"}
+_NO_RESULT = {
+    "stages", "outdated", "config", "preset", "scale", "seed", "machine", "versions", "created",
+    "contract_version", "targets",
+}  # fmt: skip
 """Parts of a report that measure nothing."""
 Rows = list[tuple[str, ...]]
 
@@ -19,9 +22,10 @@ Rows = list[tuple[str, ...]]
 def differences(reports: Sequence[Mapping[str, Any]]) -> tuple[Rows, Rows]:
     """(configuration, results): (dotted name, value in each of `reports`) where they are not all the same.
 
-    Tables in a report, such as one of trials per object, are left out.
+    Tables in a report, such as one of trials per object, are left out. Values that are too near each other
+    for what people read of them are shown to their last digit.
     """
-    settings = [dict(flatten(report["config"])) for report in reports]
+    settings = [dict(leaves(report["config"])) for report in reports]
     return _where_different(settings), _where_different([_results(report) for report in reports])
 
 
@@ -58,13 +62,31 @@ def _target_rows(reports: Sequence[Mapping[str, Any]]) -> Rows:
     return [(name, *(column.get(name, "") for column in judged)) for name in names]
 
 
-def _results(report: Mapping[str, Any]) -> dict[str, str]:
+def _results(report: Mapping[str, Any]) -> dict[str, Any]:
     measured = {key: value for key, value in report.items() if key not in _NO_RESULT}
     seconds = {f"{name}.seconds": stage["seconds"] for name, stage in report["stages"].items()}
-    return dict(flatten(measured | seconds))
+    return dict(leaves(measured | seconds))
 
 
-def _where_different(columns: Sequence[Mapping[str, str]]) -> Rows:
+def _where_different(columns: Sequence[Mapping[str, Any]]) -> Rows:
     names = dict.fromkeys(name for column in columns for name in column)
-    rows = ((name, *(column.get(name, "") for column in columns)) for name in names)
-    return [row for row in rows if len(set(row[1:])) > 1]
+    rows = ((name, [column.get(name) for column in columns]) for name in names)
+    return [(name, *_told_apart(name, values)) for name, values in rows if _count_distinct(values) > 1]
+
+
+def _told_apart(name: str, values: Sequence[Any]) -> list[str]:
+    """The values as people read them, or whole where some that differ would read alike."""
+    texts = [text(value, explain(name)[0]) for value in values]
+    if len(set(texts)) == _count_distinct(values):
+        return texts
+    return [_whole(value) for value in values]
+
+
+def _whole(value: Any) -> str:
+    if isinstance(value, Mapping):  # a success rate
+        return f"{value['successes']} of {value['n']}"
+    return "" if value is None else repr(value)
+
+
+def _count_distinct(values: Sequence[Any]) -> int:
+    return sum(value not in values[:place] for place, value in enumerate(values))

@@ -104,8 +104,13 @@ def is_records(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(item, Mapping) for item in value)
 
 
-def flatten(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """(dotted name, text) of every number and text in nested objects; a success rate is one line, and lists
+def flatten(value: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """`leaves` as people read them."""
+    return [(name, text(item, explain(name)[0])) for name, item in leaves(value)]
+
+
+def leaves(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """(dotted name, value) of every number and text in nested objects; a success rate is one line, and lists
     of objects, which are tables, are left out."""
     lines = []
     for key, item in value.items():
@@ -113,9 +118,9 @@ def flatten(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]
         if is_records(item):
             continue
         if isinstance(item, Mapping) and not _is_success(item):
-            lines.extend(flatten(item, f"{name}."))
+            lines.extend(leaves(item, f"{name}."))
         else:
-            lines.append((name, text(item, explain(name)[0])))
+            lines.append((name, item))
     return lines
 
 

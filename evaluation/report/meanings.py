@@ -114,6 +114,8 @@ MEANINGS: dict[str, Meaning] = {
     "eval_success": Meaning("success without exploration", SHARE),
     "eval_saturated": Meaning("joint actions at the end of their range, without exploration", SHARE),
     "saturated": Meaning("joint actions at the end of their range", SHARE),
+    "lost": Meaning("episodes that ended before their time", SHARE),
+    "blown_up": Meaning("states that were not finite, and were put back"),
     "episode": Meaning("episode"),
     "length": Meaning("control steps", "steps"),
     "return": Meaning("sum of its rewards"),

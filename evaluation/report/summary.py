@@ -27,11 +27,11 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     Keys: `stages.<name>.{seconds, trained, loaded, machine}`; `<name>` holds what that stage measured, except
     keys that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top;
     `machine` (the last stage's), `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`;
-    `targets`, each with what was measured and whether it is met; `outdated.<name>`, the parent that was made
-    again since that stage, which is left out. A success rate is {rate, n, successes, low, high}.
-    `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows; `teacher.backends`, if `ddgrasp
-    teacher compare` was, is `evaluation.backends.table`; `student.perception`, if `ddgrasp student
-    perception` was, is `evaluation.perception.tabulate`.
+    `targets`, each with what was measured and whether it is met; `outdated.<name>`, the parent for which that
+    stage is left out: the one here is not what it was made of, or is left out itself. A success rate is
+    {rate, n, successes, low, high}. `teacher.trials`, if `ddgrasp teacher eval` was run, are its rows;
+    `teacher.backends`, if `ddgrasp teacher compare` was, is `evaluation.backends.table`;
+    `student.perception`, if `ddgrasp student perception` was, is `evaluation.perception.tabulate`.
     """
     found = {
         stage.name: artifacts.read_artifact(run_dir / stage.name)
@@ -91,7 +91,7 @@ def _why_nothing(run_dir: Path) -> str:
 
 
 def _outdated(found: Mapping[str, Artifact]) -> dict[str, str]:
-    """Stages made of what is there no more -> the parent that was made again since."""
+    """Stages made of what is not here -> the parent that is another here, or made of what is not here."""
     outdated: dict[str, str] = {}
     for name, artifact in found.items():  # parents come first
         for parent in get_stage(name).parents:
@@ -122,9 +122,7 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     for stage in (*STAGES[:-1], *asked_for, STAGES[-1]):
         entry = report["stages"].get(stage.name)
         if entry is None:
-            parent = report.get("outdated", {}).get(stage.name)
-            why = f"left out: made of an earlier {parent} than is there now" if parent else "not run"
-            rows.append((stage.name, "", "", why))
+            rows.append((stage.name, "", "", _why_absent(stage.name, report.get("outdated", {}))))
             continue
         section = report["config"].get(stage.name, {})
         start = section.get("start") or section.get("init_from", "")
@@ -136,6 +134,14 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         apart = _apart(report["student_rig"])
         rows.append(("deploy", "", "", f"exported student in the pseudo-real rig: success {rig}{apart}"))
     return rows
+
+
+def _why_absent(stage: str, outdated: Mapping[str, str]) -> str:
+    if (parent := outdated.get(stage)) is None:
+        return "not run"
+    if parent in outdated:
+        return f"left out: made of {parent}, which is left out"
+    return f"left out: made of another {parent} than is here"
 
 
 def _apart(rig: Mapping[str, Any]) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 from evaluation import wilson
 from evaluation.failure_modes import MODES, NOTE
+from evaluation.paired import describe_p
 from evaluation.report import success_chart
 from evaluation.report.html import image, page, table
 from evaluation.table2.results import describe_set
@@ -34,17 +35,13 @@ def _line(
     source = f" ({made['generator_from']})" if made.get("generator_from") else ""
     rig = ("not tried", "", "") if tried is None else tuple(_rate(tried.get(group)) for group in _GROUPS)
     pairs = f"{test['only_reference']} / {test['only_row']} of {test['n']}" if test else ""
-    p_values = (_p(test["p"]), _p(test["p_holm"])) if test else ("", "")
+    p_values = (describe_p(test["p"]), describe_p(test["p_holm"])) if test else ("", "")
     own = _rate(simulated.get("success"))
     return (row.title, f"{TRAINING[row.source]}{source}", DEPLOYED[row.depth], own, *rig, pairs, *p_values)
 
 
 def _rate(success: Mapping[str, Any] | None) -> str:
     return wilson.describe(dict(success)) if success else ""
-
-
-def _p(value: float) -> str:
-    return "< 0.0001" if value < 1e-4 else f"{value:.4f}"
 
 
 def apart(study: Mapping[str, Any], set_of_trials: str, name: str) -> list[str]:

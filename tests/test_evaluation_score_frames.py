@@ -1,0 +1,95 @@
+"""What is scored, and what is refused before hours of work: frames, their colour, weights, kept episodes."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ddg_jax.prior import make_prior
+from ddg_jax.sample import Generator
+from ddgrasp import artifacts
+from ddgrasp.config import Config, DDGConfig, ScoreConfig
+from ddgrasp.errors import UserError
+from ddgrasp.job import Job
+from ddgrasp.progress import Progress
+from ddgrasp.stages import get_stage
+from evaluation.depth_score import curve, samplers, stage
+from evaluation.depth_score import data as score_data
+from evaluation.depth_score import episodes as score_episodes
+from evaluation.depth_score import table as score_table
+from evaluation.depth_score.domains import FLOOR, RAW, Methods
+from evaluation.depth_score.resampling import Sample
+from foundation import store
+from sensors.recordings.recording import RecordingWriter
+
+QUIET = Progress(quiet=True)
+
+
+def episode(side: str, colour: bool = True) -> score_data.Episode:
+    depth = np.full((3, 36, 64), 700, np.uint16)
+    rgb = np.zeros((3, 36, 64, 3), np.uint8) if colour else None
+    return score_data.Episode(side, 0, 0, depth, depth, depth[:0], rgb, 40.0, 0.095)
+
+
+def write_recording(path: Path, aligned: bool) -> None:
+    with RecordingWriter(path, {"fx_px": 40.0, "sensor": "RealSense D435"}) as writer:
+        for _ in range(8):
+            writer.add(np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 700, np.uint16))
+    meta = path / "meta.json"
+    meta.write_text(json.dumps({**json.loads(meta.read_text()), "color_aligned_to_depth": aligned}))
+
+
+def test_colour_of_recordings_that_are_not_scored_counts_for_nothing(tmp_path):
+    write_recording(tmp_path / "a", aligned=False)
+    write_recording(tmp_path / "b", aligned=True)
+    assert score_data.load_real(tmp_path, 32, 8).unaligned == ()
+    assert score_data.load_real(tmp_path, 32, 9).unaligned == (tmp_path / "a",)
+
+
+@pytest.mark.parametrize("without", ["real_0000", "sim_0001"])
+def test_a_trajectory_without_colour_is_refused_before_any_is_scored(tmp_path, without):
+    for name in ("real_0000", "real_0001", "sim_0000", "sim_0001"):
+        score_data._save(tmp_path / f"{name}.npz", episode(name[:-5], colour=name != without))
+    config = Config(preset="test", score=ScoreConfig(trajectories=2))
+    with pytest.raises(UserError, match=f"{without}.npz was recorded without colour"):
+        score_data.record_rig(config, tmp_path / "teacher", tmp_path, True, QUIET)
+
+
+@pytest.mark.parametrize("module", [stage, curve, samplers], ids=lambda module: module.__name__)
+def test_absent_weights_are_said_before_anything_is_recorded(tmp_path, monkeypatch, module):
+    """Nor is anything else read: the parents are empty."""
+    monkeypatch.setattr(store, "WEIGHTS_DIR", tmp_path)
+    config = Config(preset="test", score=ScoreConfig(features=("fid_inception",)))
+    parents = {
+        name: artifacts.finish(tmp_path / name, name, config, seconds=0, metrics={})
+        for name in ("teacher", "ddg")
+    }
+    with pytest.raises(UserError, match=f"{tmp_path}/fid_inception holds no converted weights"):
+        module.run(Job(get_stage("score"), config, tmp_path, QUIET, parents))
+
+
+def test_the_same_episodes_are_examples_wherever_a_run_was_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(score_episodes, "EXAMPLES", 1)
+    methods = Methods(ScoreConfig(), 0, Generator(DDGConfig(), {}, make_prior(DDGConfig())))
+    loads = [partial(episode, "real")] * 2
+
+    def examples() -> int:
+        files = score_episodes.score_episodes(methods, [], loads, ["real_raw"], tmp_path, QUIET)
+        return len(score_episodes.collect(files).examples["real_raw"])
+
+    assert examples() == 1
+    (tmp_path / "0001.npz").unlink()
+    assert examples() == 1
+
+
+def test_every_column_is_resampled_alike():
+    """So that a ratio to Sim GT's distance has the interval of the method alone: none, of the same maps."""
+    rng, groups = np.random.default_rng(0), np.repeat([0, 1, 2, 3], 2)
+    real, floor, clean = (Sample(rng.normal(size=(8, 2)), of) for of in (groups, groups + 4, groups + 4))
+    samples = {RAW: real, FLOOR: floor, "sim_gt": clean, "sim_ddg": clean}
+    config = ScoreConfig(columns=("sim_gt", "ddg"), bootstrap=5, kid_subset_size=2)
+    table = score_table.make_table(samples, config, 0, QUIET)
+    assert table["ddg"]["fid"]["low"] < table["ddg"]["fid"]["high"]
+    assert table["ddg"]["fid_ratio"] == {"value": 1, "low": 1, "high": 1}
