@@ -23,6 +23,7 @@ from ddg_jax.sample import Generator, condition, frame_noise, generate, grafted
 from ddg_jax.train import init_params, predict_noise
 from ddgrasp.config import CROSS_ENTROPY, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.presets import get_preset
+from learning.convolutions import compiler_options
 
 REFERENCE = ("ddim", 50)
 SAMPLERS = (
@@ -80,6 +81,15 @@ def measure(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
         print(line, flush=True)
 
 
+def one_evaluation(config: DDGConfig, batch: int) -> jax.stages.Wrapped:
+    """(parameters, maps, priors), `batch` frames each -> noise; compiled as `generate` is."""
+
+    def network(params: Any, x: jax.Array, c: jax.Array) -> jax.Array:
+        return predict_noise(config, params, x, c, jnp.full(batch, 500))
+
+    return jax.jit(network, compiler_options=compiler_options())
+
+
 def parts(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
     """Prints what one frame costs in each part of `generate`."""
     generator = make_generator(config, params, batch, "ddim", 1)
@@ -87,7 +97,7 @@ def parts(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
     c = condition(generator, depth, None, one_episode=True)
     shape = (config.depth.height_px, config.depth.width_px, channels(config))
     x = np.zeros((batch, *shape), np.float32)
-    network = jax.jit(lambda p, x, c: predict_noise(config, p, x, c, jnp.full(batch, 500)))
+    network = one_evaluation(config, batch)
     noise = jax.jit(partial(frame_noise, shape=shape, correlation=correlations(config)))
     on_device = jax.device_put((params, x, c))
     runners = {

@@ -8,8 +8,8 @@ teacher takes to 95 % success: PPO from the guide (cloned first), and PPO from n
 process of its own with a deadline; what it has measured so far is on disk after every figure, so that a
 section cut off, or the whole command, leaves its results. A section that fails, is cut off, or finds a limit
 exceeded is recorded under "errors", and the command ends with status 1. `--backends jax` is for a machine
-without Warp; the teachers train on the first backend named. `--device cpu` runs the same sections at sizes
-that mean nothing, to test the command where there is no GPU.
+without Warp; the teachers train on the first backend named that can. `--device cpu` runs the same sections at
+sizes that mean nothing, to test the command where there is no GPU.
 """
 
 import argparse
@@ -19,19 +19,20 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks.gpu_sizes import SIZES, Sizes, only
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Backend, TeacherConfig, WorldConfig
-from ddgrasp.files import atomic_write_json, read_json
+from ddgrasp.files import atomic_write_json, read_json, user_cache
 from ddgrasp.machine import describe
 from ddgrasp.progress import Progress
 
 TOTAL_S = 1190.0
-NO_GPU = 3
-"""Exit status of section `machine` without a GPU."""
+NO_GPU, FOUND = 3, 4
+"""Exit status of a section without the GPU asked for, of one that ends with errors; a crash has another."""
 SUCCESS_AIM = 0.95
 BACKENDS = ("warp", "jax", "cpu")
 
@@ -39,96 +40,13 @@ Save = Callable[..., None]
 """save(name=value, ...) adds measurements to the section's file."""
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """How much to run."""
-
-    physics: tuple[Backend, ...]
-    """The teachers train on the first."""
-    renderers: tuple[str, ...]
-    env_counts: dict[Backend, tuple[int, ...]]
-    """Of each of `physics`, the one that matters most first."""
-    control_steps: int
-    frame_sizes_px: tuple[int, ...]
-    frame_pixels: int
-    """Of all pictures of a batch together."""
-    scenes: int
-    """Drawn by every renderer and compared."""
-    teacher: dict[str, Any]
-    """Fields of TeacherConfig that differ from the presets'."""
-    evaluations: int
-    """Episodes of each evaluation of a teacher."""
-    preset: str
-    """Whose generator and student are timed."""
-    training_steps: int
-    """Timed, of each."""
-    slack: float
-    """Deadlines are longer by this factor."""
-    on_gpu: bool = False
-    """Whether a machine without a GPU is refused, and a teacher that does not learn is an error."""
-
-
-GPU = Sizes(
-    physics=("warp", "jax"),
-    renderers=("warp", "jax"),
-    env_counts={"warp": (8192, 1024, 256, 16384), "jax": (8192, 1024)},
-    control_steps=20,
-    frame_sizes_px=(64, 128, 256),
-    frame_pixels=2**26,
-    scenes=48,
-    teacher={"total_steps": 20_000_000, "num_envs": 4096, "minibatches": 16, "eval_every": 2},
-    evaluations=256,
-    preset="paper",
-    training_steps=50,
-    slack=1.0,
-    on_gpu=True,
-)
-CPU = Sizes(
-    physics=("cpu",),
-    renderers=("jax",),
-    env_counts={"cpu": (4, 16)},
-    control_steps=2,
-    frame_sizes_px=(16,),
-    frame_pixels=2**11,
-    scenes=2,
-    teacher={
-        "total_steps": 64, "num_envs": 8, "unroll_steps": 4, "minibatches": 2, "epochs": 1, "eval_every": 1,
-        "critic_warmup": 0, "hidden": (8,), "clone_envs": 4, "clone_steps": 2,
-    },
-    evaluations=8,
-    preset="debug",
-    training_steps=3,
-    slack=5.0,
-)  # fmt: skip
-SIZES = {"gpu": GPU, "cpu": CPU}
-
-
-def only(sizes: Sizes, backends: Sequence[str]) -> Sizes:
-    """`sizes` with these of its backends, in this order; none stands for all."""
-    if not backends:
-        return sizes
-    kept = {
-        kind: tuple(b for b in backends if b in getattr(sizes, kind)) for kind in ("physics", "renderers")
-    }
-    return replace(sizes, **kept)
-
-
 # --- sections -------------------------------------------------------------------------------------
 
 
 def machine(sizes: Sizes, save: Save) -> Iterator[str]:
-    """Devices and versions; without the GPU asked for, one line and the status NO_GPU."""
-    import jax
-
-    kinds = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
-    if sizes.on_gpu and not any(device.platform == "gpu" for device in jax.devices()):
-        print(
-            f"gpu-check needs an NVIDIA GPU; JAX sees {', '.join(kinds)}. Install the GPU's packages with "
-            "pip install -e '.[cuda,warp]', or try the command itself with --device cpu.",
-            file=sys.stderr,
-        )
-        sys.exit(NO_GPU)
-    save(devices=kinds, versions=artifacts.library_versions(), **describe())
+    """Devices and versions."""
+    del sizes
+    save(devices=_devices(), versions=artifacts.library_versions(), **describe())
     yield from ()
 
 
@@ -158,8 +76,11 @@ def pictures(sizes: Sizes, save: Save) -> Iterator[str]:
     scenes = render_check.random_scenes(sizes.scenes)
     drawn = {}
     for name in sizes.renderers:
-        renderer = batch_render.make_renderer(name, scenes.camera)
-        drawn[name] = jax.device_get(jax.jit(renderer)(scenes.geoms, scenes.T_world_cam))
+        try:
+            renderer = batch_render.make_renderer(name, scenes.camera)
+            drawn[name] = jax.device_get(jax.jit(renderer)(scenes.geoms, scenes.T_world_cam))
+        except Exception as error:  # the next one may draw
+            yield _failed(name, error)
     references = {"numpy": render_check.draw_with_numpy, "opengl": render_check.draw_with_open_gl}
     for against, draw in references.items():
         try:
@@ -192,14 +113,18 @@ def frames(sizes: Sizes, save: Save) -> Iterator[str]:
             cx_px=side / 2, cy_px=side / 2, height_px=side, width_px=side,
         )  # fmt: skip
         for name in sizes.renderers:
-            draw = jax.jit(batch_render.make_renderer(name, camera, depth_only=True))
-            seconds = _seconds(lambda draw=draw, geoms=geoms, T=T: draw(geoms, T))
+            try:
+                draw = jax.jit(batch_render.make_renderer(name, camera, depth_only=True))
+                seconds = _seconds(lambda draw=draw, geoms=geoms, T=T: draw(geoms, T))
+            except Exception as error:  # the next one may draw
+                yield _failed(f"{name}, {side} px", error)
+                continue
             save(**{f"{name}_{side}px": {"scenes": count, "frames_per_s": count / seconds}})
-    yield from ()
 
 
 def env_steps(sizes: Sizes, save: Save) -> Iterator[str]:
-    """Control steps/s of the whole environment, episodes restarting, random actions."""
+    """Control steps/s of the whole environment, random actions, episodes restarting at starts drawn before:
+    drawing new ones (`AutoReset.refresh`, once an episode where a teacher trains) is not in the rate."""
     substeps = round(contract.CONTROL_DT_S / WorldConfig().sim_dt_s)
     for name, count in _in_turn({name: sizes.env_counts[name] for name in sizes.physics}):
         try:
@@ -273,14 +198,28 @@ def unguided(sizes: Sizes) -> TeacherConfig:
 
 
 def _teacher(sizes: Sizes, save: Save, teacher: TeacherConfig) -> Iterator[str]:
-    """Trains until an evaluation reaches SUCCESS_AIM; wall time, cloning and compilation too."""
+    """On the first backend that can train; the others are errors."""
+    save(start=teacher.start, num_envs=teacher.num_envs)
+    for backend in sizes.physics:
+        save(backend=backend)
+        try:
+            reached = _train(sizes, save, teacher, backend)
+        except Exception as error:  # the next one may train
+            yield _failed(backend, error)
+            continue
+        if sizes.on_gpu and not reached:
+            yield f"the teacher ended below {SUCCESS_AIM:.0%}"
+        return
+
+
+def _train(sizes: Sizes, save: Save, teacher: TeacherConfig, backend: Backend) -> bool:
+    """Whether an evaluation after PPO began reached SUCCESS_AIM; wall time, cloning and compilation too."""
     from ddgrasp.presets import LAPTOP
     from ppo.train import train
 
-    world = WorldConfig(objects=contract.SEEN_OBJECTS, backend=sizes.physics[0])
+    world = WorldConfig(objects=contract.SEEN_OBJECTS, backend=backend)
     evaluation = replace(LAPTOP.evaluation, teacher_trials=sizes.evaluations)
     config = replace(LAPTOP, world=world, teacher=teacher, evaluation=evaluation)
-    save(start=teacher.start, num_envs=teacher.num_envs)
     evaluations: list[dict[str, float]] = []
     start = time.monotonic()
 
@@ -293,7 +232,7 @@ def _teacher(sizes: Sizes, save: Save, teacher: TeacherConfig) -> Iterator[str]:
             seconds = time.monotonic() - start
             evaluations.append({"iteration": step, "success": values["eval_success"], "seconds": seconds})
             save(evaluations=evaluations)
-            if values["eval_success"] >= SUCCESS_AIM:
+            if step and values["eval_success"] >= SUCCESS_AIM:  # before the first step it is the clone's
                 save(seconds_to_95_percent=seconds)
                 raise _Reached
 
@@ -301,9 +240,8 @@ def _teacher(sizes: Sizes, save: Save, teacher: TeacherConfig) -> Iterator[str]:
         try:
             train(config, Path(directory), Watch(name="teacher"))
         except _Reached:
-            return
-    if sizes.on_gpu:
-        yield f"the teacher ended below {SUCCESS_AIM:.0%}"
+            return True
+    return False
 
 
 class _Reached(Exception):
@@ -345,7 +283,12 @@ def main() -> None:
 
 
 def run_section(name: str, sizes: Sizes, out: Path) -> int:
-    """One section in this process: {measurements..., "errors": [...]} in `out`. Returns the exit status."""
+    """One section in this process: {measurements..., "errors": [...]} in `out`. Returns the exit status.
+
+    Ends the process in one line and with status NO_GPU where there is no GPU and `sizes` are for one.
+    """
+    if sizes.on_gpu:
+        _check_gpu()
     result: dict[str, Any] = {"errors": []}
 
     def save(**values: Any) -> None:
@@ -355,7 +298,24 @@ def run_section(name: str, sizes: Sizes, out: Path) -> int:
     for error in SECTIONS[name][0](sizes, save):
         save(errors=[*result["errors"], error])
     save()
-    return 1 if result["errors"] else 0
+    return FOUND if result["errors"] else 0
+
+
+def _devices() -> list[str]:
+    import jax
+
+    return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+
+
+def _check_gpu() -> None:
+    kinds = _devices()
+    if not any(kind.startswith("gpu") for kind in kinds):
+        print(
+            f"gpu-check needs an NVIDIA GPU; JAX sees {', '.join(kinds)}. Install the GPU's packages with "
+            "pip install -e '.[cuda,warp]', or try the command itself with --device cpu.",
+            file=sys.stderr,
+        )
+        sys.exit(NO_GPU)
 
 
 def run_all(sections: Sequence[str], device: str, out: Path, backends: Sequence[str] = ()) -> int:
@@ -398,16 +358,17 @@ def _in_process(
         result = read_json(out) if out.exists() else {"errors": []}
     if status is None:
         result["errors"].append(f"cut off after {allowed_s:.0f} s")
-    elif status and not result["errors"]:
+    elif status not in (0, FOUND):
         result["errors"].append(f"exit status {status}: {' | '.join(said.splitlines()[-3:])}")
     return result | {"seconds": time.monotonic() - start}, status or 0
 
 
 def _environment(device: str) -> dict[str, str]:
-    """Warp allocates beside JAX, so JAX takes memory as it needs it."""
+    """Warp allocates beside JAX, so JAX takes memory as it needs it. Programs are kept for the next call."""
     chosen = {"JAX_PLATFORMS": "cpu"} if device == "cpu" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     without_display = {"MUJOCO_GL": "egl"} if sys.platform == "linux" else {}
-    return without_display | dict(os.environ) | chosen
+    kept = {"JAX_COMPILATION_CACHE_DIR": str(user_cache("jax"))}
+    return kept | without_display | dict(os.environ) | chosen
 
 
 def _failed(what: str, error: Exception) -> str:

@@ -6,8 +6,9 @@ The twelve objects on the table, the arm at its start, the same scenes for every
 more than 12 mm above the table within 10 cm of the object. A line has their number over clean depth's, how
 many of clean depth's are holes, by how much inverse depth is off in the whole picture (median and 99th
 percentile, 1/m), and how far the mean of the object's points is from clean depth's, in millimetres, robot's
-base frame (x from the base to the camera, z up): mean, and root mean square over scenes. Lines `window` are
-clean depth through `ddg_jax.window.mixed`.
+base frame (x from the base to the camera, z up): mean, and root mean square over scenes; scenes in which a
+line has no object pixels are not in these, and `none` counts them. Lines `window` are clean depth through
+`ddg_jax.window.mixed`.
 """
 
 import argparse
@@ -54,7 +55,8 @@ def main() -> None:
             values = [len(points) / len(truth), np.mean(depth_m[shown] == 0), *off_per_m(depth_m, clean_m)]
             rows.setdefault(name, []).append(np.array([*values, *moved_mm]))
     print(
-        f"{'':16}{'pixels':>8}{'holes':>8}   off, 1/m: p50, p99   x, y, z, mm: mean        root mean square"
+        f"{'':16}{'pixels':>8}{'none':>6}{'holes':>8}   off, 1/m: p50, p99   x, y, z, mm: mean        "
+        "root mean square"
     )
     for name, values in rows.items():
         print(_line(name, np.stack(values)))
@@ -101,7 +103,8 @@ def _line(name: str, values: np.ndarray) -> str:
     texts: Sequence[str] = [
         "".join(f"{v:7.1f}" for v in row) for row in (np.nanmean(moved, 0), np.sqrt(np.nanmean(moved**2, 0)))
     ]
-    return f"{name:16}{pixels:8.2f}{holes:8.1%}{p50:14.5f}{p99:9.5f}{texts[0]}    {texts[1]}"
+    none = int(np.isnan(moved).any(1).sum())
+    return f"{name:16}{pixels:8.2f}{none:6}{holes:8.1%}{p50:14.5f}{p99:9.5f}{texts[0]}    {texts[1]}"
 
 
 if __name__ == "__main__":

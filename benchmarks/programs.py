@@ -32,6 +32,7 @@ from ddgrasp.config import (
     SensorConfig,
 )
 from demos.rollout import Roller
+from learning.convolutions import compiler_options
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import evaluate, policy, rollout, train
@@ -171,7 +172,9 @@ def sampler(name: Sampler, config: Config) -> Program:
     ddg = _sampled_by(config, name)
     count = ddg.sampling.batch_size
     frames = shape(count, dtype=jnp.int32)
-    drawn = jax.jit(partial(sample.sample, ddg, steps=ddg.sampling.steps))
+    drawn = jax.jit(
+        partial(sample.sample, ddg, steps=ddg.sampling.steps), compiler_options=compiler_options()
+    )
     return drawn, (_key(), _ddg_state(config).params, _maps(config, count)[1], frames, frames)
 
 

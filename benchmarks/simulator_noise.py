@@ -27,7 +27,8 @@ from ddgrasp.depth import to_metres, to_millimetres
 from ddgrasp.errors import UserError
 from deploy.depth_noise import DepthGenerator
 from evaluation.depth_score import features as score_features
-from evaluation.depth_score.data import REAL, SIM, Episode, load_real, real_episodes
+from evaluation.depth_score import real as real_score
+from evaluation.depth_score.data import BLOCK_FRAMES, REAL, SIM, Episode, load_real, real_episodes
 from evaluation.depth_score.distances import fid
 from evaluation.depth_score.resampling import Sample, bootstrap_pairs, draws, interval
 from sensors.models.procedural import dextrah, kinect
@@ -129,8 +130,13 @@ def timed(name: str, noise: Noise, episodes: Sequence[Episode]) -> Row:
 
 
 def measure(episodes: Sequence[Episode], files: Sequence[Path], threads: int) -> None:
-    """Prints a line per noise."""
+    """Prints a line per noise. UserError for fewer blocks of frames than can be resampled."""
     real, sim = ([e for e in episodes if e.side == side] for side in (REAL, SIM))
+    if len(real) < real_score._FEWEST_BLOCKS:
+        raise UserError(
+            f"the frames scored hold {len(real)} run(s) of {2 * BLOCK_FRAMES} of one recording; expected "
+            f"{real_score._FEWEST_BLOCKS} or more: give a larger --score-frames."
+        )
     sensed, clean = (to_metres(np.concatenate([getattr(e, n) for e in sim])) for n in _PAIR)
     rows = [Row("none (clean depth)", clean)]
     rows += [timed(name, noise, sim) for name, noise in noises(real, files, threads).items()]

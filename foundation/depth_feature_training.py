@@ -18,9 +18,10 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from ddgrasp import artifacts
+from ddgrasp.alone import alone_in
 from ddgrasp.config import DepthFeatureConfig
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_path, atomic_write_json, read_json, to_json
+from ddgrasp.files import DAMAGED_NPZ, atomic_path, atomic_write_json, read_json, to_json
 from ddgrasp.progress import Progress
 from foundation import depth_features
 from foundation.depth_feature_data import MEASURED, TREATMENTS, Batch, Pool, make_batch
@@ -57,8 +58,15 @@ class Heads(nn.Module):
 def train(config: DepthFeatureConfig, out: Path, *, quiet: bool = False) -> dict[str, Any]:
     """Trains, freezes the trunk into `out` and returns its manifest. Continues what is in `out`/.work.
 
-    UserError if `out` holds a finished extractor, or one begun with another configuration.
+    UserError if `out` holds a finished extractor, or one begun with another configuration, or if another
+    process trains there.
     """
+    out.mkdir(parents=True, exist_ok=True)
+    with alone_in(out):
+        return _train(config, out, quiet)
+
+
+def _train(config: DepthFeatureConfig, out: Path, quiet: bool) -> dict[str, Any]:
     if (out / artifacts.MANIFEST).exists():
         raise UserError(f"{out} holds a finished extractor: choose another --out, or delete it.")
     work = out / WORK
@@ -100,10 +108,11 @@ def load_pools(config: DepthFeatureConfig, work: Path, progress: Progress) -> tu
     """(training, test) pictures; devices whose file is in `work` are not taken anew."""
     files = [work / f"device_{number:03d}.npz" for number in range(config.devices)]
     with progress.task("random cameras", config.devices) as task:
+        task.start_at(sum(file.exists() for file in files))
         for number, file in enumerate(files):
             if not file.exists():
                 _take_pictures(config, number, file)
-            task.advance()
+                task.advance()
     pools = [_read(file) for file in files]
     tested = max(1, round(config.devices * TEST_SHARE))
     return _joined(pools[:-tested]), _joined(pools[-tested:])
@@ -119,8 +128,11 @@ def _take_pictures(config: DepthFeatureConfig, number: int, file: Path) -> None:
 
 
 def _read(file: Path) -> Pool:
-    with np.load(file) as arrays:
-        return Pool(**dict(arrays))
+    try:
+        with np.load(file) as arrays:
+            return Pool(**dict(arrays))
+    except DAMAGED_NPZ as error:
+        raise UserError(f"{file} is damaged ({error}): delete it and run the same command again.") from None
 
 
 def _joined(pools: list[Pool]) -> Pool:

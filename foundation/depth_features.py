@@ -99,7 +99,8 @@ class DepthFeatures:
 @jax.jit
 def standardised(params: dict[str, Any], depth_m: Float[Array, "B H W"]) -> Float[Array, f"B {FEATURES}"]:
     """(B, H, W) metres -> features with mean 0 and deviation 1 over the training pictures."""
-    features: Any = Trunk().apply({"params": params["trunk"]}, depth_m)
+    with jax.default_matmul_precision("highest"):
+        features: Any = Trunk().apply({"params": params["trunk"]}, depth_m)
     return (features - params["mean"]) / params["std"]
 
 

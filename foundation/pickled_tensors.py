@@ -40,8 +40,8 @@ DTYPES = {
 }
 
 _DAMAGE = (
-    ArithmeticError, AttributeError, EOFError, LookupError, RuntimeError, TypeError, ValueError, struct.error,
-    zipfile.BadZipFile, zlib.error,
+    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, RuntimeError, TypeError, ValueError,
+    struct.error, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """What reading a damaged file may end in."""
 
@@ -82,7 +82,8 @@ def read_pth(path: Path) -> dict[str, np.ndarray]:
         tree, storages = _read_zip(path) if zipfile.is_zipfile(path) else _read_legacy(path)
         return {name: _array(name, view, storages, path) for name, view in _state_dict(tree, path).items()}
     except _DAMAGE as error:
-        raise UserError(f"{path} is no readable PyTorch checkpoint: {error}.") from None
+        reason = str(error) or type(error).__name__
+        raise UserError(f"{path} is no readable PyTorch checkpoint: {reason}.") from None
 
 
 def _state_dict(tree: Any, path: Path) -> dict[str, _View]:
@@ -146,9 +147,9 @@ def _read_legacy(path: Path) -> tuple[Any, Callable[[_Storage], bytes]]:
             (length,) = struct.unpack("<q", file.read(8))
             if key not in sizes:
                 raise ValueError(f"storage {key} belongs to no tensor")
-            parts[key] = file.read(length * sizes[key]) if length >= 0 else b""
-            if len(parts[key]) != length * sizes[key]:
+            if not 0 <= length * sizes[key] <= path.stat().st_size - file.tell():
                 raise ValueError("it ends early")
+            parts[key] = file.read(length * sizes[key])
     return tree, lambda storage: parts[storage.key]
 
 

@@ -119,9 +119,23 @@ def load(directory: Path, families: tuple[str, ...] = ()) -> tuple[WeightsManife
 
 
 def installed(weights_dir: Path = WEIGHTS_DIR) -> dict[str, WeightsManifest]:
-    """Folder name (the network's, of metric variants with `_metric` behind) -> manifest."""
-    folders = [path.parent for path in sorted(weights_dir.glob(f"[!.]*/{MANIFEST}"))]
-    return {folder.name: read_manifest(folder) for folder in folders}
+    """Folder name (the network's, of metric variants with `_metric` behind) -> manifest that can be read."""
+    return {name: read for name, read in _folders(weights_dir).items() if isinstance(read, WeightsManifest)}
+
+
+def unreadable(weights_dir: Path = WEIGHTS_DIR) -> dict[str, str]:
+    """Name of each other folder of weights -> what is wrong with its manifest, and the remedy."""
+    return {name: str(read) for name, read in _folders(weights_dir).items() if isinstance(read, UserError)}
+
+
+def _folders(weights_dir: Path) -> dict[str, WeightsManifest | UserError]:
+    found: dict[str, WeightsManifest | UserError] = {}
+    for path in sorted(weights_dir.glob(f"[!.]*/{MANIFEST}")):
+        try:
+            found[path.parent.name] = read_manifest(path.parent)
+        except UserError as error:
+            found[path.parent.name] = error
+    return found
 
 
 def _check_metric(file: Path, network: str, max_depth_m: float) -> None:

@@ -72,6 +72,17 @@ def test_a_missed_bound_writes_nothing_and_keeps_the_old_file(tmp_path):
     assert not artifacts.is_finished(tmp_path / "export")
 
 
+def test_a_larger_bound_is_advised_where_the_setting_takes_it():
+    for difference in (3.2e-4, 0.2, 0.49):
+        said = stage._too_different(difference, 1e-4)
+        advised = float(said.partition("--export.max-abs-diff ")[2].partition(";")[0])
+        assert difference < advised and ExportConfig(max_abs_diff=advised) is not None
+    assert "--export.max-abs-diff 6e-04; otherwise train longer" in stage._too_different(3.2e-4, 1e-4)
+    for difference in (0.5, 1.7):
+        said = stage._too_different(difference, 1e-4)
+        assert said.endswith("the student is kept. Train longer.")
+
+
 def test_no_student_is_said(tmp_path):
     with pytest.raises(UserError, match="no finished stage 'student'"):
         stage.run(make_job("export", CONFIG, tmp_path / "export"))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks import network_graphs, networks
 from ddgrasp.errors import UserError
 from foundation import long_video, pictures
 from foundation.depth import DepthNetwork, predict
@@ -88,6 +89,19 @@ def test_wrong_shapes_are_named(params):
         replace(VIDEO, dtype="float23")
     with pytest.raises(UserError, match="0 x 40"):
         pictures.network_size(0, 40, 518, video=False)
+
+
+@pytest.mark.parametrize("network", [VIDEO, IMAGE])
+def test_the_benchmark_s_graph_computes_what_the_network_does(params, network):
+    """benchmarks/network_graphs.py, by onnxruntime."""
+    weights = {"pretrained": params["pretrained"], network.head: params["head"]}
+    x = np.random.default_rng(2).normal(size=(3, SIZE, 2 * SIZE, 3)).astype(np.float32)
+    nchw = np.ascontiguousarray(np.moveaxis(x, -1, 1))
+    session = networks.open_session(network_graphs.depth_model(network, weights, nchw.shape))
+    (made,) = session.run(None, {network_graphs.INPUT: nchw})
+    wanted = np.asarray(jax.jit(network)(weights, x[None] if network.video else x)).reshape(3, SIZE, 2 * SIZE)
+    assert wanted.std() > 0.05
+    np.testing.assert_allclose(np.asarray(made)[:, 0], wanted, atol=1e-4)
 
 
 # --- long videos ---------------------------------------------------------------------------------

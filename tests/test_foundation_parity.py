@@ -1,6 +1,7 @@
 """Every recorded array of the original networks, in float32: foundation/ computes the same numbers.
 
-`make test-parity` runs this file alone; fixtures come from PARITY_DIR, any of the same kind.
+`make test-parity` runs this file, with those of distances and diffusion; fixtures come from PARITY_DIR, any
+of the same kind.
 """
 
 import re

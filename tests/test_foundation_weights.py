@@ -15,6 +15,7 @@ import parity_support as parity
 import weights_support
 from app.cli import main
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json
 from foundation import catalog, convert, store
 from foundation.checkpoint_files import read_checkpoint
 from foundation.pickled_tensors import read_pth
@@ -45,6 +46,14 @@ def test_pth_of_the_older_format(tmp_path):
     whole = (tmp_path / "x.pth").read_bytes()
     (tmp_path / "x.pth").write_bytes(whole[:-4])
     with pytest.raises(UserError, match="ends early"):
+        read_pth(tmp_path / "x.pth")
+    claimed = struct.pack("<q", 6), struct.pack("<q", 2**44)
+    (tmp_path / "x.pth").write_bytes(whole.replace(*claimed))
+    with pytest.raises(UserError, match="ends early"):
+        read_pth(tmp_path / "x.pth")
+    text_of_16_tb = b"\x80\x04\x8d" + struct.pack("<Q", 2**44)
+    (tmp_path / "x.pth").write_bytes(text_of_16_tb)
+    with pytest.raises(UserError, match=r"no readable PyTorch checkpoint: \w"):
         read_pth(tmp_path / "x.pth")
 
 
@@ -115,9 +124,11 @@ def test_files_of_other_kinds_are_named(tmp_path):
     header = {"x": {"dtype": "F32", "shape": [4], "data_offsets": [0, 16]}}
     short = json.dumps(header).encode()
     (tmp_path / "y.safetensors").write_bytes(struct.pack("<Q", len(short)) + short + bytes(8))
+    (tmp_path / "z.safetensors").write_bytes(struct.pack("<Q", 100_000) + b"[" * 100_000)
     for name, message in (
         ("x.pth", "neither"), ("x.txt", "expected one of"), ("x.safetensors", "header"),
-        ("y.safetensors", "offsets 0 to 16 in 8 bytes"), ("none.pth", "does not exist"),
+        ("y.safetensors", "offsets 0 to 16 in 8 bytes"), ("z.safetensors", "no readable safetensors file"),
+        ("none.pth", "does not exist"),
     ):  # fmt: skip
         with pytest.raises(UserError, match=message):
             read_checkpoint(tmp_path / name)
@@ -241,6 +252,23 @@ def test_metric_weights_of_the_video_network_are_refused(tmp_path):
     with pytest.raises(UserError, match="not supported: take video_depth_anything_vits.pth"):
         store.convert_file(file, tmp_path / "weights")
     assert not (tmp_path / "weights").exists()
+
+
+def test_one_damaged_folder_hides_no_other(tmp_path, capsys):
+    for name, text in (("resnet18", "{"), ("fid_inception", '{"format_version": 0}')):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / store.MANIFEST).write_text(text)
+    name = "depth_anything_v2_small"
+    manifest = store.WeightsManifest(name, "x.pth", "ab12", "Apache-2.0", "here", 1, 0.0, {}, "today")
+    atomic_write_json(tmp_path / name / store.MANIFEST, manifest)
+    assert store.installed(tmp_path) == {name: manifest}
+    reasons = store.unreadable(tmp_path)
+    assert reasons.keys() == {"resnet18", "fid_inception"}
+    assert "not valid JSON" in reasons["resnet18"] and "another version" in reasons["fid_inception"]
+    assert main(["weights", "list", "--out", str(tmp_path)]) == 0
+    listed = capsys.readouterr().out
+    assert all(reason in listed for reason in reasons.values())
+    assert f"installed in {tmp_path / name}, from x.pth" in listed
 
 
 def test_the_catalog_states_licences():

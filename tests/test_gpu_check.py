@@ -1,12 +1,15 @@
 """The command that measures a GPU, at its smallest sizes, where there is none."""
 
 import json
+import os
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import jax
 import pytest
 
-from benchmarks import gpu_check
+from benchmarks import gpu_check, gpu_sizes
 
 
 def test_sections_run_in_processes_of_their_own_and_fill_one_file(tmp_path):
@@ -15,16 +18,16 @@ def test_sections_run_in_processes_of_their_own_and_fill_one_file(tmp_path):
     report = json.loads(out.read_text())
     assert report["complete"] and report["machine"]["cores"] >= 1
     assert report["env_steps"]["errors"] == []
-    rates = [report["env_steps"][f"cpu_{count}"] for count in gpu_check.CPU.env_counts["cpu"]]
+    rates = [report["env_steps"][f"cpu_{count}"] for count in gpu_sizes.CPU.env_counts["cpu"]]
     assert all(rate["physics_steps_per_s"] == pytest.approx(20 * rate["env_steps_per_s"]) for rate in rates)
     assert min(rate["env_steps_per_s"] for rate in rates) > 1
 
 
 def test_backends_are_those_named_in_that_order_and_all_without():
-    assert gpu_check.only(gpu_check.GPU, []) is gpu_check.GPU
-    chosen = gpu_check.only(gpu_check.GPU, ["jax"])
+    assert gpu_sizes.only(gpu_sizes.GPU, []) is gpu_sizes.GPU
+    chosen = gpu_sizes.only(gpu_sizes.GPU, ["jax"])
     assert chosen.physics == ("jax",) and chosen.renderers == ("jax",)
-    assert gpu_check.only(gpu_check.GPU, ["jax", "warp"]).physics == ("jax", "warp")
+    assert gpu_sizes.only(gpu_sizes.GPU, ["jax", "warp"]).physics == ("jax", "warp")
 
 
 def test_backends_that_leave_nothing_are_refused_in_one_line(monkeypatch, capsys):
@@ -53,8 +56,38 @@ def test_a_section_that_finds_something_keeps_its_figures_and_fails(tmp_path, mo
 
     monkeypatch.setitem(gpu_check.SECTIONS, "frames", (finds, 1.0))
     out = tmp_path / "section.json"
-    assert gpu_check.run_section("frames", gpu_check.CPU, out) == 1
+    assert gpu_check.run_section("frames", gpu_sizes.CPU, out) == gpu_check.FOUND
     assert json.loads(out.read_text()) == {"errors": ["too slow"], "speed": 3.0, "more": 4.0}
+
+
+CRASHES_AFTER_A_FINDING = """#!{python}
+import sys
+sys.path.insert(0, {root!r})
+from benchmarks import gpu_check
+
+def crashes(sizes, save):
+    save(speed=3.0)
+    yield "too slow"
+    raise RuntimeError("out of memory")
+
+gpu_check.SECTIONS["frames"] = (crashes, 60.0)
+sys.argv = sys.argv[2:]  # as with -m
+gpu_check.main()
+"""
+
+
+def test_a_section_that_crashes_after_a_finding_keeps_both(tmp_path, monkeypatch):
+    program = tmp_path / "python"
+    root = str(Path(gpu_check.__file__).parents[1])
+    program.write_text(CRASHES_AFTER_A_FINDING.format(python=sys.executable, root=root))
+    os.chmod(program, 0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    assert gpu_check.run_all(["frames"], "cpu", tmp_path / "check.json") == 1
+    section = json.loads((tmp_path / "check.json").read_text())["frames"]
+    assert section["speed"] == 3.0
+    found, crash = section["errors"]
+    assert found == "too slow"
+    assert crash.startswith("exit status 1: ") and crash.endswith("RuntimeError: out of memory")
 
 
 def test_without_a_gpu_it_says_so_in_one_line(tmp_path, monkeypatch, capsys):
@@ -67,22 +100,63 @@ def test_without_a_gpu_it_says_so_in_one_line(tmp_path, monkeypatch, capsys):
     assert stop.value.code == 2 and not out.exists()
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and "needs an NVIDIA GPU" in lines[0] and "--device cpu" in lines[0]
+    assert gpu_check.run_all(["frames"], "gpu", out) == 2 and not out.exists()
+    assert "needs an NVIDIA GPU" in capsys.readouterr().err
 
 
 def test_generator_and_student_are_timed(tmp_path):
     out = tmp_path / "check.json"
-    assert gpu_check.run_section("training", gpu_check.CPU, out) == 0
+    assert gpu_check.run_section("training", gpu_sizes.CPU, out) == 0
     report = json.loads(out.read_text())
     assert report["preset"] == "debug"
     assert min(report["student"].values()) > 0 and min(report["generator"].values()) > 0
 
 
-def test_the_teacher_from_nothing_starts_from_nothing_and_the_guided_one_from_the_guide(tmp_path):
-    for sizes in gpu_check.SIZES.values():
+def test_physics_is_within_its_limits(tmp_path):
+    out = tmp_path / "check.json"
+    assert gpu_check.run_section("conformance", gpu_sizes.CPU, out) == 0
+    measured = json.loads(out.read_text())["cpu"]
+    assert 1e-4 < measured["fall_relative"] < 1e-3 and measured["fall_from_cpu_m"] == 0
+
+
+def test_pictures_are_compared_with_each_reference_that_there_is(tmp_path):
+    """Without OpenGL there is the other one, and a line that says why."""
+    out = tmp_path / "check.json"
+    status = gpu_check.run_section("pictures", gpu_sizes.CPU, out)
+    report = json.loads(out.read_text())
+    assert status == (gpu_check.FOUND if report["errors"] else 0)
+    assert 0 < report["jax_numpy"]["median_depth_error_m"] < 1e-4
+    assert "jax_opengl" in report or [error[:8] for error in report["errors"]] == ["opengl: "]
+
+
+def test_frames_are_timed_for_every_size(tmp_path):
+    out = tmp_path / "check.json"
+    assert gpu_check.run_section("frames", gpu_sizes.CPU, out) == 0
+    report = json.loads(out.read_text())
+    assert report["jax_16px"]["scenes"] == 8 and report["jax_16px"]["frames_per_s"] > 1
+
+
+def test_the_teacher_from_nothing_starts_from_nothing_and_the_guided_one_from_the_guide():
+    for sizes in gpu_sizes.SIZES.values():
         assert gpu_check.guided(sizes).start == "guide"
         assert gpu_check.unguided(sizes).start == "nothing"
-    out = tmp_path / "check.json"
-    assert gpu_check.run_section("ppo_from_nothing", gpu_check.CPU, out) == 0
-    report = json.loads(out.read_text())
-    assert report["start"] == "nothing"
-    assert [row["iteration"] for row in report["evaluations"]] == [0, 1, 2]
+
+
+def test_a_teacher_trains_until_an_evaluation_reaches_the_aim(monkeypatch):
+    """One that PPO did not begin to train counts for nothing; a backend that cannot train stops no other."""
+    report = {}
+    monkeypatch.setattr(gpu_check, "SUCCESS_AIM", 0.0)
+    sizes = replace(gpu_sizes.CPU, physics=("abacus", "cpu"))
+    (error,) = gpu_check.ppo_from_nothing(sizes, lambda **values: report.update(values))
+    assert error.startswith("abacus: UserError: ")
+    assert report["start"] == "nothing" and report["backend"] == "cpu"
+    assert [row["iteration"] for row in report["evaluations"]] == [0, 1]
+    assert report["seconds_to_95_percent"] == report["evaluations"][1]["seconds"] > 0
+
+
+@pytest.mark.parametrize("section, figure", [("pictures", "jax_numpy"), ("frames", "jax_16px")])
+def test_a_renderer_that_cannot_draw_stops_no_other(section, figure):
+    report = {}
+    sizes = replace(gpu_sizes.CPU, renderers=("abacus", "jax"))
+    found = list(gpu_check.SECTIONS[section][0](sizes, lambda **values: report.update(values)))
+    assert [error for error in found if error.startswith("abacus")] and figure in report

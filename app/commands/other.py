@@ -13,6 +13,7 @@ from ddgrasp import contract
 from ddgrasp.config.checks import Range
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
+from foundation.store import WEIGHTS_DIR
 
 if TYPE_CHECKING:
     from evaluation.report.trials_page import Trials
@@ -24,7 +25,7 @@ class WeightsConvert:
 
     file: tyro.conf.Positional[Path]
     """File as `ddgrasp weights list` names it; what is pickled in it is not run."""
-    out: Path = Path("weights")
+    out: Path = WEIGHTS_DIR
     """Folder of converted weights; each network gets a folder in it."""
     max_depth_m: Annotated[float, Range(0, 1000)] = 0.0
     """Range of a metric depth model in metres (20 indoor, 80 outdoor); 0 for the relative ones."""
@@ -45,19 +46,20 @@ class WeightsConvert:
 class WeightsList:
     """List networks with published weights: where to get them, their licence, what is installed."""
 
-    out: Path = Path("weights")
+    out: Path = WEIGHTS_DIR
     """Folder of converted weights."""
 
     def run(self) -> None:
         """Prints an entry per network."""
         from foundation import catalog, store
 
-        there = store.installed(self.out)
+        there, damaged = store.installed(self.out), store.unreadable(self.out)
         for name, entry in catalog.ENTRIES.items():
-            folder = name if name in there else f"{name}_metric"
+            folder = name if name in there | damaged else f"{name}_metric"
             manifest = there.get(folder)
             place = self.out / folder
             state = f"installed in {place}, from {manifest.source_file}" if manifest else "not installed"
+            state = damaged.get(folder, state)
             lines = {"file": entry.file, "published": entry.published, "licence": entry.licence}
             lines |= {"used for": entry.used_for, "here": state}
             print(name, *(f"  {title:<10} {text}" for title, text in lines.items()), "", sep="\n")

@@ -1,0 +1,55 @@
+"""What benchmarks measure and print: the programs that stages run, what is left out, too few frames."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import generator, objects_seen, simulator_noise
+from benchmarks.programs import PROGRAMS
+from ddg_jax.train import init_params
+from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
+from evaluation.depth_score.data import SIDES, Episode
+from learning import convolutions
+
+DEBUG = PRESETS["debug"]
+
+
+def _options(jitted, arguments) -> str:
+    """What XLA is told where `jitted` is compiled, as JAX says it: a program inside another may have none."""
+    with pytest.raises(ValueError, match="compiler_options") as refusal:
+        jax.make_jaxpr(jitted)(*arguments)
+    return str(refusal.value)
+
+
+def test_evaluations_are_compiled_as_the_generator_s_are():
+    config, (height, width) = DEBUG.ddg, (DEBUG.ddg.depth.height_px, DEBUG.ddg.depth.width_px)
+    if convolutions.compiler_options() is None:
+        pytest.skip("this jaxlib is not 0.10, or compiles for an accelerator")
+    params = jax.eval_shape(lambda: init_params(config, jax.random.key(0)))
+    maps = jax.ShapeDtypeStruct((2, height, width, generator.channels(config)), jnp.float32)
+    priors = jax.ShapeDtypeStruct((2, height, width), jnp.float32)
+    assert convolutions.OPTION in _options(generator.one_evaluation(config, 2), (params, maps, priors))
+    drawn, arguments = PROGRAMS[f"sampler: {config.sampling.sampler}"](DEBUG)
+    assert convolutions.OPTION in _options(drawn, arguments)
+
+
+def test_scenes_without_object_pixels_are_counted():
+    seen, unseen = [0.5, 0.1, 0.01, 0.02, 3.0, 0.0, -3.0], [0.0, 1.0, 0.01, 0.02, *3 * [np.nan]]
+    line = objects_seen._line("generator", np.array([seen, unseen, unseen]))
+    assert line.split() == [
+        "generator", "0.17", "2", "70.0%", "0.01000", "0.02000", "3.0", "0.0", "-3.0", "3.0", "0.0", "3.0",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("blocks", [0, 1])
+def test_fewer_blocks_than_can_be_resampled_are_refused(blocks):
+    maps = np.full((4, 12, 16), 700, np.uint16)
+    episodes = [
+        Episode(side, number, number, maps, maps, maps[:0], None, 300.0, 0.05)
+        for side in SIDES
+        for number in range(blocks)
+    ]
+    with pytest.raises(UserError, match=rf"hold {blocks} run\(s\) of 8 .*give a larger --score-frames"):
+        simulator_noise.measure(episodes, [], 1)
