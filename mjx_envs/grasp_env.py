@@ -120,7 +120,7 @@ class GraspEnv(MjxEnv):
         )
         obs = self._get_obs(state, episode)
         metrics = {f"reward/{name}": jnp.zeros(()) for name in rewards.TERMS}
-        names = ("success", "saturated", "return", "length", "contacts_dropped")
+        names = ("success", "lost", "blown_up", "saturated", "return", "length", "contacts_dropped")
         metrics |= {name: jnp.zeros(()) for name in names}
         info = {"episode": episode, "rng": k_next, "truncation": jnp.zeros(())}
         return State(state, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
@@ -140,7 +140,8 @@ class GraspEnv(MjxEnv):
             episode.latency, grasp_math.controls(old.qpos[QPOS.arm], action, jnp)
         )
         new = self.physics.step(episode.params, old, controls)
-        finite = sound & jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel))
+        blown_up = ~(jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel)))
+        finite = sound & ~blown_up
         new = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
 
         distances = self._distances(new.qpos, episode.variant, episode.branch)
@@ -171,6 +172,7 @@ class GraspEnv(MjxEnv):
         )  # fmt: skip
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         metrics["success"] = (over & ~lost & (hold_count >= contract.HOLD_STEPS)).astype(jnp.float32)
+        metrics |= {"lost": lost.astype(jnp.float32), "blown_up": blown_up.astype(jnp.float32)}
         metrics |= {"return": episode.total_reward, "length": steps.astype(jnp.float32)}
         metrics["contacts_dropped"] = new.dropped.astype(jnp.float32)
         metrics["saturated"] = jnp.mean(jnp.abs(action[ACTION.arm]) > grasp_math.SATURATED)

@@ -88,9 +88,11 @@ inertia keeps the damping below inertia / time step, as for the arm."""
 PAD_FRICTION = 1.0
 JOINT_DAMPING_NMS_RAD = 1.0
 
-MAX_CONTACTS = 12
-"""Contacts that MJX-JAX holds, the deepest ones; it computes as many, touching or not, so that 60 cost 257
-constraint rows where 12 cost 65. A cube between the pads has eight. The C engine and MJX-Warp do not read it.
+CONTACTS_PER_CAPSULE = 3
+"""Contacts that MJX-JAX holds for each capsule among the slots, the deepest ones of all (`max_contacts`). It
+computes as many, touching or not, so that 60 cost 257 constraint rows where 12, those of the default slots,
+cost 65. The C engine and MJX-Warp do not read it. An object at rest has no more than 4 of its box and 2 of
+each capsule; in the guide's grasp a cube has 12 and a ring, of eight capsules, 24.
 
 MJX can also cap the pairs of geoms (`max_geom_pairs`), but it keeps those whose bounding spheres are closest,
 and the hand's is so large (11 cm) that its pairs would push out those of the pads."""
@@ -202,7 +204,7 @@ def scene_xml(sim_dt_s: float = 0.005, layout: SlotLayout = DEFAULT_SLOTS) -> st
     </default>
     <default class="drawn_slot"><geom contype="0" conaffinity="0" group="1"/></default>
   </default>
-  <custom><numeric name="max_contact_points" data="{MAX_CONTACTS}"/></custom>
+  <custom><numeric name="max_contact_points" data="{max_contacts(layout)}"/></custom>
   <visual><global offwidth="1280" offheight="720"/><map znear="0.02" zfar="20"/></visual>
   <worldbody>
     <light pos="0.6 -0.6 2" dir="-0.1 0.3 -1" directional="true"/>
@@ -236,6 +238,11 @@ def build_model(
     model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
     _widen_object_bounds(model)
     return model
+
+
+def max_contacts(layout: SlotLayout) -> int:
+    """Contacts that MJX-JAX holds in a scene with `layout`."""
+    return CONTACTS_PER_CAPSULE * layout.capsules
 
 
 def slot_ids(model: mujoco.MjModel) -> np.ndarray:

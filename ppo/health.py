@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.errors import UserError
 
 ORDER = ("observation", "action", "reward", "loss", "gradient", "state")
@@ -37,9 +38,9 @@ def watch(observation: jax.Array, action: jax.Array, metrics: Mapping[str, jax.A
     return watched | {f"state/{name}": _worst(part) for name, part in vars(state).items()}
 
 
-def check(iteration: int, watched: Mapping[str, jax.Array], saved: int | None, directory: Any) -> None:
+def check(iteration: int, watched: Mapping[str, AnyArray], saved: int | None, directory: Any) -> None:
     """UserError naming the first term that is not finite; `saved` is the iteration of the last checkpoint."""
-    wrong = {name: float(value) for name, value in jax.device_get(watched).items() if not np.isfinite(value)}
+    wrong = {name: float(value) for name, value in watched.items() if not np.isfinite(value)}
     if not wrong:
         return
     first = min(wrong, key=lambda name: (ORDER.index(_kind(name)), name))

@@ -2,10 +2,10 @@
 
 An iteration draws episodes, collects one batch of experience and takes the gradient steps on it: `refresh`,
 `collect`, `improve`, three programs, since XLA keeps no program that calls the host (the C engine) on disk,
-and compiling the two others took most of the time. The whole learner,
-environments included, is one pytree, so that a checkpoint of it resumes exactly. It lies on a mesh of
-devices: environments and batches are shared out, parameters are everywhere, and the numbers drawn are the
-same on any number of devices.
+and compiling the two others took most of the time. The whole learner, environments included, is one pytree,
+so that a checkpoint of it resumes exactly (to the bit on the C engine and on MJX-JAX on a CPU; not promised
+on accelerators). It lies on a mesh of devices: environments and batches are shared out, parameters are
+everywhere, and the numbers drawn are the same on any number of devices.
 """
 
 import math
@@ -45,6 +45,9 @@ SETTLED = 0.1
 STEERED_RATE_MIN = 1e-4
 """Least step size that `target_kl` steers to: at 3e-5, which Brax's own 1e-5 allows, PPO from nothing stayed
 with the object in the hand and did not learn to lift it."""
+
+COUNTED = ("contacts_dropped", "blown_up")
+"""Metrics of the environment that an iteration's scalars hold the sum of."""
 
 
 @struct.dataclass
@@ -263,8 +266,9 @@ def _unroll(env, env_state, policy, key, length):
     (env_state, _), (data, done, metrics) = jax.lax.scan(step, (env_state, key), None, length)
     episodes = jnp.maximum(done.sum(), 1.0)
     outcome = {"success": metrics["success"].sum() / episodes, "saturated": metrics["saturated"].mean()}
+    outcome["lost"] = metrics["lost"].sum() / episodes
     outcome |= {f"episode/{k}": (metrics[k] * done).sum() / episodes for k in ("return", "length")}
-    outcome["contacts_dropped"] = metrics["contacts_dropped"].sum()
+    outcome |= {name: metrics[name].sum() for name in COUNTED}
     outcome |= {k: v.mean() for k, v in metrics.items() if k.startswith("reward/")}
     return env_state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data), outcome
 

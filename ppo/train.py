@@ -56,16 +56,17 @@ def _train(
     with progress.task("PPO", total) as task:
         task.start_at(int(state.iteration))
         control_steps = teacher.num_envs * teacher.unroll_steps
-        clock, lost = _Clock(control_steps), _Lost(control_steps)
+        clock, counts = _Clock(control_steps), _Counts(control_steps)
         for i in range(int(state.iteration) + 1, total + 1):
             if int(state.good_evaluations) >= 2:  # before any work: a checkpoint may hold this already
                 progress.note(f"two evaluations in a row reached {teacher.stop_at:.0%}: done early")
                 break
-            state, metrics, watched = iterate(state)
+            state, *scalars = iterate(state)
+            metrics, watched = jax.device_get(scalars)
             health.check(i, watched, saved.latest, directory)
-            lost.add(metrics)
+            counts.add(metrics)
             if i % LOG_EVERY == 0 or i == total:
-                _log(i, metrics | clock.rate(i) | lost.told(progress), progress, task)
+                _log(i, metrics | clock.rate(i) | counts.told(progress), progress, task)
             task.advance()
             if i % teacher.eval_every == 0 or i == total:
                 rate = _evaluate(test_env, state, config, i, progress)
@@ -73,7 +74,7 @@ def _train(
                 state = learner.with_evaluation(state, rate >= teacher.stop_at)
             if i % teacher.checkpoint_every == 0 or i == total:
                 saved.save(i, state)
-    lost.told(progress)
+    counts.told(progress)
     return state
 
 
@@ -185,24 +186,25 @@ class _Clock:
         return {"steps_per_s": (now[0] - before[0]) * self._steps / max(now[1] - before[1], 1e-9)}
 
 
-class _Lost:
-    """Contacts that physics could not hold since they were told last."""
+class _Counts:
+    """Sums of `learner.COUNTED` since they were told last."""
 
     def __init__(self, steps_per_iteration: int):
         self._per_iteration = steps_per_iteration
-        self._contacts, self._steps = 0.0, 0
+        self._sums: dict[str, float] = {name: 0.0 for name in learner.COUNTED}
+        self._steps = 0
 
-    def add(self, metrics: Mapping[str, jax.Array]) -> None:
+    def add(self, metrics: Mapping[str, Any]) -> None:
         """Counts those of an iteration."""
-        self._contacts += float(metrics["contacts_dropped"])
+        self._sums = {name: count + float(metrics[name]) for name, count in self._sums.items()}
         self._steps += self._per_iteration
 
     def told(self, progress: Progress) -> dict[str, float]:
-        """{"contacts_dropped": their number}, after a warning if there are any."""
-        if warning := dropped_warning(self._contacts, self._steps):
+        """The sums by name, after a warning if contacts were dropped."""
+        if warning := dropped_warning(self._sums["contacts_dropped"], self._steps):
             progress.note(warning)
-        told = {"contacts_dropped": self._contacts}
-        self._contacts, self._steps = 0.0, 0
+        told = self._sums
+        self._sums, self._steps = dict.fromkeys(told, 0.0), 0
         return told
 
 

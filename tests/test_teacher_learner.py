@@ -28,7 +28,8 @@ from teacher_support import learner_without_envs
 
 TEACHER = TeacherConfig(
     total_steps=4 * 8 * 4, num_envs=8, unroll_steps=4, minibatches=2, epochs=1, hidden=(16,), eval_every=100,
-    checkpoint_every=2, pregrasp_share=0.0, start="nothing", critic_warmup=0,
+    checkpoint_every=2, pregrasp_share=0.2, held_share=0.2, settle_from=0.5, target_kl=0.02, start="nothing",
+    critic_warmup=0,
 )  # fmt: skip
 CONFIG = Config(
     "test", world=WorldConfig(episode_steps=6), teacher=TEACHER, evaluation=EvalConfig(teacher_trials=4)
@@ -175,7 +176,7 @@ def test_two_good_evaluations_in_a_row_end_training(tmp_path, monkeypatch):
 
     def iterate(state):
         counts.append(int(state.good_evaluations))
-        curves = {name: jnp.zeros(()) for name in ("success", "contacts_dropped")}
+        curves = {name: jnp.zeros(()) for name in ("success", *learner.COUNTED)}
         return replace(state, iteration=state.iteration + 1), curves, {}
 
     monkeypatch.setattr(ppo_train, "_start", lambda *_: learner_without_envs(teacher))
@@ -228,10 +229,12 @@ def test_episodes_start_as_the_worlds_do_once_training_settles():
     assert env.exploring == [1, 1, 0, 0]
 
 
-def _experience(config: TeacherConfig, state: learner.LearnerState) -> types.Transition:
-    """Eight stretches of four steps, made up, in which the policy of `state` acted."""
+def _experience(
+    config: TeacherConfig, state: learner.LearnerState, seen: jax.Array | None = None
+) -> types.Transition:
+    """Eight stretches of four steps, made up, in which the policy of `state` acted on `seen` (8, 4, 40)."""
     key, steps = state.key, jnp.ones((8, 4))
-    seen = jax.random.normal(key, (8, 4, 40))
+    seen = jax.random.normal(key, (8, 4, 40)) if seen is None else seen
     policy = (state.normalizer, state.params.policy)
     action, extras = ppo_networks.make_inference_fn(learner.make_networks(config))(policy)(seen, key)
     return types.Transition(
@@ -298,13 +301,14 @@ def test_exploring_starts_reach_training_alone(tmp_path, monkeypatch):
     }  # fmt: skip
 
 
-def test_contacts_that_were_dropped_are_told_of_every_iteration(tmp_path, monkeypatch):
+def test_contacts_dropped_and_states_blown_up_are_told_of_every_iteration(tmp_path, monkeypatch):
     """At the fifth, and after the seventh, which an evaluation makes the last of more."""
     teacher = dataclasses.replace(TEACHER, total_steps=20 * 8 * 4, eval_every=6, stop_at=0.9)
-    dropped, said = iter([3, 0, 4, 0, 0, 1, 5]), []
+    dropped, blown_up, said = iter([3, 0, 4, 0, 0, 1, 5]), iter([0, 2, 0, 0, 1, 0, 0]), []
 
     def iterate(state):
-        curves = {"success": jnp.zeros(()), "contacts_dropped": jnp.float32(next(dropped))}
+        counts = {"contacts_dropped": next(dropped), "blown_up": next(blown_up)}
+        curves = {name: jnp.float32(count) for name, count in counts.items()} | {"success": jnp.zeros(())}
         good = jnp.asarray(2 if state.iteration == 6 else 0)
         return replace(state, iteration=state.iteration + 1, good_evaluations=good), curves, {}
 
@@ -319,22 +323,67 @@ def test_contacts_that_were_dropped_are_told_of_every_iteration(tmp_path, monkey
     told = [note for note in said if "contacts" in note]
     assert len(told) == 2
     assert "7 contacts in 160 control steps" in told[0] and "6 contacts in 64 control steps" in told[1]
-    assert read_curves(tmp_path)["contacts_dropped"] == [(5, 7.0)]
+    curves = read_curves(tmp_path)
+    assert (curves["contacts_dropped"], curves["blown_up"]) == ([(5, 7.0)], [(5, 3.0)])
 
 
-def test_an_actor_that_does_not_learn_yet_keeps_its_optimiser():
-    """While the critic warms up the policy stands still: its KL says nothing of its step size, and an Adam
-    that counts the steps without gradients would take the first ones with them several times too large."""
-    config = dataclasses.replace(TEACHER, target_kl=0.02, learning_rate=2e-5, critic_warmup=2)
-    mesh, state = devices.make_mesh(), learner_without_envs(config)
-    data = _experience(config, state)
-    improve = jax.jit(lambda state: learner.improve(config, mesh, state, data, {})[:2])
-    rates = []
+FROM_NOTHING = dataclasses.replace(TEACHER, target_kl=0.02, learning_rate=2e-5, critic_warmup=2)
+
+
+@pytest.fixture(scope="module")
+def from_nothing() -> tuple[np.ndarray, list[tuple[learner.LearnerState, dict[str, float]]]]:
+    """Observations (8, 4, 40) about 2, the last of them all 1.5, and the learner and its scalars after each
+    of three iterations on them, in the first two of which the critic warms up."""
+    mesh, state = devices.make_mesh(), learner_without_envs(FROM_NOTHING)
+    seen = (2.0 + jax.random.normal(jax.random.key(1), (8, 4, 40))).at[..., 39].set(1.5)
+    data, made = _experience(FROM_NOTHING, state, seen), []
+    improve = jax.jit(lambda state: learner.improve(FROM_NOTHING, mesh, state, data, {})[:2])
     for _ in range(3):
         state, metrics = improve(state)
-        rates.append(float(metrics["policy/learning_rate"]))
+        made.append((state, {name: float(value) for name, value in metrics.items()}))
+    return np.asarray(seen), made
+
+
+def test_an_actor_that_does_not_learn_yet_keeps_its_optimiser(from_nothing):
+    """While the critic warms up the policy stands still: its KL says nothing of its step size, and an Adam
+    that counts the steps without gradients would take the first ones with them several times too large."""
+    _, made = from_nothing
+    state, rates = made[-1][0], [metrics["policy/learning_rate"] for _, metrics in made]
     assert rates[:2] == pytest.approx([2e-5, 2e-5]) and rates[2] <= 3.01e-5
     actor, critic = (state.opt_state.inner_states[name] for name in ("policy", "value"))
     steps = [{int(count) for _, count in tree_get_all_with_path(part, "count")} for part in (actor, critic)]
     assert steps == [{2}, {6}]
     assert int(state.normalizer.count) == 3 * 8 * 4  # from nothing, what was seen counts
+
+
+def test_an_update_sees_by_the_scales_that_its_experience_was_made_with(from_nothing):
+    """And leaves those of what was seen: by these a policy that has not moved would act otherwise."""
+    seen, ((state, metrics), *_) = from_nothing
+    assert metrics["policy/kl"] == pytest.approx(8 * np.log(1 + 1e-5), abs=1e-5)  # of Brax's own 1e-5
+    flat = seen.reshape(-1, 40)
+    floored = np.maximum(flat.std(axis=0), learner.OBSERVATION_STD_MIN)
+    assert flat.std(axis=0)[:39].min() > 0.5 and floored[39] == 0.01
+    np.testing.assert_allclose(state.normalizer.mean, flat.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(state.normalizer.std, floored, rtol=1e-5)
+
+
+def test_step_sizes_fall_to_a_tenth_while_each_of_both_learns():
+    """Adam's steps along one constant gradient are as large as its step size."""
+    teacher = dataclasses.replace(TEACHER, total_steps=10 * 8 * 4, critic_warmup=4, target_kl=0.0)
+    optimizer = learner.make_optimizer(teacher)
+    params = learner.network_params({"w": jnp.zeros(1)}, {"w": jnp.zeros(1)})
+    gradient = learner.network_params({"w": jnp.ones(1)}, {"w": jnp.ones(1)})
+
+    def step(state, _):
+        moved, state = optimizer.update(gradient, state, params)
+        return state, (-moved.policy["w"][0], -moved.value["w"][0])
+
+    actor, critic = jax.lax.scan(step, optimizer.init(params), None, 1 + 10 * 2)[1]
+    for steps, rate, taken in (
+        (6 * 2, teacher.learning_rate, actor),
+        (20, teacher.critic_learning_rate, critic),
+    ):
+        assert float(taken[0]) == pytest.approx(rate, rel=1e-3)
+        assert float(taken[steps // 2]) == pytest.approx(0.55 * rate, rel=1e-3)
+        assert float(taken[steps - 1]) == pytest.approx((0.1 + 0.9 / steps) * rate, rel=1e-3)
+        assert float(taken[steps]) == pytest.approx(0.1 * rate, rel=1e-3)

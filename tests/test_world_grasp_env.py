@@ -74,12 +74,20 @@ def test_an_episode_whose_physics_blow_up_at_its_end_has_not_succeeded(stepped):
     state = stepped(HELD_M, speed_rad_s=1e9, hold_count=5, steps=5)
     assert state.info["episode"].hold_count == 6
     assert (state.metrics["success"], state.done, state.info["truncation"]) == (0, 1, 0)
+    assert (state.metrics["blown_up"], state.metrics["lost"]) == (1, 1)
+
+
+@pytest.mark.parametrize(("beside_m", "action", "lost"), [(0.34, OPEN, 0), (0.36, OPEN, 1), (0.36, CLOSE, 0)])
+def test_an_object_out_of_reach_is_lost_unless_it_is_held(stepped, beside_m, action, lost):
+    state = stepped(np.add(contract.WORKSPACE_CENTER_M + (0.03,), (0, beside_m, 0)), action)
+    assert (state.metrics["lost"], state.done, state.metrics["blown_up"]) == (lost, lost, 0)
 
 
 @pytest.mark.parametrize(("last", "reward"), [(CLOSE, -WORLD.reward.toggle), (OPEN, 0.0)])
 def test_an_action_that_is_not_finite_counts_as_zeros_which_open_the_gripper(stepped, first, last, reward):
     state = stepped(first.data.qpos[QPOS.object_pos], CLOSE.at[3].set(jnp.nan), last)
     assert state.done == 1 and float(state.reward) == pytest.approx(reward)
+    assert (state.metrics["lost"], state.metrics["blown_up"]) == (1, 0)
 
 
 def test_joint_actions_beyond_95_percent_are_saturated(stepped):
@@ -98,5 +106,6 @@ def test_a_new_episode_is_drawn_by_each_refresh_and_follows_the_one_that_ends(en
     assert (np.abs(later - earlier).max(axis=1) > 1e-3).all()
     stepped = jax.jit(batch.step)(twice, jnp.zeros((2, 8)))
     assert stepped.done.tolist() == [0, 1] and stepped.info["episode"].steps.tolist() == [5, 0]
+    assert stepped.info["truncation"].tolist() == [0, 1] and stepped.metrics["length"].tolist() == [5, 6]
     begun = (np.asarray(stepped.obs) == later).all(axis=1)
     assert begun.tolist() == [False, True]

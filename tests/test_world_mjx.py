@@ -115,14 +115,17 @@ def test_poses_are_those_of_the_c_engine():
             np.testing.assert_allclose(mine[i], theirs.reshape(mine[i].shape), atol=2e-6)
 
 
-@pytest.mark.parametrize("layout", [DEFAULT_SLOTS, SlotLayout(capsules=8, cylinders=2, plates=5)])
-def test_rows_and_contacts_are_those_asked_for(layout):
+@pytest.mark.parametrize(
+    ("layout", "contacts", "rows"),
+    [(DEFAULT_SLOTS, 12, 65), (SlotLayout(capsules=8, cylinders=2, plates=5), 24, 113)],
+)
+def test_rows_and_contacts_are_those_asked_for(layout, contacts, rows):
     physics = JaxPhysics(0.005, 20, layout)
     made = physics.empty._impl
-    assert (made.ncon, made.nefc) == (12, 65)
+    assert (made.ncon, made.nefc) == (contacts, rows)
     assert (made.ne, made.nf, made.nl) == (1, 7, 9)
     assert (made.contact.dim == 4).all()
-    assert made.efc_J.shape == (65, scene.NV)
+    assert made.efc_J.shape == (rows, scene.NV)
 
 
 def test_contacts_beyond_the_cap_are_counted():
@@ -137,7 +140,7 @@ def test_contacts_beyond_the_cap_are_counted():
     @jax.vmap
     def collided(qpos):
         data = mjx_kinematics.kinematics(physics.model, physics.empty.replace(qpos=qpos))
-        contact, dropped = mjx_collision.collide(physics.model, data, scene.MAX_CONTACTS)
+        contact, dropped = mjx_collision.collide(physics.model, data, 12)
         return jnp.sum(contact.dist < 0), dropped
 
     held, dropped = jax.device_get(collided(np.stack([falling, sunk])))
@@ -168,7 +171,7 @@ def test_a_ball_beside_a_pads_face_is_touched():
     @jax.vmap
     def depth(qpos):
         posed = mjx_kinematics.kinematics(mx, empty.replace(qpos=qpos))
-        contact, _ = mjx_collision.collide(mx, posed, scene.MAX_CONTACTS)
+        contact, _ = mjx_collision.collide(mx, posed, 12)
         pair = jnp.array([ball.id, model.geom("left_finger_pad").id])
         return jnp.min(jnp.where((contact.geom == pair).all(axis=1), contact.dist, 0.0))
 

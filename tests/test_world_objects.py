@@ -161,6 +161,15 @@ def test_in_its_other_pose_it_stays_and_has_turned(name):
     assert np.degrees(2 * np.arccos(min(1.0, abs(data.qpos[12:16] @ start[3:])))) < 3.0
 
 
+@pytest.mark.parametrize("pose", [*EVERYTHING, *(f"{name}, turned" for name in BOTH_POSES)])
+def test_at_rest_mjx_holds_every_contact(pose):
+    name, *turned = pose.split(", ")
+    spec = get_object(name).in_other_pose() if turned else get_object(name)
+    model, data = place(spec)
+    mujoco.mj_step(model, data, nstep=40)
+    assert 1 <= (data.contact.dist < 0).sum() <= scene.max_contacts(slot_layout([spec]))
+
+
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_the_other_pose_comes_up_in_its_share_of_the_episodes_and_stays(share):
     env = GraspEnv(WorldConfig(objects=("block", "cube"), random=RandomConfig(other_pose_share=share)))

@@ -159,6 +159,17 @@ def test_randomisation_stays_in_range_and_moves_only_what_it_should(table):
     np.testing.assert_array_equal(params.link_mass_scale, 1.0)
 
 
+@pytest.mark.parametrize(("room", "dropped"), [(4, 0), (3, 1)])
+def test_warp_counts_an_environment_whose_contacts_had_no_room(room, dropped, monkeypatch):
+    """A cube lies on four contacts."""
+    monkeypatch.setattr(physics_warp, "CONTACTS_PER_ENV", room)
+    warp.config.optimization_level = 0
+    params, rest = conformance._params(("cube",))
+    start = conformance._start([(0.5, 0.0, rest[0] - 0.001)])
+    step = jax.jit(jax.vmap(physics_warp.WarpPhysics(DT_S, 1, DEFAULT_SLOTS).step))
+    assert step(params, start, conformance._hold(1)[0, :1]).dropped.tolist() == [dropped]
+
+
 def test_unknown_backend_is_named():
     with pytest.raises(UserError, match="'cpuu'.*Did you mean 'cpu'"):
         backends.make_physics("cpuu", DT_S)

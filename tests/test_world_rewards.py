@@ -99,6 +99,20 @@ def test_the_papers_distance_is_from_gripper_to_object_and_ours_goes_by_way_of_a
     assert float(funnel.grip_to_object) == pytest.approx(0.1, abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("aside_m", "hand", "target"), [(0.3, 0.3, 0.3), (0.45, 0.45, 0.45), (0.9, 0.5, 0.5)]
+)
+def test_an_object_knocked_away_costs_no_more_than_half_a_metre(aside_m, hand, target):
+    """The grip point at the lift target, (0.5, 0, 0.4), the object beside it."""
+    qpos = jnp.zeros(16).at[9:12].set(jnp.array([0.5, aside_m, 0.4])).at[12].set(1.0)
+    down = jnp.array([0.0, 1.0, 0.0, 0.0])
+    grip = jnp.array([0.5, 0.0, 0.4])
+    seen = rewards.distances(PAPER_REWARD, qpos, qpos[9:12], down, (grip, down))
+    assert float(seen.hand) == pytest.approx(hand, abs=1e-4)
+    assert float(seen.object) == pytest.approx(target, abs=1e-4)
+    assert float(seen.grip_to_object) == pytest.approx(aside_m, abs=1e-4)
+
+
 @pytest.mark.parametrize("metres", [0.02, 0.04])
 @pytest.mark.parametrize("closing", [0, 1])
 @pytest.mark.parametrize("touching", [0, 1])

@@ -1,6 +1,7 @@
 """The solver of MJX-JAX finds the C engine's accelerations and forces, on the C engine's own problems."""
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -112,3 +113,37 @@ def test_it_minimises_the_same_cost_as_the_c_engine(visited, noise):
         np.testing.assert_allclose(acceleration[:9], best[:9], atol=1e-4, err_msg=str(i))
         balance = task.mass @ acceleration - task.force - forces[i] @ task.jacobian
         assert np.abs(balance).max() < 1e-3, i
+
+
+def test_a_state_that_is_not_finite_keeps_no_other_waiting(monkeypatch):
+    """The batch's line search turns until its last one is done. A body sinks and slides along a table."""
+    turns, slopes = [], mjx_solver._slopes
+
+    def counting(task, line):
+        def counted(step):
+            jax.debug.callback(lambda _: turns.append(1), step)
+            return slopes(task, line)(step)
+
+        return counted
+
+    monkeypatch.setattr(mjx_solver, "_slopes", counting)
+    aims, stiffness = jnp.array([5.0, 3.0, 0.1, 0.0]), jnp.full(4, 50.0)
+    cone = jnp.full((1, 4), 0.5)
+
+    @jax.jit
+    @jax.vmap
+    def solve(force):
+        task = mjx_solver.Problem(jnp.eye(4), force, jnp.eye(4), aims, stiffness, jnp.zeros(0), cone, 0)
+        return mjx_solver.solve(task, jnp.zeros(4), 20, mjx_jax.LINE_STEPS, 1e-8)[0]
+
+    def turns_of(*forces):
+        turns.clear()
+        found = np.asarray(solve(np.array(forces, np.float32)))
+        jax.effects_barrier()
+        return len(turns) / len(forces), found
+
+    sound = [-9.81, 1.0, -4.0, 0.5]
+    alone, expected = turns_of(sound, sound)
+    beside, found = turns_of(sound, [np.nan] * 4)
+    assert 2 < beside <= alone < mjx_jax.LINE_STEPS
+    np.testing.assert_array_equal(found[0], expected[0])

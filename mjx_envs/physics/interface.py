@@ -59,7 +59,8 @@ class PhysicsState:
     qvel: jax.Array
     """(15,)"""
     warmstart: jax.Array
-    """(15,) the constraint solver's last solution: with it a step is repeatable to the bit."""
+    """(15,) the constraint solver's last solution: with it a step is repeatable to the bit (on the C engine
+    and on MJX-JAX on a CPU)."""
     touch: jax.Array
     """(2,) contact force (N) between the object and the left and right finger pad."""
     dropped: jax.Array
@@ -96,8 +97,8 @@ def dropped_warning(dropped: float, control_steps: float) -> str | None:
         return None
     return (
         f"warning: {dropped:,.0f} contacts in {control_steps:,.0f} control steps were more than the physics "
-        "backend holds and were left out: use --world.backend cpu, or raise MAX_CONTACTS of "
-        "mjx_envs/scene.py (jax) or CONTACTS_PER_ENV and CONSTRAINTS_PER_ENV of mjx_warp.py (warp)"
+        "backend holds and were left out: use --world.backend cpu, or raise CONTACTS_PER_CAPSULE "
+        "of mjx_envs/scene.py (jax) or CONTACTS_PER_ENV and CONSTRAINTS_PER_ENV of mjx_warp.py (warp)"
     )
 
 

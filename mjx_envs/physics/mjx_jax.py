@@ -41,6 +41,7 @@ class JaxPhysics:
         self.empty = mjx.make_data(model, impl="jax")
         self.model = mjx.put_model(_all_contacts(model), impl="jax")
         self._substeps = substeps
+        self._max_contacts = scene.max_contacts(layout)
         self._index = ModelIndex(model)
         self._pads = np.array([model.geom(f"{side}_finger_pad").id for side in ("left", "right")])
         self._slots = np.array([model.geom(name).id for name in layout.colliding_names])
@@ -60,7 +61,7 @@ class JaxPhysics:
         """`mjx.step` less what the scene has none of: sensors, tendons, cameras, applied forces."""
         data = self.empty.replace(qpos=now.qpos, qvel=now.qvel, ctrl=ctrl)
         data = mjx.crb(mx, mjx.com_pos(mx, kinematics(mx, data)))
-        contact, dropped = collide(mx, data, scene.MAX_CONTACTS)
+        contact, dropped = collide(mx, data, self._max_contacts)
         data = data.tree_replace({"_impl.contact": contact})
         data = mjx.transmission(mx, mjx.make_constraint(mx, data))
         data = mjx.fwd_actuation(mx, mjx.fwd_velocity(mx, data))

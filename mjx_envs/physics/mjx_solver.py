@@ -189,7 +189,7 @@ def _line_search(task: Problem, line: _Line, flat: jax.Array, steps: int) -> jax
         there = here - slope / curvature
         middle = jnp.where(jnp.isinf(high), here, (low + high) / 2)
         there = jnp.where((there > low) & (there < high), there, middle)
-        done = jnp.abs(slope) <= flat
+        done = ~(jnp.abs(slope) > flat)  # a state that is not finite keeps no other waiting
         return count + 1, low, high, jnp.where(done, here, there), done
 
     zero, one = jnp.zeros_like(line.slope), jnp.ones_like(line.slope)

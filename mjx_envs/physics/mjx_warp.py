@@ -12,13 +12,10 @@ from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, to
 
 CONTACTS_PER_ENV = 40
 """Room per environment in the batch's common buffer: nine slots against table, hand and two pads, all near
-at once, are 36 candidates; the most contacts seen is 20 (a persimmon pressed by the hand). Warp computes
-those that there are, so that a closer cap would save memory alone."""
+at once, are 36 candidates; the most contacts seen is 24 (a ring in the guide's grasp). Warp computes those
+that there are, so that a closer cap would save memory alone."""
 CONSTRAINTS_PER_ENV = 128
-"""Rows; the most seen is 90."""
-TOO_MANY = (1 << 0) | (1 << 2) | (1 << 3)
-"""Bits of MuJoCo Warp's `Data.overflow` (its `OverflowType`): rows, candidate pairs, contacts. Once set they
-stay, and how many were lost is not kept: an environment counts 1 for a control step."""
+"""Rows; the most seen is 104, the ring's."""
 
 
 def require_gpu(what: str = "backend") -> None:
@@ -47,6 +44,17 @@ def warp_model(model: mujoco.MjModel) -> mjx.Model:
     model.opt.disableflags &= ~int(disable.mjDSBL_MIDPHASE)
     model.opt.disableflags |= int(disable.mjDSBL_NATIVECCD)
     return mjx.put_model(model, impl="warp")
+
+
+def too_many() -> int:
+    """Bits of MuJoCo Warp's `Data.overflow` that say that rows, candidate pairs or contacts had no room.
+
+    Once set they stay, and how many were lost is not kept: an environment counts 1 for a control step.
+    """
+    from mujoco.mjx.warp import mujoco_warp
+
+    kinds = mujoco_warp.OverflowType
+    return int(kinds.NEFC | kinds.BROADPHASE | kinds.NARROWPHASE)
 
 
 class WarpPhysics:
@@ -83,7 +91,7 @@ class WarpPhysics:
 
         qpos, qvel, warmstart, sensors, overflow = jax.vmap(one)(params, state, ctrl)
         touch = touch_from_sensors(sensors, jnp)
-        dropped = ((overflow & TOO_MANY) != 0).astype(jnp.int32)
+        dropped = ((overflow & too_many()) != 0).astype(jnp.int32)
         return PhysicsState(qpos=qpos, qvel=qvel, warmstart=warmstart, touch=touch, dropped=dropped)
 
     def _advance_nested(self, axis_size, batched, *arguments):
