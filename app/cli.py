@@ -63,9 +63,10 @@ def _dispatch(argv: list[str]) -> int:
         print("  ".join(f"{name} {version}" for name, version in library_versions().items()))
         return 0
     if argv and argv[0] == "completion":
-        from app.completion import script
+        from app.completion import USAGE, script
 
-        print(script(" ".join(argv[1:])))
+        asked = not {"--help", "-h", HELP_ALL}.isdisjoint(argv)
+        print(USAGE if asked else script(" ".join(argv[1:])))
         return 0
     for length in (2, 1):
         name = " ".join(words[:length])

@@ -46,6 +46,9 @@ SHELLS = {
     "zsh": "autoload -U +X compinit && compinit\nautoload -U +X bashcompinit && bashcompinit\n",
 }
 """Shell -> what comes before bash's script there."""
+USAGE = """usage: ddgrasp completion {bash,zsh}
+
+eval "$(ddgrasp completion bash)"  in ~/.bashrc (zsh: ~/.zshrc) completes commands, options, their values."""
 
 
 def script(shell: str) -> str:

@@ -60,17 +60,6 @@ def check(command: str) -> None:
         raise UserError(f"`ddgrasp {command}` needs more than is installed: {more}.")
 
 
-def check_fr3(what: str) -> None:
-    """UserError unless the FR3 rig, which `what` needs, and the driver of its arm are installed."""
-    if missing := lacks_fr3():
-        raise UserError(f"{what} needs {' and '.join(missing)}: {pip_install('fr3')}.")
-
-
-def lacks_fr3() -> list[str]:
-    """What the FR3 rig and the driver of its arm need and is not installed."""
-    return [module for module in ("franky_sim", "franky") if find_spec(module) is None]
-
-
 def remedy(missing: str | None) -> str | None:
     """One line for an absent module of that name; None if no extra brings it."""
     if not missing or not (extras := bringing(missing)):

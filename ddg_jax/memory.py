@@ -13,15 +13,14 @@ from ddgrasp.config import Config, DDGConfig
 from learning.memory import Need, traced_bytes
 
 
-def need(config: Config) -> Need:
-    """What stage `ddg` takes; frames are those of the rig's recordings."""
-    ddg = config.ddg
-    frames = config.record.trajectories * config.record.frames
-    host = frames_bytes(ddg, frames)
+def need(config: Config, frames: int | None = None) -> Need:
+    """What stage `ddg` takes on so many frames; without a number those of the rig's recordings."""
+    ddg, count = config.ddg, "record.frames" if frames is None else "the number of frames"
+    if frames is None:
+        frames = config.record.trajectories * config.record.frames
     device = max(training_bytes(ddg), sampling_bytes(ddg))
-    return Need(
-        "ddg", device, host, remedy="ddg.training.batch_size, ddg.sampling.batch_size or record.frames"
-    )
+    remedy = f"ddg.training.batch_size, ddg.sampling.batch_size or {count}"
+    return Need("ddg", device, frames_bytes(ddg, frames), remedy=remedy)
 
 
 def training_bytes(config: DDGConfig) -> int:

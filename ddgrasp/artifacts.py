@@ -11,6 +11,7 @@ import hashlib
 import importlib.metadata
 import json
 import platform
+import shutil
 import time
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,6 +20,7 @@ from typing import Any
 
 from ddgrasp import contract, machine, upgrades
 from ddgrasp.config import Config, DDGTrainingConfig, DeployConfig, ExportConfig, TeacherConfig
+from ddgrasp.config.checks import has_sections
 from ddgrasp.errors import UserError
 from ddgrasp.files import TEMPORARY, atomic_write_json, read_json, to_json
 from ddgrasp.stages import config_fields, get_stage
@@ -34,6 +36,7 @@ _INDIFFERENT = {
 }
 """Fields that decide whether or how a result comes about, not what it is. They count as these values when
 configurations are compared, so that a stage that missed its bound, or took too much memory, goes on."""
+_ORIGINS = ("trained", "loaded")
 _LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
 
 
@@ -67,7 +70,7 @@ class Manifest:
     """Format of the configuration's fields (ddgrasp/upgrades.py). A Manifest's are always this code's."""
 
     def __post_init__(self):
-        if self.origin not in ("trained", "loaded"):
+        if self.origin not in _ORIGINS:
             raise ValueError(f"origin is {self.origin!r}; expected 'trained' or 'loaded'")
 
 
@@ -98,8 +101,8 @@ def read_manifest(directory: Path | str) -> Manifest:
     names = {field.name for field in dataclasses.fields(Manifest)}
     later = {"created", "machine", upgrades.VERSION_FIELD}
     absent = names - value.keys() - later if isinstance(value, dict) else names
-    if absent or not _has_mappings(value, "config", "parents", "metrics"):
-        raise UserError(f"{path} is no manifest of this project: delete {directory} and run the stage again.")
+    if absent or not _has_mappings(value, "config", "parents", "metrics") or value["origin"] not in _ORIGINS:
+        raise _damaged(path)
     if value["contract_version"] != contract.CONTRACT_VERSION:
         raise UserError(
             f"{path} was made with contract version {value['contract_version']}, this code has "
@@ -117,12 +120,26 @@ def _has_mappings(value: Any, *names: str) -> bool:
 def _config_of(value: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """The configuration in a manifest or started.json, with the fields that this code has."""
     version = value.get(upgrades.VERSION_FIELD, 1)
+    if not isinstance(version, int):
+        raise _damaged(path)
     if version > upgrades.VERSION:
         raise UserError(
             f"{path} is of version {version}, this code reads up to {upgrades.VERSION}: use the release that "
             "made it, or make it again."
         )
-    return upgrades.upgraded(value["config"], version)
+    try:
+        config = upgrades.upgraded(value["config"], version)
+    except (AttributeError, TypeError):  # of what is no section, or no number
+        raise _damaged(path) from None
+    if not has_sections(config, Config):
+        raise _damaged(path)
+    return config
+
+
+def _damaged(path: Path) -> UserError:
+    if path.name == STARTED:
+        return UserError(f"{path} does not say how a stage was begun: delete {path.parent}, run it again.")
+    return UserError(f"{path} is no manifest of this project: delete {path.parent} and run the stage again.")
 
 
 def read_artifact(directory: Path | str) -> Artifact:
@@ -226,10 +243,12 @@ def begin(
     inputs = dict(inputs or {})
     if write:
         for litter in Path(directory).glob(f"{TEMPORARY}*"):  # of an attempt that was killed mid-write
-            litter.unlink(missing_ok=True)
+            if litter.is_dir() and not litter.is_symlink():
+                shutil.rmtree(litter)
+            else:
+                litter.unlink(missing_ok=True)
     if (started := _check_begun(Path(directory), stage, config)) is not None:
-        before = started["inputs"]
-        _check_same_inputs(directory, before, {name: inputs.get(name) for name in before}, "begun")
+        _check_same_inputs(directory, started["inputs"], inputs, "begun")
     elif write:
         value = {
             upgrades.VERSION_FIELD: upgrades.VERSION,
@@ -269,7 +288,7 @@ def _read_started(path: Path) -> dict[str, Any]:
     """What started.json holds; UserError if it is damaged or no such note."""
     started = read_json(path)
     if not _has_mappings(started, "config", "inputs"):
-        raise UserError(f"{path} does not say how a stage was begun: delete {path.parent}, run it again.")
+        raise _damaged(path)
     return started
 
 
@@ -289,7 +308,7 @@ def check_inputs(directory: Path | str, inputs: Mapping[str, str]) -> None:
 
 
 def _check_same_inputs(
-    directory: Path | str, there: Mapping[str, str], here: Mapping[str, str | None], how: str
+    directory: Path | str, there: Mapping[str, str], here: Mapping[str, str], how: str
 ) -> None:
     if difference := next(differences(there, here), None):
         raise UserError(

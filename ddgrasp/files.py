@@ -60,9 +60,14 @@ def replaced_folder(path: Path | str) -> Iterator[Path]:
     old = path.with_name(f"{TEMPORARY}{os.getpid()}-old-{path.name}")
     with _folder_beside(path) as temporary:
         yield temporary
-        if path.exists():
-            os.replace(path, old)
-        os.replace(temporary, path)
+        try:
+            if path.exists():
+                os.replace(path, old)
+            os.replace(temporary, path)
+        except BaseException:
+            if old.exists() and not path.exists():
+                os.replace(old, path)
+            raise
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -90,8 +95,9 @@ def _name(error: BaseException, temporary: Path, path: Path) -> None:
 
 def user_cache(name: str) -> Path:
     """Where what can be made again is kept: `name` in DDGRASP_CACHE, or in ddgrasp/ of the user's caches."""
-    caches = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return Path(os.environ.get("DDGRASP_CACHE", caches / "ddgrasp")) / name
+    if own := os.environ.get("DDGRASP_CACHE"):
+        return Path(own) / name
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ddgrasp" / name
 
 
 def atomic_write_bytes(path: Path | str, data: bytes) -> None:

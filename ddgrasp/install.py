@@ -2,9 +2,26 @@
 
 import os
 import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
+from ddgrasp.errors import UserError
+
 PROJECT = "ddgrasp"
+FR3 = ("franky_sim", "franky", "trimesh")
+"""Modules of the extra [fr3] that the FR3 rig takes: its arm, the arm's driver, its objects."""
+
+
+def check_fr3(what: str, needed: Sequence[str] = FR3) -> None:
+    """UserError unless all that `what`, the FR3 rig or a part of it, takes is installed."""
+    if missing := lacks_fr3(needed):
+        raise UserError(f"{what} needs {' and '.join(missing)}: {pip_install('fr3')}.")
+
+
+def lacks_fr3(needed: Sequence[str] = FR3) -> list[str]:
+    """What of the modules of FR3 that are `needed` is not installed."""
+    return [module for module in needed if find_spec(module) is None]
 
 
 def pip_install(extras: str) -> str:

@@ -41,17 +41,19 @@ def _check_losses(student: StudentConfig) -> None:
 
 def _check_head(student: StudentConfig) -> None:
     """What acts must have been trained, which the action loss on pictures does by itself."""
-    head, begun = student.head, bool(student.init_from)
-    if student.training.action_weight:
+    head, training, begun = student.head, student.training, bool(student.init_from)
+    if training.action_weight and training.steps:
         return
+    lacking = "steps" if training.action_weight else "action_weight"
     if head.features_to_head and (student.poses.rounds or (student.dagger.rounds and not begun)):
         raise UserError(
-            "student.head.features_to_head with student.training.action_weight 0: the head would act before "
-            "it has learnt what the features mean; give action_weight, or 0 poses.rounds and dagger.rounds."
+            f"student.head.features_to_head with student.training.{lacking} 0: the head would act before it "
+            f"has learnt what the features mean; give {lacking}, or 0 poses.rounds and dagger.rounds."
         )
     acts_untrained = student.dagger.rounds or not head.train_steps
-    if acts_untrained and not (student.poses.rounds or begun):
+    if acts_untrained and not (student.poses.rounds * student.poses.steps or begun):
         raise UserError(
-            "student.poses.rounds, student.training.action_weight and student.init_from are all empty: "
-            "nothing would have trained the action head before it acts; give one of them."
+            f"student.poses.rounds {student.poses.rounds} and steps {student.poses.steps}, student.training."
+            f"{lacking} 0, no student.init_from: nothing would have trained the action head before it acts; "
+            f"give rounds and steps on poses, {lacking}, or a student to begin from."
         )

@@ -151,9 +151,9 @@ class ControlLoop:
             self._keep_time(max_steps, on_step)
         except KeyboardInterrupt:
             self._report.interrupted = True
+            after = "the start was broken off"
             if moving:
-                self._hold_quietly()
-            after = "the robot holds position" if moving else "the start was broken off"
+                after = "the robot holds position" if self._hold_quietly() else "holding failed"
             self._log("stop", f"interrupted; {after}")
         except RobotError as error:
             self._fail(error)
@@ -332,11 +332,14 @@ class ControlLoop:
         if width_m < EMPTY_WIDTH_M:
             self._log("empty", f"the gripper closed to {1e3 * width_m:.1f} mm: nothing in the hand")
 
-    def _hold_quietly(self) -> None:
+    def _hold_quietly(self) -> bool:
+        """Whether the robot was told to hold; it was not where that failed, which is the run's fault then."""
         try:
             self._robot.hold()
         except RobotError as error:
             self._fail(error)
+            return False
+        return True
 
     def _fail(self, error: RobotError) -> None:
         """The first fault ends the run; what comes after it is its consequence."""

@@ -15,6 +15,7 @@ import pytest
 from app import cli, commands, pipeline
 from app.commands import parse
 from app.commands.checks import check_file, check_folder
+from ddgrasp import install
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 
@@ -208,3 +209,24 @@ def test_where_a_command_is_to_write_is_tried_before_it_works(command, place, tm
     ):
         parse(name, [*words[len(name.split()) :], "--out", out]).run()
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("command", "absent"),
+    [
+        ("deploy trials --policy pretrained/student/policy.onnx", "franky"),
+        ("play --rig fr3", "franky_sim"),
+        ("study table2 --rig fr3", "trimesh"),
+        ("study causes --policy pretrained/student/policy.onnx --rows fr3", "franky"),
+        ("rig pictures", "franky_sim"),
+    ],
+)
+def test_what_the_fr3_rig_lacks_is_said_before_anything_is_made(command, absent, tmp_path, monkeypatch):
+    there = install.find_spec
+    monkeypatch.setattr(install, "find_spec", lambda name: None if name == absent else there(name))
+    monkeypatch.chdir(tmp_path)
+    words = command.split()
+    name = " ".join(words[:2]) if " ".join(words[:2]) in commands.COMMANDS else words[0]
+    with pytest.raises(UserError, match=rf"^[-\w' ]+ needs {absent}: .+ install 'ddgrasp\[fr3\]'\.$"):
+        parse(name, [*words[len(name.split()) :], "--out", str(tmp_path / "out")]).run()
+    assert list(tmp_path.iterdir()) == []

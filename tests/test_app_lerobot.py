@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from app.commands import parse
-from app.lerobot import card, dataset, deployments, steps
+from app.lerobot import card, dataset, demonstrations, deployments, steps
 from app.lerobot.source import limited, open_source
 from ddgrasp import contract
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
+from ddgrasp.stages import get_stage
 from lerobot_support import LENGTHS, OBJECTS, SIZE, write_demos, write_deployment, write_noisy
 
 NAMES = get_preset("debug").world.objects
@@ -326,3 +327,12 @@ def test_a_gripper_that_waits_for_a_slow_hand_is_told_as_it_was_told():
     assert deployments.actions(rows)[:, 7].tolist() == [-1.0, 1.0, 1.0]
     before = [{"action": asked}, {"action": None}]  # rows of before 2026-11-26
     assert deployments.actions(before)[:, 7].tolist() == [1.0, 1.0]
+
+
+def test_the_stores_are_those_that_the_stages_write():
+    import ddg_jax.generate
+    import demos.stage
+
+    assert (demonstrations.STORE, demonstrations.NOISY_STORE) == (demos.stage.STORE, ddg_jax.generate.STORE)
+    assert demonstrations.STAGE == get_stage("demos").name
+    assert demonstrations.NOISY_STAGE == get_stage("noisy").name

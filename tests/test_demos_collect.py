@@ -91,5 +91,57 @@ def test_a_teacher_that_fails_is_given_up_after_a_fair_trial(collect, parallel):
 
 def test_a_poor_teacher_is_given_up_and_a_fair_one_is_not(collect):
     assert collect(100, 60, lambda *_: 15)[1] == 100
-    with pytest.raises(UserError, match="succeeded in 14 of 60"):
+    with pytest.raises(UserError, match="succeeded in 119 of 480"):  # 7 batches before, and one now
         collect(200, 60, lambda *_: 14)
+
+
+def test_an_interrupted_collection_goes_on_as_if_it_had_not_been(tmp_path, monkeypatch):
+    """An episode is told apart by its batch's key, and its place in it; some batches add nothing."""
+    demo = get_preset("demo")
+    config = replace(demo, demos=replace(demo.demos, episodes=30, parallel=8))
+    teacher, append = policy.load(ROOT / "pretrained" / "teacher"), EpisodeStore.append
+    sizes, left = [], []
+
+    def roll(key, actor):
+        rng = np.random.default_rng(np.asarray(key))
+        sizes.append(int(rng.choice([0, 4, 6])))
+        return rng.integers(1, 2**31 - 1, size=sizes[-1]).astype(np.int32)
+
+    def kept(numbers):
+        for number in numbers:
+            yield {"held": np.zeros(3, bool)}, {"object_index": number}
+
+    def append_while_it_lasts(store, steps, episode):
+        if not left:
+            raise KeyboardInterrupt
+        left.pop()
+        append(store, steps, episode)
+
+    monkeypatch.setattr(stage, "Roller", lambda *_, **__: SimpleNamespace(run=roll))
+    monkeypatch.setattr(stage, "successful", kept)
+    monkeypatch.setattr(EpisodeStore, "append", append_while_it_lasts)
+
+    def collected(name: str, at_once: int) -> tuple[int, list[int], int]:
+        """(tried, episodes, interruptions)"""
+        store = EpisodeStore(tmp_path / name / "episodes.zarr", create=True)
+        for interruptions in range(100):
+            left[:] = [None] * at_once
+            try:
+                tried = stage.collect(config, teacher, store, QUIET)
+            except KeyboardInterrupt:
+                continue
+            return tried, store.episodes("object_index").tolist(), interruptions
+        raise AssertionError("it never ends")
+
+    tried, episodes, _ = collected("whole", 1000)
+    assert 0 in sizes[:-1] and len(set(episodes)) == 30 and tried == 8 * len(sizes)
+    assert collected("one at a time", 1) == (tried, episodes, 29)
+    assert collected("three", 3) == (tried, episodes, 9)
+
+
+def test_what_is_there_of_an_older_collection_stays_and_is_gone_on_from(collect, tmp_path):
+    collect(20, 60, lambda *_: 20)
+    (tmp_path / stage.BATCHES).unlink()
+    assert collect(25, 60, lambda *_: 20) == (60, 25)
+    (tmp_path / stage.BATCHES).write_text('{"stored": 999}')
+    assert collect(30, 60, lambda *_: 20) == (60, 30)

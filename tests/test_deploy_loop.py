@@ -345,6 +345,7 @@ def test_an_arm_that_does_not_hold_after_ctrl_c_is_said_and_stopped(tmp_path, mo
     monkeypatch.setattr(robot, "hold", held)
     report = loop.run(max_steps=5, on_step=interrupt)
     assert report.interrupted and report.fault == "no answer"
+    assert [event.reason for event in report.events[-2:]] == ["no answer", "interrupted; holding failed"]
     assert robot.calls == ["start", "command", "stop"] and camera.stopped
 
 

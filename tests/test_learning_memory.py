@@ -4,14 +4,20 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from app.commands import parse
+from app.commands.checks import tell_fit
 from benchmarks.programs import PROGRAMS
 from ddg_jax import memory as ddg_memory
+from ddgrasp import artifacts
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from demos import memory as demos_memory
+from learning import memory
 from learning.memory import Need, check, compiled_bytes, traced_bytes
+from sensors.recordings.recording import RecordingWriter
 from student_jax import memory as student_memory
 
 MB = 2**20
@@ -97,3 +103,53 @@ def test_a_batch_that_cannot_fit_is_refused_before_any_work(tmp_path):
     with pytest.raises(UserError, match="Stage student needs about .* lower student.training.batch_size"):
         check_networks(large, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def recordings(tmp_path):
+    """A folder with one recording of eight frames."""
+    with RecordingWriter(tmp_path / "data" / "a", {"fx_px": 40.0, "sensor": "RealSense D435"}) as writer:
+        for _ in range(8):
+            writer.add(np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 700, np.uint16))
+    return tmp_path / "data"
+
+
+HALVED = (
+    "--ddg.sampling.sampler progressive --ddg.sampling.spacing quadratic --ddg.sampling.steps 4 "
+    "--ddg.training.distil-from 128 --ddg.diffusion.steps 1000"
+)
+BATCH = "Stage ddg needs about .* lower ddg.training.batch_size, ddg.sampling.batch_size or the number of fr"
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ("ddg fit --data {} --ddg.training.batch-size 65536", BATCH),
+        ("ddg fit --data {} --ddg.sampling.batch-size 65536", BATCH),
+        ("ddg score --real {} --ddg.training.batch-size 65536", BATCH),
+        ("ddg distil --model pretrained/ddg --data {} --evaluations 1", BATCH),
+        (f"ddg fit --data {{}} {HALVED}", "distil_from is 128: of 1000 diffusion steps, .* cannot be halved"),
+    ],
+)
+def test_a_generator_on_recordings_is_refused_before_they_are_read(
+    command, expected, recordings, tmp_path, monkeypatch
+):
+    # The batches of `ddg distil` are its model's; no machine has more than the others take.
+    monkeypatch.setattr(memory, "host_bytes", lambda: 0 if "distil" in command else 10**11)
+    group, name, *options = command.format(recordings).split()
+    with pytest.raises(UserError, match=expected):
+        parse(f"{group} {name}", [*options, "--out", str(tmp_path / "out")]).run()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_generator_s_frames_are_counted(recordings, tmp_path, capsys, monkeypatch):
+    config, seen = PRESETS["debug"], []
+    monkeypatch.setattr(ddg_memory, "frames_bytes", lambda ddg, frames: seen.append(frames) or 10**9)
+    tell_fit(config, recordings, tmp_path / "ddg")
+    tell_fit(config, recordings, tmp_path / "ddg", 5)
+    assert seen == [8, 5]
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and lines[0].startswith("ddg: about ") and lines[0].endswith(", 1.0 GB of arrays")
+    artifacts.finish(tmp_path / "ddg", "ddg", config, seconds=1.0, metrics={})
+    tell_fit(config, recordings, tmp_path / "ddg")
+    assert capsys.readouterr().err == "" and len(seen) == 2

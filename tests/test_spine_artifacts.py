@@ -2,11 +2,13 @@
 
 import dataclasses
 import json
+import os
 import resource
 import subprocess
 import sys
 import textwrap
 from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from ddgrasp.files import (
     read_json,
     replaced_folder,
     to_json,
+    user_cache,
 )
 from ddgrasp.presets import PRESETS
 from ddgrasp.stages import get_stage
@@ -71,6 +74,47 @@ def test_a_folder_is_replaced_by_a_whole_one_or_stays(tmp_path):
         raise KeyboardInterrupt
     assert (path / "file").read_text() == "second"
     assert [there.name for there in path.parent.iterdir()] == ["set"]
+
+
+def test_who_is_interrupted_between_two_renames_keeps_the_old_folder(tmp_path, monkeypatch):
+    path, rename, renames = tmp_path / "set", os.replace, []
+
+    def interrupted(source, target):
+        renames.append(target)
+        if len(renames) == 2:
+            raise KeyboardInterrupt
+        rename(source, target)
+
+    path.mkdir()
+    (path / "file").write_text("old")
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt), replaced_folder(path) as temporary:
+        temporary.mkdir()
+    assert (path / "file").read_text() == "old" and renames[1:] == [path, path]
+    assert [there.name for there in tmp_path.iterdir()] == ["set"]
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"),
+    [
+        ({"DDGRASP_CACHE": "/a", "XDG_CACHE_HOME": "/b"}, "/a/jax"),
+        ({"XDG_CACHE_HOME": "/b"}, "/b/ddgrasp/jax"),
+        ({"HOME": "/c"}, "/c/.cache/ddgrasp/jax"),
+        ({"XDG_CACHE_HOME": "", "DDGRASP_CACHE": "", "HOME": "/c"}, "/c/.cache/ddgrasp/jax"),
+    ],
+)
+def test_caches_are_where_the_environment_says(environment, expected, monkeypatch):
+    for name in ("DDGRASP_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    if "HOME" not in environment:  # as in a container whose user has no home
+
+        def nowhere():
+            raise RuntimeError("Could not determine home directory.")
+
+        monkeypatch.setattr(Path, "home", nowhere)
+    assert user_cache("jax") == Path(expected)
 
 
 @pytest.mark.parametrize("make", [atomic_path, new_folder])
@@ -224,14 +268,23 @@ def test_an_unfinished_attempt_with_other_inputs_is_refused(tmp_path):
     (tmp_path / "ddg" / "checkpoint").touch()
     with pytest.raises(UserError, match="data is '/a' there, '/b' here"):
         artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/b"})
+    with pytest.raises(UserError, match="begun with other inputs: model is None there, 'x' here"):
+        artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a", "model": "x"})
+    with pytest.raises(UserError, match="begun with other inputs: data is '/a' there, None here"):
+        artifacts.begin(tmp_path / "ddg", "ddg", CONFIG)
 
 
 def test_an_attempt_that_left_nothing_binds_nobody(tmp_path):
     artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a typing error"})
     (tmp_path / "ddg" / ".tmp-123-params").write_bytes(b"half")
+    (tmp_path / "ddg" / ".tmp-123-checkpoint" / "0").mkdir(parents=True)
+    (tmp_path / "ddg" / ".tmp-123-checkpoint" / "0" / "state").write_bytes(b"half")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "ddg" / ".tmp-123-link").symlink_to(tmp_path / "elsewhere")
     assert not artifacts.has_work(tmp_path / "ddg")
     artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/b"})
     assert [file.name for file in (tmp_path / "ddg").iterdir()] == [artifacts.STARTED]
+    assert (tmp_path / "elsewhere").is_dir()
     assert read_json(tmp_path / "ddg" / artifacts.STARTED)["inputs"] == {"data": "/b"}
 
 
@@ -263,6 +316,40 @@ def test_a_damaged_manifest_is_named(tmp_path, text):
     (tmp_path / "export" / artifacts.MANIFEST).write_text(text, encoding="latin-1")
     with pytest.raises(UserError, match=r"manifest\.json"):
         artifacts.read_manifest(tmp_path / "export")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"manifest_version": "13"},
+        {"manifest_version": None},
+        {"origin": "x"},
+        {"origin": ["trained"]},
+        {"config": {"preset": "debug", "student": 3}},
+        {"config": {"preset": "debug", "student": {"head": None}}},
+        {"config": {"preset": "debug", "world": {"random": []}}},
+        {"config": {"preset": "debug", "deploy": []}, "manifest_version": 5},
+        {"config": {"preset": "debug", "ddg": 3}, "manifest_version": 1},
+        {"config": {"student": {"input_width_px": "wide"}}, "manifest_version": 1},
+    ],
+    ids=str,
+)
+def test_a_manifest_of_other_values_than_this_project_writes_is_named(tmp_path, damage):
+    directory = _finish(tmp_path / "export").directory
+    path = directory / artifacts.MANIFEST
+    path.write_text(json.dumps(read_json(path) | damage))
+    with pytest.raises(UserError) as error:
+        artifacts.require(tmp_path, "export", CONFIG)
+    assert str(error.value) == (
+        f"{path} is no manifest of this project: delete {directory} and run the stage again."
+    )
+    if "origin" in damage:
+        return
+    begun = {"contract_version": contract.CONTRACT_VERSION, "inputs": {}, "config": to_json(CONFIG)}
+    path.rename(directory / "checkpoint")
+    (directory / artifacts.STARTED).write_text(json.dumps(begun | damage))
+    with pytest.raises(UserError, match=r"started\.json does not say how a stage was begun: delete"):
+        artifacts.begin(directory, "export", CONFIG)
 
 
 def test_an_absent_stage_is_named_with_the_remedy(tmp_path):

@@ -475,5 +475,8 @@ def test_what_comes_with_the_project_is_not_measured_over():
 def test_a_teacher_s_world_is_its_run_s_wherever_the_run_stands(tmp_path):
     config = dataclasses.replace(PRESETS["demo"], world=PRESETS["ppo_paper"].world)
     artifacts.finish(tmp_path / "teacher", "teacher", config, seconds=1.0, metrics={})
-    for args in ([str(tmp_path), "--trials", "5"], ["--trials", "5", str(tmp_path)]):
-        assert parse("teacher eval", args).world == config.world
+    for place in (str(tmp_path), str(tmp_path / "teacher")):
+        for args in ([place, "--trials", "5"], ["--trials", "5", place]):
+            assert parse("teacher eval", args).world == config.world
+    student = artifacts.finish(tmp_path / "student", "student", config, seconds=1.0, metrics={}).directory
+    assert parse("teacher eval", [str(student)]).world == PRESETS["demo"].world  # and `run` says what it is

@@ -72,3 +72,11 @@ def test_another_shell_is_named(capsys, text):
     assert cli.main(["completion", "bsh"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("ddgrasp: Unknown shell 'bsh'. Did you mean 'bash'?") and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["completion", "--help"], ["help", "completion"], ["completion", "-h"]])
+def test_help_of_it_says_how_it_is_used(words, capsys):
+    assert cli.main(words) == 0
+    told = capsys.readouterr()
+    assert told.out.startswith("usage: ddgrasp completion {bash,zsh}\n") and told.err == ""
+    assert 'eval "$(ddgrasp completion bash)"' in told.out and "COMP_WORDS" not in told.out

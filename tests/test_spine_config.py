@@ -37,7 +37,7 @@ from ddgrasp.config import (
     UNetConfig,
     WorldConfig,
 )
-from ddgrasp.config.checks import FreeText, Range, kinds
+from ddgrasp.config.checks import FreeText, Range, check_value, kinds
 from ddgrasp.config.score import Monocular
 from ddgrasp.config.sensors import SENSORS
 from ddgrasp.errors import UserError
@@ -124,6 +124,23 @@ def test_every_choice_suggests_the_nearest(name):
 def test_numbers_of_numpy_are_numbers():
     assert UNetConfig(space_to_depth=np.int64(2)).space_to_depth == 2  # pyright: ignore
     assert SamplingConfig(eta=np.float32(0.5)).eta == 0.5  # pyright: ignore
+    assert EncoderConfig(output_stride=np.int64(16)).output_stride == 16  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    ("choices", "taken", "refused"),
+    [
+        (Literal[4, 8], 8, 8.0),
+        (Literal[1, 2], 1, True),
+        (Literal[True], True, 1),
+        (Literal[0.5, 1.0], 1.0, 1),
+        (Literal["1"], "1", 1),
+    ],
+)
+def test_what_equals_a_choice_and_is_of_another_type_is_none(choices, taken, refused):
+    check_value("x", taken, choices)
+    with pytest.raises(UserError, match=rf"^x is {refused}; expected one of "):
+        check_value("x", refused, choices)
 
 
 def test_a_field_without_bounds_is_an_error_of_the_programmer():
@@ -190,6 +207,20 @@ def test_stages_that_do_not_fit_each_other_are_refused():
         ("head.features_to_head=yes", "action_weight 0: the head would act before it has learnt"),
         ("poses.rounds=0", "nothing would have trained the action head before it acts"),
         ("poses.rounds=0 dagger.rounds=0 head.train_steps=0", "nothing would have trained the action head"),
+        ("poses.steps=0", "poses.rounds 8 and steps 0, .*action_weight 0, .* nothing would have trained"),
+        ("poses.steps=0 dagger.rounds=0 head.train_steps=0", "nothing would have trained the action head"),
+        (
+            "training.action_weight=1 training.steps=0 poses.rounds=0",
+            "steps 0, no student.init_from: nothing",
+        ),
+        (
+            "training.action_weight=1 training.steps=0 poses.rounds=0 dagger.rounds=0 head.train_steps=0",
+            "nothing would have trained the action head before it acts; give rounds and steps on p",
+        ),
+        (
+            "head.features_to_head=yes training.action_weight=1 training.steps=0",
+            "training.steps 0: the head would act before it has learnt",
+        ),
         ("head.batch_size=1", "student.head.batch_size is 1; expected at least 2"),
     ],
 )

@@ -47,6 +47,13 @@ def test_module_level_imports_of_the_robot_side_never_reach_jax():
     assert wrong == {}
 
 
+def test_what_the_rules_name_is_there():
+    """A name that nothing has would be kept by nothing."""
+    named = {*JAX_FREE, *(name for names in INSTALLED_WITH.values() for name in names)}
+    assert {name for name in named if not any(_under(module, (name,)) for module in modules(ROOT))} == set()
+    assert set(ORDER) == {module.split(".")[0] for module in modules(ROOT)}
+
+
 def test_deploy_names_jax_nowhere_not_even_inside_functions():
     named = {
         f"{module}: {name}"

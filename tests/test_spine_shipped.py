@@ -47,6 +47,8 @@ def test_commands_and_stages_find_it_from_any_folder(tmp_path, monkeypatch):
     assert command.config.preset == "demo"
     played = parse("play", ["--generator", "pretrained/ddg", "--out", "pretrained/ddg"])
     assert (played.generator, played.out) == (PRETRAINED / "ddg", Path("pretrained/ddg"))
+    report = parse("report", ["pretrained", "pretrained/table2", "runs/x"])
+    assert report.out == PRETRAINED and report.others == (PRETRAINED / "table2", Path("runs/x"))
 
 
 def test_a_stage_is_found_by_its_file_in_its_folder_or_in_a_run(tmp_path, monkeypatch):

@@ -41,7 +41,7 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.scaling import scaled
-from ddgrasp.shipped import shipped
+from ddgrasp.shipped import holding, shipped
 
 
 @dataclass(frozen=True)
@@ -138,14 +138,25 @@ def parse(name: str, args: Sequence[str]) -> Command:
 
 def _found(command: Any) -> Any:
     """`command` with the places of what it reads that comes with this project (`shipped`)."""
-    given = {field.name: getattr(command, field.name) for field in fields(command) if field.name != "out"}
-    return replace(command, **{name: shipped(path) for name, path in given.items() if isinstance(path, Path)})
+    reads = [field.name for field in fields(command) if field.name != "out" or isinstance(command, Report)]
+    return replace(command, **{name: _place(getattr(command, name)) for name in reads})
+
+
+def _place(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_place(item) for item in value)
+    return shipped(value) if isinstance(value, Path) else value
 
 
 def _teacher_s_run(args: Sequence[str]) -> Path | None:
-    """The run among the arguments of `teacher eval`, wherever it stands."""
+    """The run, or its teacher's folder, among the arguments of `teacher eval`, wherever it stands."""
     places = (shipped(arg) for arg in args if arg and arg != _option(args, "--out"))
-    return next((place for place in places if artifacts.is_finished(place / "teacher")), None)
+    return next((place for place in places if _has_teacher(place)), None)
+
+
+def _has_teacher(place: Path) -> bool:
+    found = holding(place, artifacts.MANIFEST, "teacher")
+    return found is not None and artifacts.read_manifest(found).stage == "teacher"
 
 
 def _base(args: Sequence[str], default_preset: str) -> Config:

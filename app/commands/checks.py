@@ -226,6 +226,24 @@ def tell_needs(config: Config, run_dir: Path, stages: Collection[str] = ON_PICTU
         print(need, file=sys.stderr, flush=True)
 
 
+def tell_fit(config: Config, data: Path, directory: Path, most: int | None = None) -> None:
+    """`tell_needs` of a generator that is fitted in `directory` on recordings at `data`, the first `most` of
+    their frames. Reads none."""
+    if artifacts.is_finished(directory):
+        return
+    from ddg_jax import distil
+    from ddg_jax import memory as ddg_memory
+    from learning import memory
+    from sensors.recordings.recording import recording_folders
+
+    if config.ddg.sampling.sampler == PROGRESSIVE:
+        distil.check(config.ddg)
+    frames = sum(1 for folder in recording_folders(data) for _ in (folder / "depth").glob("*.png"))
+    need = ddg_memory.need(config, frames if most is None else min(most, frames))
+    memory.check(need, directory)
+    print(need, file=sys.stderr, flush=True)
+
+
 def check_start(stage: str, option: str, folder: str, others: str = "") -> None:
     """UserError unless `folder` is empty or holds the stage's checkpoint; `others` might be given instead."""
     file = CHECKPOINTS[stage]

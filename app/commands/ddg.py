@@ -12,6 +12,7 @@ from app.commands.checks import (
     check_folder,
     recordings_in,
     stage_folder,
+    tell_fit,
 )
 from ddgrasp import artifacts
 from ddgrasp.config.checks import Count, Seed, Steps, Text
@@ -35,6 +36,7 @@ class DDGFit(OneStage):
             return
         inputs = recordings_in("--data", self.data)
         config = check_config_values(self.config)
+        tell_fit(config, self.data, self.out / self.stage)
         pipeline.make(get_stage(self.stage), config, self.out, resume=self.resume, parents={}, inputs=inputs)
 
 
@@ -104,6 +106,7 @@ class DDGDistil:
         )
         config = replace(config, ddg=ddg)
         inputs["model"] = fitted.hash
+        tell_fit(config, self.data, self.out / "ddg")
         pipeline.make(get_stage("ddg"), config, self.out, resume=self.resume, parents={}, inputs=inputs)
 
 

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import tyro
 
-from app import extras
 from app.commands.checks import check_file, check_tried, stage_folder
 from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
+from ddgrasp.install import check_fr3, lacks_fr3
 from ddgrasp.shipped import PRETRAINED
 from deploy.controls import KEYS, Controls, Noise
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 PRETRAINED_GENERATOR = PRETRAINED / "ddg"
 FILM = Path("runs/play.mp4")
+LIVE = ("mujoco", "rerun", "web")
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,8 @@ class Play:
 
     def run(self) -> None:
         """Runs the trials, prints how each ended, and where the film is."""
+        if self.out and self.viewer in (("mujoco",) if self.out.suffix == ".rrd" else LIVE):
+            raise UserError(f"--out is {self.out}, and --viewer {self.viewer} writes no file: leave out one.")
         chosen = _chosen(self._wants_film) if self.viewer == "auto" else self.viewer
         replace(self, viewer=chosen)._run()
 
@@ -80,7 +83,7 @@ class Play:
         from evaluation.rig_trials import Series
 
         if self.rig == "fr3":
-            extras.check_fr3("--rig fr3")
+            check_fr3("--rig fr3")
         series = Series(self.rig, self.objects, self.trials, number=self.number, seconds=self.seconds)
         check_tried(series)
         trials = series.plan()
@@ -185,7 +188,7 @@ def _objects_by_rig(series: "Series", choice: bool) -> dict[str, tuple[str, ...]
 
     The FR3's meshes take a second to import, in which trimesh loses a Ctrl-C.
     """
-    others = {"development", "fr3"} - {series.rig} if choice and not extras.lacks_fr3() else set()
+    others = {"development", "fr3"} - {series.rig} if choice and not lacks_fr3() else set()
     return {rig: replace(series, rig=rig).known() for rig in (series.rig, *others)}
 
 

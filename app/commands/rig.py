@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,7 +9,7 @@ from app.commands.checks import check_file
 from ddgrasp.config.checks import Range, Seed
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
-from ddgrasp.install import pip_install
+from ddgrasp.install import FR3, check_fr3
 from deploy.devices.options import RIG_HOST
 
 
@@ -58,8 +57,7 @@ class RigPictures:
     def run(self) -> None:
         """Writes the picture and prints where it is."""
         check_file("--out", self.out)
-        if find_spec("franky_sim") is None:
-            raise UserError(f"pictures of the FR3 rig need franky-sim: {pip_install('fr3')}.")
+        check_fr3("rig pictures", FR3[:1])
         from evaluation.rig_sheet import draw
 
         atomic_write_bytes(self.out, draw(self.object_name))

@@ -9,7 +9,7 @@ import tyro
 
 from app import pipeline
 from app.commands.base import load_config
-from app.commands.checks import check_config_values, check_folder, check_score, recordings_in
+from app.commands.checks import check_config_values, check_folder, check_score, recordings_in, tell_fit
 from ddgrasp import artifacts
 from ddgrasp.config import DDGConfig, DepthFeatureConfig, ScoreConfig
 from ddgrasp.config.checks import Count, Seed
@@ -80,6 +80,7 @@ class DDGScore(Scoring):
         preset = replace(get_preset(self.preset), ddg=self.ddg, score=self.score, seed=self.seed)
         config = real_config(check_config_values(preset), self.real)
         stage = get_stage("score_real")
+        tell_fit(config, self.real, self.out / stage.name, self.fit_frames)
         inputs = recordings | {"fit_frames": self.fit_frames, "score_frames": self.score_frames}
         pipeline.make(stage, config, self.out, resume=self.resume, inputs=inputs)
         print_result(self.out / stage.name)

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from app import extras
 from app.commands.base import FromPreset
 from app.commands.checks import (
     check_config_values,
@@ -18,6 +17,7 @@ from ddgrasp import artifacts, contract
 from ddgrasp.config import UNIFORM, Config, DDGConfig
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
+from ddgrasp.install import check_fr3
 
 if TYPE_CHECKING:
     from app.table2 import Study
@@ -96,7 +96,7 @@ class StudyTable2(FromPreset):
         check_tried(series)
         series.names()
         if self.rig == "fr3":
-            extras.check_fr3("--rig fr3")
+            check_fr3("--rig fr3")
         config = rows.shared_config(self.config)
         check_config_values(config)
         shared = self.out / results.SHARED
@@ -185,8 +185,7 @@ def _check_row(config: Config, name: str, shared: Path, paper_from: str = "") ->
     check_config_values(row_config(config, ROWS[name], paper_from))
     make_treatment(ROWS[name].depth, config)
     if ROWS[name].source == "rig" and artifacts.is_finished(shared / "demos"):
-        from demos.stage import STORE
-        from demos.store import EpisodeStore
+        from demos.store import STORE, EpisodeStore
         from student_jax.depth_source import check_views
 
         check_views(EpisodeStore(shared / "demos" / STORE))

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from app.commands.checks import check_folder, check_tried
 from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
+from ddgrasp.install import check_fr3
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class DeployTrials:
         from ddgrasp.progress import Progress
         from evaluation import rig_trials
 
+        if self.rig == "fr3":
+            check_fr3("--rig fr3")
         series = rig_trials.Series(
             self.rig,
             self.objects,

@@ -11,12 +11,11 @@ from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.layout import ACTION
 from ddgrasp.shipped import holding
-from demos.store import EpisodeStore
+from demos.store import STORE, EpisodeStore
 
-STORE, STAGE = "episodes.zarr", "demos"
-"""As `demos.stage` names them, which imports JAX."""
+STAGE = "demos"
 NOISY_STORE, NOISY_STAGE = "depth.zarr", "noisy"
-"""As `ddg_jax.generate` names them."""
+"""As `ddg_jax.generate` names them, which imports JAX."""
 _ENGINE = {"cpu": "MuJoCo", "jax": "MuJoCo MJX", "warp": "MuJoCo Warp"}
 """By `world.backend`."""
 CLEAN_DEPTH = "its depth is clean: no holes, no noise"

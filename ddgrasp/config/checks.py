@@ -120,6 +120,15 @@ def kinds(section: type) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(section)}
 
 
+def has_sections(value: Any, section: type) -> bool:
+    """Whether `value`, as JSON has it, is a mapping, and so is every section of `section` that is there."""
+    return isinstance(value, dict) and all(
+        has_sections(value[name], typing.cast(type, kind))
+        for name, kind in kinds(section).items()
+        if name in value and dataclasses.is_dataclass(kind)
+    )
+
+
 def stated(kind: Any) -> Any:
     """What `kind` says of a value that is there: X of `X | None`, in both forms that Python has of it."""
     if typing.get_origin(kind) not in (typing.Union, types.UnionType):
@@ -163,11 +172,17 @@ def _check_number(name: str, value: Any, kind: type) -> None:
 
 
 def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
-    if value in choices and not isinstance(value, bool):
+    if any(value == choice and _is_of_kind(value, choice) for choice in choices):
         return
     if isinstance(value, str):
         raise unknown_name(name, value, [str(choice) for choice in choices])
     raise UserError(f"{name} is {value!r}; expected one of {', '.join(map(str, choices))}.")
+
+
+def _is_of_kind(value: Any, choice: Any) -> bool:
+    """Whether they are of one type, which 8.0 and 8, or True and 1, are not; integers may be NumPy's."""
+    whole = isinstance(choice, int) and not isinstance(choice, bool)
+    return isinstance(value, Integral if whole else type(choice)) and not (whole and isinstance(value, bool))
 
 
 def _check_tuple(name: str, value: Any, kinds_of_items: tuple[Any, ...]) -> None:

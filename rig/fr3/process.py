@@ -10,11 +10,10 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.util import find_spec
 from types import TracebackType
 
 from ddgrasp.errors import UserError
-from ddgrasp.install import pip_install
+from ddgrasp.install import FR3, check_fr3
 from mjx_envs.scene import HOME_RAD
 from rig.fr3.channel import PORT, Channel
 from rig.fr3.scene import SceneObject
@@ -49,8 +48,7 @@ class Fr3Rig:
         """
         if not 0.0 < speed <= 1.0:
             raise UserError(f"--speed is {speed:g}; expected above 0 and at most 1, real time.")
-        if find_spec("franky_sim") is None:
-            raise UserError(f"the FR3 rig needs franky-sim: {pip_install('fr3')}.")
+        check_fr3("the FR3 rig", FR3[:1])
         check_ports(host)
         self.host = host
         given = {"host": host, "seed": seed, "speed": speed, "q_rad": list(q_rad), "with_board": with_board}
