@@ -211,7 +211,7 @@ def _described(name: str) -> str:
 
 
 _PRESET_HELP = (
-    "Presets (--preset): debug (tests), demo (37 minutes on two cores), laptop (random first weights, the",
+    "Presets (--preset): debug (tests), demo (32 minutes on two cores), laptop (random first weights, the",
     "teacher from a scripted guide; 73 minutes on two busy cores), ppo and ppo_paper (laptop with PPO from",
     "nothing), camera (laptop, the generator for short recordings of a real camera), student_paper (laptop",
     "with the paper's own student), paper (one GPU). Any value can be given, for example",
