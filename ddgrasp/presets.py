@@ -135,9 +135,8 @@ LAPTOP = Config(
     ),
     evaluation=EvalConfig(student_trials=60),
 )
-"""Everything trained here on two cores, the teacher from the guide (73 minutes of stage time on two AMD EPYC
-cores that two to four other jobs shared, 2026-11-21, with a generator of before; today's is not yet fitted at
-this size)."""
+"""Everything trained here on two cores, the teacher from the guide: 67 minutes on two Intel Xeon cores on
+2026-11-28 (docs/results.md, with what its student lacks)."""
 
 _FROM_NOTHING = TeacherConfig(
     start="nothing",

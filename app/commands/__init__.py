@@ -212,7 +212,7 @@ def _described(name: str) -> str:
 
 _PRESET_HELP = (
     "Presets (--preset): debug (tests), demo (32 minutes on two cores), laptop (random first weights, the",
-    "teacher from a scripted guide; 73 minutes on two busy cores), ppo and ppo_paper (laptop with PPO from",
+    "teacher from a scripted guide; 67 minutes on two cores), ppo and ppo_paper (laptop with PPO from",
     "nothing), camera (laptop, the generator for short recordings of a real camera), student_paper (laptop",
     "with the paper's own student), paper (one GPU). Any value can be given, for example",
     "--teacher.num-envs 64. --scale 0.001 makes all its counts that much smaller, never its networks or",
