@@ -1,14 +1,18 @@
-"""A run's configuration as a small YAML file: its preset, and what differs from it.
+"""A run's configuration as a YAML file.
 
-`ddgrasp run` leaves one, `config.yaml`, in the run's folder; `--config FILE` takes it.
+`ddgrasp run` leaves one with every setting, `config.yaml`, in the run's folder: presets change from release
+to release, and a run is to be had again. `--config FILE` takes it, or one written by hand of a preset's name
+and what differs from it.
 """
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ddgrasp import upgrades
 from ddgrasp.artifacts import config_from_json, to_json
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
@@ -23,22 +27,33 @@ _MERGE = "tag:yaml.org,2002:merge"
 
 
 def write(config: Config, path: Path) -> None:
-    """Writes what `read` makes `config` of."""
+    """Writes what `read` makes `config` of, by this release and later ones; atomically.
+
+    What differs from the preset as it is now stands above, as comments.
+    """
     import yaml
 
     preset = PRESETS.get(config.preset, Config(config.preset))
     if config.scale != 1:
         preset = replace(scaled(preset, config.scale), scale=1.0)
-    values = {_PRESET: config.preset, **_differences(to_json(preset), to_json(config))}
-    text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=110)
-    atomic_write_text(path, f"# ddgrasp run --config {path.name}\n{text}")
+    different = _differences(to_json(preset), to_json(config), "")
+    head = [
+        f"ddgrasp run --config {path.name}",
+        f"Preset {config.preset} but for:" if different else f"Preset {config.preset} as it is.",
+        *(f"  {name}: {json.dumps(value)}" for name, value in different.items()),
+    ]
+    values = {_PRESET: config.preset, upgrades.VERSION_FIELD: upgrades.VERSION, **to_json(config)}
+    text = yaml.dump(values, Dumper=_dumper(), sort_keys=False, allow_unicode=True, width=110)
+    atomic_write_text(path, "".join(f"# {line}\n" for line in head) + text)
 
 
 def read(path: Path) -> Config:
     """The configuration of the file.
 
-    Raises UserError if there is no such file, it is no YAML, names no preset, or has a setting that does not
-    exist or a value that is out of bounds.
+    Settings that it lacks are those of the preset that it names.
+
+    Raises UserError if there is no such file, it is no YAML, names no preset, is of a later release, or has a
+    setting that does not exist or a value that is out of bounds.
     """
     import yaml
 
@@ -55,10 +70,39 @@ def read(path: Path) -> Config:
         preset = get_preset(values[_PRESET])
         if (scale := values.get("scale", 1.0)) != 1:
             preset = scaled(replace(preset, scale=scale), scale)
-        merged = _merged(to_json(preset), values, "")
+        merged = _merged(to_json(preset), _of_this_release(values), "")
         return config_from_json(merged)
     except UserError as error:
         raise UserError(f"--config {path}: {error}") from None
+
+
+def _of_this_release(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with the names that they have now; a file written by hand, without a version, has them."""
+    version = values.get(upgrades.VERSION_FIELD, upgrades.VERSION)
+    if type(version) is not int or not 1 <= version <= upgrades.VERSION:
+        raise UserError(
+            f"{upgrades.VERSION_FIELD} is {version!r}; this release reads 1 to {upgrades.VERSION}: use the "
+            "one that wrote the file, or take the line out."
+        )
+    given = {name: value for name, value in values.items() if name != upgrades.VERSION_FIELD}
+    if version == upgrades.VERSION:
+        return given
+    try:
+        return upgrades.upgraded(given, version)
+    except (AttributeError, TypeError):  # of what is no section: `_merged` names it
+        return given
+
+
+def _dumper() -> Any:
+    """YAML's safe dumper, which writes a list in one line."""
+    import yaml
+
+    class Dumper(yaml.SafeDumper):
+        pass
+
+    tag = "tag:yaml.org,2002:seq"
+    Dumper.add_representer(list, lambda made, values: made.represent_sequence(tag, values, flow_style=True))
+    return Dumper
 
 
 def _loader() -> Any:
@@ -78,14 +122,14 @@ def _loader() -> Any:
     return Loader
 
 
-def _differences(preset: Mapping[str, Any], here: Mapping[str, Any]) -> dict[str, Any]:
+def _differences(preset: Mapping[str, Any], here: Mapping[str, Any], section: str) -> dict[str, Any]:
+    """The values of `here` that are not those of `preset`, by their dotted names."""
     different: dict[str, Any] = {}
     for name, value in here.items():
         if isinstance(value, Mapping) and isinstance(preset[name], Mapping):
-            if inside := _differences(preset[name], value):
-                different[name] = inside
+            different |= _differences(preset[name], value, f"{section}{name}.")
         elif value != preset[name]:
-            different[name] = value
+            different[f"{section}{name}"] = value
     return different
 
 

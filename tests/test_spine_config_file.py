@@ -1,4 +1,4 @@
-"""`config.yaml`: what differs from a preset, written beside a run and accepted back."""
+"""`config.yaml`: a run's settings, written beside it and accepted back, now and by later releases."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +10,7 @@ from ddgrasp import config_file
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.scaling import scaled
+from ddgrasp.upgrades import VERSION
 
 
 def _changed():
@@ -19,31 +20,49 @@ def _changed():
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
-def test_every_preset_is_one_line(name, tmp_path):
+def test_every_preset_comes_back(name, tmp_path):
     path = tmp_path / "config.yaml"
     config_file.write(PRESETS[name], path)
-    assert path.read_text().splitlines()[1:] == [f"preset: {name}"]
+    assert path.read_text().splitlines()[:3] == [
+        "# ddgrasp run --config config.yaml", f"# Preset {name} as it is.", f"preset: {name}",
+    ]  # fmt: skip
     assert config_file.read(path) == PRESETS[name]
 
 
-def test_what_differs_is_kept_and_nothing_else(tmp_path):
+def test_what_differs_stands_above_and_lists_are_one_line(tmp_path):
     path = tmp_path / "config.yaml"
     config_file.write(_changed(), path)
-    assert path.read_text().splitlines()[1:] == [
-        "preset: debug",
-        "seed: 7",
-        "world:",
-        "  objects:",
-        "  - cube",
-        "  - can",
-        "ddg:",
-        "  graft:",
-        "    window_px: 1.25",
-        "student:",
-        "  training:",
-        "    steps: 9",
+    lines = path.read_text().splitlines()
+    assert lines[1 : lines.index("preset: debug")] == [
+        "# Preset debug but for:",
+        "#   seed: 7",
+        '#   world.objects: ["cube", "can"]',
+        "#   ddg.graft.window_px: 1.25",
+        "#   student.training.steps: 9",
     ]
+    assert "  objects: [cube, can]" in lines
     assert parse("run", ["--config", str(path)]).config == _changed()
+
+
+def test_a_run_comes_back_after_its_preset_has_changed(tmp_path, monkeypatch):
+    path, ran = tmp_path / "config.yaml", _changed()
+    config_file.write(ran, path)
+    debug = PRESETS["debug"]
+    later = replace(debug, seed=99, demos=replace(debug.demos, episodes=77))
+    monkeypatch.setitem(PRESETS, "debug", later)
+    assert config_file.read(path) == ran
+    path.write_text("preset: debug\nseed: 3\n")
+    assert config_file.read(path) == replace(later, seed=3)
+
+
+def test_a_file_of_an_earlier_release_keeps_what_it_did_then(tmp_path):
+    path = tmp_path / "config.yaml"
+    config_file.write(PRESETS["debug"], path)
+    old = path.read_text().replace(f"manifest_version: {VERSION}", "manifest_version: 7")
+    assert "  picture:" in old and "    fill_holes: true\n" in old
+    path.write_text(old.replace("    fill_holes: true\n", ""))
+    assert PRESETS["debug"].student.picture.fill_holes
+    assert not config_file.read(path).student.picture.fill_holes
 
 
 def test_single_values_can_be_given_besides_and_name_the_place(tmp_path):
@@ -95,6 +114,9 @@ def test_a_number_may_be_written_as_on_the_command_line(tmp_path):
         ("preset: demo\nstudent: {encoder: {output_stride: 8.0}}", "is 8.0; expected one of 4, 8, 16, 32"),
         ("preset: demo\nteacher: {num_envs: 64}\nteacher: {epochs: 1}", "teacher is given twice"),
         ("preset: demo\nscale: 3", "scale is 3; expected above 0, up to 1"),
+        ("preset: demo\nmanifest_version: 9999", "manifest_version is 9999; this release reads 1 to"),
+        ("preset: demo\nmanifest_version: true", "manifest_version is True; this release reads 1 to"),
+        ("preset: demo\nmanifest_version: 3\nddg: [3]", "ddg is \\[3\\]; expected its settings"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named(text, said, tmp_path):

@@ -34,8 +34,8 @@ class FromPreset:
     resume: bool = False
     """Continue what is there; finished stages are not redone."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
-    """YAML file to take instead of a preset, which it names, with what differs from it: `config.yaml` of any
-    run. Single values can be given besides."""
+    """YAML file to take instead of --preset: a preset's name and what differs from it, or all settings, as in
+    `config.yaml` of any run. Single values can be given besides."""
 
     @classmethod
     def default_preset(cls) -> str:
