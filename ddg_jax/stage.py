@@ -49,14 +49,19 @@ def run(job: Job) -> Artifact:
         "prior": prior.name,
         "prior_source": prior.source,
         "frames": {
-            "training": len(training),
+            "training": len(training) if _fits(config.ddg) else 0,
             "held_out": len(held_out),
             "skipped": frames.skipped_frames,
             "refused_recordings": frames.refused_recordings,
         },
         **_score(generator, scored, progress),
     }
-    return job.finish(metrics, origin="loaded" if config.ddg.init_from else "trained")
+    return job.finish(metrics, origin="trained" if _fits(config.ddg) else "loaded")
+
+
+def _fits(config: DDGConfig) -> bool:
+    """Whether the stage trains anything: a network, or fewer evaluations for one that is loaded."""
+    return not config.init_from or config.sampling.sampler == PROGRESSIVE
 
 
 def sample_folder(

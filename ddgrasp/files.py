@@ -57,17 +57,22 @@ def new_folder(path: Path | str) -> Iterator[Path]:
 def replaced_folder(path: Path | str) -> Iterator[Path]:
     """As `new_folder`; a folder `path` that there is goes away once the new one stands in its place."""
     path = Path(path)
-    old = path.with_name(f"{TEMPORARY}{os.getpid()}-old-{path.name}")
     with _folder_beside(path) as temporary:
         yield temporary
-        try:
-            if path.exists():
-                os.replace(path, old)
-            os.replace(temporary, path)
-        except BaseException:
-            if old.exists() and not path.exists():
-                os.replace(old, path)
-            raise
+        replace_folder(temporary, path)
+
+
+def replace_folder(folder: Path, path: Path) -> None:
+    """`folder`, beside `path`, takes its name; what was there goes away, or stays if that fails."""
+    old = path.with_name(f"{TEMPORARY}{os.getpid()}-old-{path.name}")
+    try:
+        if path.exists():
+            os.replace(path, old)
+        os.replace(folder, path)
+    except BaseException:
+        if old.exists() and not path.exists():
+            os.replace(old, path)
+        raise
     shutil.rmtree(old, ignore_errors=True)
 
 

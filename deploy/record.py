@@ -32,6 +32,8 @@ ENDED = {True: "lifted and held", False: "failed", None: "not judged"}
 """How a deployment ended, in words, by its success."""
 FILM_COLUMNS = 12
 """Most pictures of the film strip: what comes later is thinned out evenly."""
+_GAP_S = 1.5 * contract.CONTROL_DT_S
+"""Two frames further apart do not follow each other: the camera had none, or a step came late."""
 
 
 class DeploymentRecord:
@@ -46,7 +48,7 @@ class DeploymentRecord:
             "sensor": sensor, "fx_px": profile.fx_px, "baseline_m": profile.baseline_m,
             "color_aligned_to_depth": isinstance(camera, Filmed),  # a camera's own is of another lens
         }  # fmt: skip
-        self._newest_s = -math.inf
+        self._newest_s, self._kept_s = -math.inf, math.inf
         self._rows: list[dict[str, Any]] = []
         self._queue: queue.Queue[tuple[np.ndarray, np.ndarray] | None] = queue.Queue()
         self._film: list[tuple[int, UInt8[np.ndarray, "h w 3"], np.ndarray]] = []
@@ -93,6 +95,9 @@ class DeploymentRecord:
             return
         depth = step.frame.depth
         depth_mm = depth if depth.dtype == np.uint16 else to_millimetres(depth)
+        if step.frame.timestamp_s - self._kept_s > _GAP_S:
+            self._meta["consecutive_frames"] = False
+        self._kept_s = step.frame.timestamp_s
         row["frame"] = self._queued
         self._queued += 1
         self._queue.put((rgb, depth_mm))

@@ -28,6 +28,7 @@ from deploy.policy import OnnxPolicy
 from deploy.record import ENDED, REPORT_FILE, DeploymentRecord, verdict
 from deploy.setup import loop_settings, safety_filter, speed_notice
 
+_LONGEST_S = 1e9
 _TOO_SLOW = "the loop did not keep its rate: this machine is too busy or too slow for the policy and devices"
 
 
@@ -247,8 +248,8 @@ def _check(options: SessionOptions) -> None:
             )
     if options.dry_run and find_spec("matplotlib") is None:  # of the arm's extra, and needed at the end
         raise UserError(f"--dry-run ends with a drawing of what was not sent: {pip_install('franka')}.")
-    if not options.seconds >= contract.CONTROL_DT_S:
+    if not (contract.CONTROL_DT_S <= options.seconds <= _LONGEST_S or options.seconds == math.inf):
         raise UserError(
-            f"--seconds is {options.seconds:g}: choose {contract.CONTROL_DT_S:g}, a control step, or more; "
-            "inf runs until Ctrl-C."
+            f"--seconds is {options.seconds:g}: choose {contract.CONTROL_DT_S:g}, a control step, to "
+            f"{_LONGEST_S:g}; inf runs until Ctrl-C."
         )

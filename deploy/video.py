@@ -1,5 +1,7 @@
 """A film of trials: colour beside the depth that the policy sees."""
 
+import contextlib
+import errno
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -72,10 +74,13 @@ class Video:
             for _ in range(round(VERDICT_S * contract.CONTROL_HZ)):
                 self._write(self._labelled(f"{self._title}   {verdict}"))
 
-    def close(self) -> None:
-        """The film takes its name."""
+    def close(self, whole: bool = True) -> None:
+        """The film takes its name if it is `whole`; else a film of that name stays as it was.
+
+        Raises OSError if pictures are missing in it: encoders do not say that the disk is full.
+        """
         if self._encoder is not None:
-            self._encoder.close()
+            self._encoder.close(whole)
 
     def watched(self) -> bool:
         """See `Viewer`."""
@@ -110,7 +115,7 @@ class Video:
 class _Encoder(Protocol):
     def write(self, picture: Picture) -> None: ...
 
-    def close(self) -> None: ...
+    def close(self, whole: bool) -> None: ...
 
 
 class _Codec:
@@ -119,19 +124,40 @@ class _Codec:
     def __init__(self, path: Path, width: int, height: int):
         import cv2
 
-        self._files = ExitStack()
-        temporary = self._files.enter_context(atomic_path(path))
+        self._files, self._path, self._written = ExitStack(), path, 0
+        self._temporary = self._files.enter_context(atomic_path(path))
         code = cv2.VideoWriter.fourcc(*VIDEO_CODECS[path.suffix])
-        self._writer: Any = cv2.VideoWriter(str(temporary), code, contract.CONTROL_HZ, (width, height))
+        self._writer: Any = cv2.VideoWriter(str(self._temporary), code, contract.CONTROL_HZ, (width, height))
         if not self._writer.isOpened():
             raise UserError(f"This OpenCV cannot write {path.suffix} films: try another ending.")
 
     def write(self, picture: Picture) -> None:
         self._writer.write(picture[..., ::-1])
+        self._written += 1
 
-    def close(self) -> None:
+    def close(self, whole: bool) -> None:
         self._writer.release()
-        self._files.close()
+        with contextlib.suppress(_BrokenOff), self._files:
+            if not whole:
+                raise _BrokenOff
+            if (kept := _frame_count(self._temporary)) < self._written:
+                why = f"{kept} of {self._written} pictures were written: is the disk full?"
+                raise OSError(errno.EIO, why, str(self._path))
+
+
+class _BrokenOff(Exception):
+    """Takes a half-made film away."""
+
+
+def _frame_count(film: Path) -> int:
+    """Pictures that can be read from it."""
+    import cv2
+
+    reader, count = cv2.VideoCapture(str(film)), 0
+    while reader.grab():
+        count += 1
+    reader.release()
+    return count
 
 
 class _Animation:
@@ -143,9 +169,11 @@ class _Animation:
     def write(self, picture: Picture) -> None:
         self._pictures.append(picture[..., ::-1].copy())
 
-    def close(self) -> None:
+    def close(self, whole: bool) -> None:
         import cv2
 
+        if not whole:
+            return
         film: Any = cv2.Animation()
         film.frames = self._pictures
         film.durations = [round(1e3 * contract.CONTROL_DT_S)] * len(self._pictures)

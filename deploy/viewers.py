@@ -41,8 +41,8 @@ class Viewer(Protocol):
         """Whether it is still looked at: a window may have been closed."""
         ...
 
-    def close(self) -> None:
-        """There are no more trials."""
+    def close(self, whole: bool = True) -> None:
+        """There are no more trials; `whole` unless something broke them off."""
         ...
 
 
@@ -97,8 +97,8 @@ class Rerun:
         """See `Viewer`: who looks is not known."""
         return True
 
-    def close(self) -> None:
-        """What was shown has been sent or is in the file."""
+    def close(self, whole: bool = True) -> None:
+        """What was shown has been sent or is in the file, what was broken off as well."""
         self._rr.disconnect()
 
     def _note(self, text: str) -> None:
@@ -170,7 +170,7 @@ class MujocoWindow:
         self._closed = self._closed or (self._handle is not None and not self._handle.is_running())
         return not self._closed
 
-    def close(self) -> None:
+    def close(self, whole: bool = True) -> None:
         """The window goes."""
         if self._handle is not None:
             self._handle.close()

@@ -131,9 +131,11 @@ class GraspEnv(MjxEnv):
 
     @exact
     def step(self, state: State, action: Float[jax.Array, "8"]) -> State:
-        """One control step with `action` (8,); an episode whose action or state is not finite is over."""
+        """One control step with `action` (8,), of which [-1, 1] counts; an episode whose action or state is
+        not finite is over."""
         sound = jnp.all(jnp.isfinite(action))
         action = jnp.where(sound, action, 0.0)  # the C engine would drive every joint to 0 by a NaN
+        action = jnp.clip(action, -1.0, 1.0)
         old: physics.PhysicsState = state.data
         episode: Episode = state.info["episode"]
         controls, latency = self._delayed(

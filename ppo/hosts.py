@@ -66,11 +66,16 @@ def _initialize(trouble: str, **arguments: Any) -> None:
 def _wait_until_it_listens(address: str) -> None:
     """UserError unless something accepts connections at host:port within CONNECT_TIMEOUT_S."""
     host, _, port = address.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")  # of an IPv6 address
     deadline = time.monotonic() + CONNECT_TIMEOUT_S
     while True:
         try:
             socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
             return
+        except UnicodeError:
+            raise UserError(
+                f"hosts.coordinator is {address!r}, and {host!r} can be no host's name: check the address."
+            ) from None
         except OSError as error:
             if time.monotonic() > deadline:
                 raise UserError(

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from ddgrasp import contract
 from mjx_envs import scene
 from mjx_envs.camera import Buffers, Camera
+from mjx_envs.object_spec import ObjectSpec
 from rig.camera import RigCamera
 from rig.fr3 import picture
 from rig.fr3.picture import ScenePicture
@@ -22,6 +23,14 @@ from rig.world import SIM_DT_S, RigWorld
 
 class MeshWorld(RigWorld):
     """The test rig's mesh objects under the same names; can and block lie in one pose only."""
+
+    def _choose_pose(self, rng: np.random.Generator, spec: ObjectSpec) -> ObjectSpec:
+        """See RigWorld; draws what it draws, so that a seed is the same trial in both."""
+        super()._choose_pose(rng, spec)
+        body = make_body(spec.name)
+        return replace(
+            spec, grasp_offset_m=body.grasp_offset_m, grasp_symmetry=body.grasp_symmetry, other_pose=None
+        )
 
     def _put(self, seed: int, size: float, mass: float, friction: float) -> float:
         """See RigWorld; compiles a new model."""

@@ -19,6 +19,7 @@ DICTIONARIES: tuple[Dictionary, ...] = get_args(Dictionary)
 PAPERS_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0)}
 HELD_AT_M = 0.020
 """From the point between the finger pads to the pattern's upper edge: the plate's margin is between them."""
+_SMALLEST_MARKER_M = 0.001
 _INCH_MM = 25.4
 _PRINT_DPI = 300
 _RULER_MM = 100.0
@@ -62,6 +63,11 @@ class CharucoBoard:
             raise UserError(
                 f"board markers of {1e3 * self.marker_m:g} mm in squares of {1e3 * self.square_m:g} mm: "
                 "a marker must be smaller than its square, and larger than nothing."
+            )
+        if self.marker_m < _SMALLEST_MARKER_M:
+            raise UserError(
+                f"board markers of {1e3 * self.marker_m:g} mm: no printer or camera resolves less than "
+                f"{1e3 * _SMALLEST_MARKER_M:g} mm."
             )
         known, needed = len(self._markers().bytesList), self.columns * self.rows // 2
         if needed > known:

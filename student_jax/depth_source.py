@@ -39,7 +39,9 @@ _BATCH = 16
 class DepthSource(Protocol):
     """Gives clean depth a camera's artefacts.
 
-    What a frame gets depends on its episode's number and its own within it alone, however frames are batched.
+    Noise follows from a frame's episode and its own number within it alone, however frames are batched. A
+    generator whose prior is normalised (`inverse_depth`) normalises it over what it is given at once: whole
+    episodes by `episodes`, frame by frame by `frames`.
     """
 
     @property

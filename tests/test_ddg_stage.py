@@ -154,7 +154,7 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
     loaded = stage.run(
         make_job("ddg", config, tmp_path / "ddg", Progress(tmp_path / "ddg", quiet=True), data=recordings)
     )
-    assert loaded.manifest.origin == "loaded"
+    assert loaded.manifest.origin == "loaded" and loaded.manifest.metrics["frames"]["training"] == 0
     before, after = (load_params(a.directory / "params.msgpack") for a in (fitted, loaded))
     jax.tree.map(np.testing.assert_array_equal, before, after)
     for change, message in (

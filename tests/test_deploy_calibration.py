@@ -183,6 +183,7 @@ def test_the_printed_page_has_the_pattern_in_its_true_size():
     [
         ({"columns": 2}, "2 x 7 squares: give at least 3 x 3"),
         ({"marker_m": 0.03}, "30 mm in squares of 30 mm"),
+        ({"square_m": 0.0005, "marker_m": 0.0003}, "markers of 0.3 mm: .* less than 1 mm"),
         ({"columns": 11, "rows": 11}, "needs 60 markers, DICT_4X4_50 has 50"),
         ({"dictionary": "DICT_7X7"}, "'DICT_7X7': choose one of"),
     ],

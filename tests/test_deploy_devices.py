@@ -1,5 +1,6 @@
 """Camera and robot drivers as far as they go without hardware, and what a user sees who chose wrongly."""
 
+import json
 import math
 import os
 import signal
@@ -66,6 +67,17 @@ def test_replay_follows_the_clock_and_ends_on_its_last_frame(recording):
         frame = camera.read()
         seen.append((int(frame.depth[0, 0]), round(frame.timestamp_s, 6)))
     assert seen == [(700, 0.0), (700, 0.0), (710, 0.1), (730, 0.3), (730, 0.3), (730, 0.3)]
+
+
+@pytest.mark.parametrize(("hz", "shown_mm"), [(30.0, 730), (20.0, 720), (10.0, 710), (2.0, 710), (None, 710)])
+def test_replay_keeps_the_pace_of_a_faster_recording(recording, hz, shown_mm):
+    meta = json.loads((recording / "meta.json").read_text())
+    (recording / "meta.json").write_text(json.dumps(meta | {"hz": hz}))
+    clock = SimClock()
+    camera = ReplayCamera.open(recording, clock)
+    camera.start()
+    clock.sleep_until(0.1)
+    assert camera.read().depth[0, 0] == shown_mm
 
 
 def test_loop_over_a_replay_holds_once_the_recording_ends(recording, tmp_path):
@@ -482,7 +494,8 @@ def test_drivers_that_never_started_can_be_stopped():
         (SessionOptions(host="10.0.0.7"), "--host is 10.0.0.7, and robot 'sim' has none: drop it, or choose"),
         (SessionOptions("sim", "replay", Path("r"), host="10.0.0.7"), "--host is 10.0.0.7, and robot 'sim'"),
         (SessionOptions(calibration=Path("c.json")), "--calibration is c.json, and robot 'sim' has none"),
-        (SessionOptions(seconds=-1.0), "--seconds is -1: choose 0.1, a control step, or more"),
+        (SessionOptions(seconds=-1.0), "--seconds is -1: choose 0.1, a control step, to 1e"),
+        (SessionOptions(seconds=1e308), "--seconds is 1e.308: choose 0.1, a control step, to 1e"),
         (SessionOptions(seconds=0.0), "--seconds is 0: choose 0.1"),
         (SessionOptions(seconds=0.04), "--seconds is 0.04: choose 0.1, a control step"),
         (SessionOptions(seconds=float("nan")), "--seconds is nan: choose 0.1"),

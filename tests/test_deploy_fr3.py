@@ -30,6 +30,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy.aside import pressed_at
 from deploy.clock import RobotClock
+from deploy.devices.fr3_imager import Fr3Imager
 from deploy.devices.franka_hand import THREADS, WIDTH_PERIOD_S
 from deploy.devices.franka_robot import AT_START_RAD, FrankaRobot
 from deploy.devices.options import SessionOptions
@@ -41,7 +42,7 @@ from deploy.policy import OnnxPolicy
 from deploy.session import ask_person, deploy
 from deploy.setup import safety_filter, speed_notice
 from deploy_support import HOME_RAD, ScriptedCamera, constant_bias, depth_mm, describe, write_policy
-from rig.fr3.channel import Channel
+from rig.fr3.channel import PORT, Channel
 from rig.fr3.process import Fr3Rig
 from rig.fr3.scene import SceneObject, primitive
 
@@ -331,6 +332,17 @@ def test_no_server_at_the_host():
     assert "\n" not in str(error.value)
     with pytest.raises(UserError, match="no FR3 rig at '127.0.0.13'.*ddgrasp rig fr3"):
         Channel("127.0.0.13")
+    with pytest.raises(UserError, match="no FR3 rig at 'a..b' "):
+        Channel("a..b")
+
+
+def test_a_rig_that_goes_while_a_camera_starts_is_one_line():
+    with socket.create_server(("127.0.0.14", PORT)) as server:
+        threading.Thread(target=lambda: server.accept()[0].close(), daemon=True).start()
+        camera = Fr3Imager("127.0.0.14", np.eye(4))
+        with pytest.raises(UserError, match="FR3 rig.*: start it again, `ddgrasp rig fr3 --host 127.0.0.14`"):
+            camera.start()
+        camera.stop()
 
 
 def test_ports_that_are_taken_are_refused(rig):

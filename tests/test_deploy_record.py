@@ -15,7 +15,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy import session
 from deploy.devices.options import SessionOptions
-from deploy.interfaces import Frame
+from deploy.interfaces import CameraError, Frame
 from deploy_support import KinematicRobot, constant_bias, describe, write_policy
 from evaluation.report import deployments
 from sensors.recordings import recording as recording_files
@@ -320,6 +320,19 @@ def test_a_frame_that_came_again_is_no_next_one(run):
     report, folder = run(Stalled)
     recording = Recording.open(folder)
     assert report.holds == 1 and len(recording) == 5 and not recording.consecutive
+
+
+def test_frames_before_and_after_an_outage_do_not_follow_each_other(run):
+    class Gone(ColourCamera):
+        def read(self):
+            frame = super().read()
+            if self._reads == 3:
+                raise CameraError("no frame came")
+            return frame
+
+    report, folder = run(Gone)
+    recording = Recording.open(folder)
+    assert report.holds == 1 and len(recording) == 4 and not recording.consecutive
 
 
 def test_where_nothing_can_be_kept_nothing_moves(run, tmp_path, monkeypatch):

@@ -65,6 +65,43 @@ def test_a_film_has_colour_beside_depth_and_stays_at_the_verdict(tmp_path, name)
     np.testing.assert_allclose(below[:, PANEL_PX + 50 : -50].mean((0, 1)), INVALID_RGB, atol=12)
 
 
+@pytest.mark.parametrize("name", ["film.mp4", "film.webp"])
+def test_a_film_that_was_broken_off_leaves_the_one_before(tmp_path, name):
+    (tmp_path / name).write_bytes(b"before")
+    video = Video(tmp_path / name)
+    video.begin("apple")
+    video.look(_step(0, 700), _RedCamera())
+    video.close(whole=False)
+    assert (tmp_path / name).read_bytes() == b"before" and len(list(tmp_path.iterdir())) == 1
+
+
+_ON_A_FULL_DISK = """
+import resource, signal, sys
+from pathlib import Path
+import numpy as np
+from deploy import video
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+film, rng = video._Codec(Path(sys.argv[1]), 640, 360), np.random.default_rng(0)
+for _ in range(30):
+    film.write(rng.integers(0, 255, (360, 640, 3)).astype(np.uint8))
+try:
+    film.close(whole=True)
+except OSError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.webm"])
+def test_a_film_that_a_full_disk_cut_leaves_the_one_before(tmp_path, name):
+    (tmp_path / name).write_bytes(b"before")
+    run = subprocess.run(
+        [sys.executable, "-c", _ON_A_FULL_DISK, str(tmp_path / name)], capture_output=True, text=True
+    )
+    assert run.returncode == 0 and "of 30 pictures were written: is the disk full?" in run.stdout, run
+    assert (tmp_path / name).read_bytes() == b"before" and len(list(tmp_path.iterdir())) == 1
+
+
 class _Simulated(_RedCamera):
     def clean_mm(self) -> np.ndarray:
         return np.full((HEIGHT, WIDTH), 500, np.uint16)

@@ -178,6 +178,8 @@ def test_a_real_cameras_recordings_are_fitted_and_scored(tmp_path, capsys):
     assert "must not overlap" in capsys.readouterr().err
     assert cli.main([*command, "--run-dir", str(tmp_path)]) == 2
     assert "leave one of them out" in capsys.readouterr().err
+    assert cli.main([*command, "--ddg.init-from", "pretrained/ddg"]) == 2
+    assert "--ddg.init-from pretrained/ddg with --real: what is scored is fitted" in capsys.readouterr().err
     command += ["--fit-frames", "10", "--score-frames", "16", "--ddg.training.steps", "3"]
     assert cli.main([*command, "--resume"]) == 0
     fitted = artifacts.read_manifest(tmp_path / "out" / "score_real" / "ddg").config["ddg"]

@@ -11,7 +11,10 @@ import trimesh
 from app.commands import parse
 from ddgrasp import contract
 from ddgrasp.errors import UserError
+from ddgrasp.layout import QPOS
+from mjx_envs import grasp_math
 from mjx_envs.objects import OBJECTS, get_object
+from rig.mesh_world import MeshWorld
 from rig.meshes import convex
 from rig.meshes.bodies import CONTACT_GROUP, VISUAL_GROUP, MeshBody, body_of, make_body, place
 from rig.meshes.fit import fit
@@ -221,3 +224,17 @@ def test_the_sheet_shows_the_meshes(tmp_path, open_gl):
     blue, green, red = np.moveaxis(picture, -1, 0)
     assert ((red > 100) & (green < 60) & (blue < 60)).sum() > 500  # the apple
     assert ((blue > 80) & (red < 60) & (green < 110)).sum() > 500  # the mug
+
+
+@pytest.mark.parametrize("name", ["can", "block", "banana"])
+def test_a_teacher_is_told_the_grasp_of_the_mesh_on_the_table(name):
+    body, world = make_body(name), MeshWorld((name,))
+    for seed in range(4):  # either pose of the can of boxes and the block of boxes is among them
+        world.reset(seed, name)
+        symmetry = np.asarray(body.grasp_symmetry)
+        branch = grasp_math.yaw_branch(world.data.qpos[QPOS.object_quat], symmetry)
+        expected = grasp_math.observation(
+            world.data.qpos, world.data.qvel, symmetry, branch, np.log(get_object(name).category_id),
+            offset_m=np.asarray(body.grasp_offset_m),
+        )  # fmt: skip
+        np.testing.assert_allclose(world.observation(), expected, rtol=0, atol=1e-6)

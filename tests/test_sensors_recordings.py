@@ -12,6 +12,7 @@ from app import pipeline
 from app.commands.ddg import DDGFit
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
+from sensors.recordings import recording as recording_module
 from sensors.recordings.recording import Recording, RecordingWriter, contents, find_recordings
 
 REAL = Path(__file__).parents[2] / "shared" / "real_depth"
@@ -83,6 +84,39 @@ def test_interrupted_writer_keeps_the_previous_recording(tmp_path):
         raise KeyboardInterrupt
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
     assert len(Recording.open(path)) == 2
+
+
+def test_two_writers_of_one_name_do_not_meet(tmp_path):
+    path = tmp_path / "take"
+    with RecordingWriter(path, {}) as first:
+        first.add(*_frame(1))
+        with pytest.raises(UserError, match="take is being recorded by another process: choose another name"):
+            _write(path)
+        first.add(*_frame(2))
+    assert len(Recording.open(path)) == 2 and [p.name for p in tmp_path.iterdir()] == ["take"]
+
+
+@pytest.mark.parametrize("step", ["_write", "replace_folder"])
+def test_a_recording_that_cannot_be_ended_leaves_what_was_there_and_nothing_else(tmp_path, monkeypatch, step):
+    path = _write(tmp_path / "a", frames=2)
+
+    def fail(*_: object, sync: bool = False) -> None:
+        if sync or step == "replace_folder":
+            raise OSError(28, "No space left on device")
+        (tmp_path / ".a.partial" / "depth" / "000000.png").touch()
+
+    with pytest.raises(OSError, match="No space left"), RecordingWriter(path, {}) as writer:
+        writer.add(*_frame(0))
+        monkeypatch.setattr(recording_module, step, fail)
+    assert [p.name for p in tmp_path.iterdir()] == ["a"] and len(Recording.open(path)) == 2
+
+
+def test_what_a_killed_writer_left_is_not_part_of_the_next(tmp_path):
+    for folder in ("color", "depth"):
+        (tmp_path / ".a.partial" / folder).mkdir(parents=True)
+        (tmp_path / ".a.partial" / folder / "000007.png").write_bytes(b"old")
+    assert len(Recording.open(_write(tmp_path / "a", frames=2))) == 2
+    assert not list((tmp_path / "a").glob("*/000007.png"))
 
 
 def test_writer_replaces_and_hides_until_complete(tmp_path):

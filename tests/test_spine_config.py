@@ -16,11 +16,13 @@ from app.cli import main
 from app.commands import parse
 from app.commands.checks import check_config_values
 from ddg_jax import prior, sensor
+from ddgrasp.artifacts import config_hash
 from ddgrasp.config import (
     Config,
     DDGConfig,
     DDGDiffusionConfig,
     DDGTrainingConfig,
+    DeployConfig,
     DepthFeatureConfig,
     DextrahConfig,
     EncoderConfig,
@@ -125,6 +127,14 @@ def test_numbers_of_numpy_are_numbers():
     assert UNetConfig(space_to_depth=np.int64(2)).space_to_depth == 2  # pyright: ignore
     assert SamplingConfig(eta=np.float32(0.5)).eta == 0.5  # pyright: ignore
     assert EncoderConfig(output_stride=np.int64(16)).output_stride == 16  # pyright: ignore
+
+
+def test_a_whole_number_is_a_float_where_floats_are_held():
+    whole = DeployConfig(stale_periods=3, arm_lower_m=(-1, -1, 0))
+    given = DeployConfig(stale_periods=3.0, arm_lower_m=(-1.0, -1.0, 0.0))
+    assert type(whole.stale_periods) is type(whole.arm_lower_m[0]) is float
+    whole, given = (dataclasses.replace(PRESETS["demo"], deploy=deploy) for deploy in (whole, given))
+    assert config_hash(whole, "deploy") == config_hash(given, "deploy")
 
 
 @pytest.mark.parametrize(

@@ -161,6 +161,22 @@ def test_a_coordinator_that_is_not_there_is_named(monkeypatch):
             hosts.connect(HostsConfig(address, processes=2, process=1))
 
 
+def test_a_coordinator_by_its_ipv6_address_is_found():
+    with socket.socket(socket.AF_INET6) as listening:
+        try:
+            listening.bind(("::1", 0))
+        except OSError:
+            pytest.skip("no IPv6 here")
+        listening.listen()
+        hosts._wait_until_it_listens(f"[::1]:{listening.getsockname()[1]}")
+
+
+def test_a_coordinator_that_can_be_no_host_is_named_at_once():
+    with pytest.raises(UserError, match="'a..b:1', and 'a..b' can be no host's name") as error:
+        hosts.connect(HostsConfig("a..b:1", processes=2, process=1))
+    assert "\n" not in str(error.value)
+
+
 def test_auto_without_a_cluster_says_what_to_give():
     with pytest.raises(UserError, match="'auto', and no cluster answers for it: give host:port"):
         hosts.connect(HostsConfig("auto"))

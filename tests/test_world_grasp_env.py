@@ -55,6 +55,11 @@ def stepped(env, first) -> Callable[..., State]:
     return after
 
 
+def test_what_an_action_has_beyond_its_box_counts_for_nothing(stepped):
+    within, beyond = (stepped(BESIDE_M, jnp.full(8, size, jnp.float32)) for size in (1.0, 1e20))
+    jax.tree.map(np.testing.assert_array_equal, within, beyond)
+
+
 @pytest.mark.parametrize(
     ("place_m", "action", "before", "after"),
     [(HELD_M, CLOSE, 3, 4), (HELD_M, CLOSE, 0, 1), (BESIDE_M, CLOSE, 3, 0), (HELD_M, OPEN, 3, 0)],

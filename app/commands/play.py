@@ -92,17 +92,19 @@ class Play:
         if not self._live:
             check_file("--out", self._film)
         viewer = self._viewer(noise)
-        rigs = _Rigs(series, self.policy or _pretrained(), noise)
+        rigs, whole = _Rigs(series, self.policy or _pretrained(), noise), False
         try:
             rigs.bench(self.rig)
             if self._live:
                 self._play_on(rigs, series.names(), viewer, controls)
             else:
                 lifted = sum(_watched(rigs.bench(self.rig), trial, viewer, controls) for trial in trials)
-                print(f"{lifted} of {len(trials)} lifted and held: {self._film}", flush=True)
+            whole = True
         finally:
             rigs.close()
-            viewer.close()
+            viewer.close(whole)
+        if not self._live:
+            print(f"{lifted} of {len(trials)} lifted and held: {self._film}", flush=True)
 
     @property
     def _wants_film(self) -> bool:

@@ -75,6 +75,11 @@ class DDGScore(Scoring):
                 f"--run-dir {self.run_dir} with --real: the generator is fitted on the first frames, none is "
                 "taken from a run; leave one of them out."
             )
+        if self.ddg.init_from:
+            raise UserError(
+                f"--ddg.init-from {self.ddg.init_from} with --real: what is scored is fitted on the first "
+                "frames, and a generator from elsewhere may have seen the last ones; leave one of them out."
+            )
         recordings = recordings_in("--real", self.real)
         check_score(self.score)
         preset = replace(get_preset(self.preset), ddg=self.ddg, score=self.score, seed=self.seed)

@@ -98,7 +98,9 @@ class Section:
 
     def __post_init__(self) -> None:
         for field, kind in kinds(type(self)).items():
-            check_value(self.field_name(field), getattr(self, field), kind)
+            value = getattr(self, field)
+            check_value(self.field_name(field), value, kind)
+            object.__setattr__(self, field, _as_stated(value, kind))
         self.check()
 
     def check(self) -> None:
@@ -152,6 +154,18 @@ def check_value(name: str, value: Any, kind: Any) -> None:
         raise TypeError(f"{name} has type {kind}, which states no bounds: see ddgrasp/config/checks.py")
     elif not isinstance(value, typing.cast(type, kind)):
         raise UserError(f"{name} is {value!r}; expected a {getattr(kind, '__name__', kind)}.")
+
+
+def _as_stated(value: Any, kind: Any) -> Any:
+    """A checked `value`, whole numbers as floats where the field holds floats: 3 and 3.0 are one setting, and
+    have to have one hash."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Annotated and arguments[0] is float and isinstance(value, Integral):
+        return float(value)
+    if origin is tuple:
+        of_items = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        return tuple(_as_stated(item, of_item) for item, of_item in zip(value, of_items, strict=True))
+    return value
 
 
 def _check_annotated(name: str, value: Any, kind: type, *extras: Any) -> None:

@@ -100,7 +100,7 @@ class Fr3Camera:
         from rig.fr3.picture import of_scene
 
         self._channel = Channel(self._host)
-        scene = self._channel.ask("scene")
+        scene = self._channel.scene()
         self._picture, self._object = of_scene(scene["xml"]), scene["object"]
 
     def read(self) -> Frame:

@@ -46,7 +46,7 @@ class Fr3Imager:
         from rig.fr3.picture import of_scene
 
         self._channel = Channel(self._host)
-        self._picture = of_scene(self._channel.ask("scene")["xml"], FINER * contract.D455.width_px)
+        self._picture = of_scene(self._channel.scene()["xml"], FINER * contract.D455.width_px)
 
     def lens(self) -> Lens:
         """Without distortion, as a D4xx's rectified imagers are."""

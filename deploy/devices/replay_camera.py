@@ -1,5 +1,6 @@
 """A recording played back as a camera, at the pace of the loop's clock."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,8 @@ def make(setup: Setup, robot: Robot) -> "ReplayCamera":
 class ReplayCamera:
     """Frame i is shown from i * period_s after the start; past the end the last one stays (and goes stale).
 
-    `period_s` is the time between two recorded frames.
+    `period_s` is the time between two recorded frames, at most a control step's: of a recording at 30 Hz the
+    loop sees every third frame, one at 2 Hz is played faster than it was, since nobody controls an arm by it.
     """
 
     def __init__(
@@ -35,11 +37,14 @@ class ReplayCamera:
         self._frame: Frame | None = None
 
     @classmethod
-    def open(cls, path: Path, clock: Clock, period_s: float = contract.CONTROL_DT_S) -> "ReplayCamera":
-        """Play the recording in `path`; UserError if there is none."""
+    def open(cls, path: Path, clock: Clock) -> "ReplayCamera":
+        """Play the recording in `path` at its own rate, if it names one; UserError if there is none."""
         from sensors.recordings.recording import Recording
 
-        return cls(Recording.open(path), clock, period_s)
+        recording = Recording.open(path)
+        hz = recording.meta.get("hz")
+        faster = isinstance(hz, int | float) and math.isfinite(hz) and hz > contract.CONTROL_HZ
+        return cls(recording, clock, 1.0 / hz if faster else contract.CONTROL_DT_S)
 
     def __len__(self) -> int:
         return len(self._recording)

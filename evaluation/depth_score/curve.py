@@ -135,7 +135,8 @@ def _frames(
 
     record = parents["record"].directory
     recorded = len(find_recordings(record))
-    _record_more(config, parents["teacher"].directory, range(recorded, count), extra, progress)
+    as_the_run = replace(config, seed=parents["record"].manifest.seed)
+    _record_more(as_the_run, parents["teacher"].directory, range(recorded, count), extra, progress)
     prior = make_prior(config.ddg)
     roots = [record, *([extra] if count > recorded else [])]
     parts = [load_frames(root, config.ddg, prior, config.seed, progress) for root in roots]

@@ -66,8 +66,9 @@ def _kid_draws(real: Sample, sim: Sample, drawn: Drawn) -> list[float]:
 def classifier_auc(real: Sample, sim: Sample, drawn: Drawn) -> tuple[float, list[float]]:
     """Area under the ROC curve of a logistic regression that tells the sets apart (Lopez-Paz & Oquab 2017).
 
-    Cross-validated: a scene and its neighbours in time are never both trained on and tested. 0.5 = not to be
-    told apart. The draws resample the tested scores. nan with fewer than two groups.
+    Cross-validated: a group (a scene of the rig; eight frames in a row of a real camera, whose next eight are
+    another group) is never both trained on and tested. 0.5 = not to be told apart. The draws resample the
+    tested scores. nan with fewer than two groups.
     """
     from sklearn.linear_model import LogisticRegression
     from sklearn.metrics import roc_auc_score

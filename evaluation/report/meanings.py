@@ -105,7 +105,9 @@ MEANINGS: dict[str, Meaning] = {
     "head_loss": Meaning("the action head's loss"),
     "head_grad_norm": Meaning("length of the action head's gradient"),
     "pose_loss": Meaning("the action head's loss, trained on true poses"),
-    "pose_success": Meaning("success of that head", SHARE),
+    "pose_success": Meaning(
+        "success while poses were collected: of the teacher alone at first, of that head alone at last", SHARE
+    ),
     "clone_loss": Meaning("loss of imitating the scripted controller"),
     "control_steps": Meaning("control steps so far", "steps"),
     "minutes": Meaning("time so far", "min"),

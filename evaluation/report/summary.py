@@ -214,7 +214,8 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
         ]
     if stage == "ddg" and {"recorded", "generated"} <= metrics.keys():
         shares = [metrics[key]["invalid_fraction"] for key in ("recorded", "generated")]
-        return [f"invalid pixels: recorded {shares[0]:.1%}, generated {shares[1]:.1%} (held-out frames)"]
+        judged_on = "held-out" if metrics.get("frames", {}).get("training", 1) else "recorded"
+        return [f"invalid pixels: recorded {shares[0]:.1%}, generated {shares[1]:.1%} ({judged_on} frames)"]
     if stage == "export" and "max_abs_diff" in metrics:
         return [f"largest difference between JAX and ONNX actions {metrics['max_abs_diff']:.1e}"]
     if stage == "deploy" and "latency_ms" in metrics:

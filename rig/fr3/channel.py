@@ -25,16 +25,24 @@ class Channel:
     """A connection to a running rig. Raises UserError if there is none at `host`."""
 
     def __init__(self, host: str):
+        self._host = host
         try:
             self._socket = socket.create_connection((host, PORT), CONNECT_S)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
             raise UserError(
-                f"no FR3 rig at {host!r} ({error.strerror or error}): start one, "
+                f"no FR3 rig at {host!r} ({getattr(error, 'strerror', None) or error}): start one, "
                 f"`ddgrasp rig fr3 --host {host}`."
             ) from error
         self._socket.settimeout(ANSWER_S)
         self._file = self._socket.makefile("rw")
         self._holding = 0
+
+    def scene(self) -> dict[str, Any]:
+        """What stands in the rig, to be pictured. Raises UserError if the rig does not answer."""
+        try:
+            return self.ask("scene")
+        except ChannelLost as error:
+            raise UserError(f"{error}: start it again, `ddgrasp rig fr3 --host {self._host}`.") from error
 
     def ask(self, what: str, **values: Any) -> dict[str, Any]:
         """The answer to one request; see `rig.fr3.serve.Rig.answer`. Raises ChannelLost."""

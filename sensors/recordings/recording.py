@@ -11,6 +11,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, SupportsIndex
@@ -20,8 +21,10 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
 from ddgrasp import depth
+from ddgrasp.alone import alone_in
 from ddgrasp.contract import CONTRACT_VERSION, D455, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
+from ddgrasp.files import replace_folder
 from sensors.recordings.integrity import find_color, find_depth, inspect_frame
 from sensors.recordings.sources import in_time
 
@@ -235,29 +238,44 @@ class RecordingWriter:
     """Writes one recording; it appears under its name only when complete.
 
     Use as a context manager: frames go to a hidden folder beside the target, `meta.json` is
-    written last, then the folder is renamed. Leaving by an exception (or Ctrl-C) removes the
-    hidden folder, a previous recording of that name stays as it was.
+    written last, then the folder is renamed. Leaving by an exception (or Ctrl-C), or failing at the end,
+    removes the hidden folder; a previous recording of that name stays as it was.
+
+    Raises UserError on entering if another one is at work under that name.
     """
 
     def __init__(self, path: str | os.PathLike, meta: dict[str, Any]):
         self.path = Path(path)
         self.meta = dict(meta)
         self._temporary = self.path.parent / f".{self.path.name}.partial"
+        self._alone = ExitStack()
         self._size: tuple[int, int] | None = None
         self._frames = 0
         self._invalid = 0.0
 
     def __enter__(self) -> "RecordingWriter":
-        shutil.rmtree(self._temporary, ignore_errors=True)
-        (self._temporary / "color").mkdir(parents=True)
-        (self._temporary / "depth").mkdir()
+        self._temporary.mkdir(parents=True, exist_ok=True)
+        try:
+            self._alone.enter_context(alone_in(self._temporary))
+        except UserError:
+            raise UserError(
+                f"{self.path} is being recorded by another process: choose another name."
+            ) from None
+        for folder in ("color", "depth"):  # what a killed process has left goes
+            shutil.rmtree(self._temporary / folder, ignore_errors=True)
+            (self._temporary / folder).mkdir()
         return self
 
     def __exit__(self, kind, value, traceback) -> None:
-        if kind is None:
-            self._finish()
-        else:
-            shutil.rmtree(self._temporary, ignore_errors=True)
+        with self._alone:
+            try:
+                if kind is None:
+                    self._finish()
+            except BaseException:
+                shutil.rmtree(self._temporary, ignore_errors=True)
+                raise
+            if kind is not None:
+                shutil.rmtree(self._temporary, ignore_errors=True)
 
     def add(self, rgb: np.ndarray, depth_mm: np.ndarray) -> None:
         """Append a frame.
@@ -297,7 +315,6 @@ class RecordingWriter:
 
     def _finish(self) -> None:
         if self._size is None:
-            shutil.rmtree(self._temporary, ignore_errors=True)
             raise UserError(f"{self.path}: a recording needs at least one frame.")
         meta = {
             "frames": self._frames,
@@ -310,12 +327,7 @@ class RecordingWriter:
         }
         text = json.dumps({**self.meta, **meta}, indent=1) + "\n"
         _write(self._temporary / META_FILE, text.encode(), sync=True)
-        old = self.path.parent / f".{self.path.name}.old"
-        if self.path.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            self.path.rename(old)
-        self._temporary.rename(self.path)
-        shutil.rmtree(old, ignore_errors=True)
+        replace_folder(self._temporary, self.path)
 
 
 def _encode(extension: str, image: np.ndarray, options: list[int]) -> bytes:
