@@ -331,7 +331,13 @@ def _open(path: Path, kind: str, number: int, threads: int) -> ort.InferenceSess
     options.intra_op_num_threads = threads
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        return ort.InferenceSession(str(path), options, providers=providers)
+        session = ort.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # onnxruntime raises classes of its own, without a common base
         reason = str(error).splitlines()[0]
         raise UserError(f"{path}: onnxruntime cannot load it ({reason}); {names.REMEDY}.") from error
+    if kind == "cuda" and "CUDAExecutionProvider" not in session.get_providers():
+        raise UserError(
+            "device is cuda, which onnxruntime could not load (its warning above says why): install the CUDA "
+            "and cuDNN that this onnxruntime-gpu was built for, or take device cpu."
+        )
+    return session

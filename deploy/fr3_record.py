@@ -29,7 +29,8 @@ from deploy.setup import safety_filter
 from rig.camera import jittered_pose
 from rig.fr3 import scene
 from rig.stage import describe_recording
-from sensors.recordings.recording import Recording, RecordingWriter, is_recording
+from sensors.recordings.recording import Recording, is_recording
+from sensors.recordings.writer import RecordingWriter
 
 SETTINGS_FILE = "record.json"
 CONTACT = 100.0

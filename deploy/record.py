@@ -25,7 +25,7 @@ from deploy.loop import Step
 from rig.film import Film, contact_sheet
 
 if TYPE_CHECKING:
-    from sensors.recordings.recording import RecordingWriter
+    from sensors.recordings.writer import RecordingWriter
 
 STEPS_FILE, REPORT_FILE, FILM_FILE = "steps.jsonl", "report.json", "film.png"
 ENDED = {True: "lifted and held", False: "failed", None: "not judged"}
@@ -138,7 +138,7 @@ class DeploymentRecord:
         if taken is None:
             return
         try:
-            from sensors.recordings.recording import RecordingWriter
+            from sensors.recordings.writer import RecordingWriter
 
             with RecordingWriter(folder, self._meta) as writer:
                 while taken is not None and self._add(writer, *taken):

@@ -127,7 +127,7 @@ def print_tables(result: Comparison) -> None:
     """Prints scalars, curves and losses per object, cameras side by side."""
     from rich.console import Console
 
-    console = Console()
+    console = Console(markup=False, emoji=False)  # names of recordings are no markup
     cameras = [*result.real, result.rig]
     console.print(_table("", cameras, [(SCALARS[n], [_scalar(n, f) for f in cameras]) for n in SCALARS]))
     for name, title in CURVES.items():

@@ -15,6 +15,7 @@ from ddg_jax.sample import Generator, frame_noise, generate
 from ddgrasp import artifacts, generator_metadata
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE, DDGConfig
+from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.generator_metadata import GeneratorMetadata
@@ -24,7 +25,7 @@ from export.parity import open_session
 from export.sampler_tables import MOST_STEPS, is_stochastic
 from learning import diffusion
 from mjx_envs.precision import exact
-from sensors.recordings.recording import find_recordings
+from sensors.recordings.recording import Recording, find_recordings
 
 PARITY_SCENES = 4
 MOST_SHARE = 2e-3
@@ -96,7 +97,8 @@ def describe(
     artifact: Artifact, config: DDGConfig, data: Path | None = None, licence: str = ""
 ) -> GeneratorMetadata:
     """Metadata of this stage's generator, sampled as `config` says. Other arguments: `export_generator`."""
-    camera, from_licence, source = _recorded(data) if data else _rig(artifact)
+    size = config.depth.height_px, config.depth.width_px
+    camera, from_licence, source = _recorded(data, size) if data else _rig(artifact)
     fixed = config.sampling.sampler == PROGRESSIVE
     return GeneratorMetadata(
         format=generator_metadata.FORMAT,
@@ -137,21 +139,32 @@ def _rig(artifact: Artifact) -> tuple[dict[str, Any], str, str]:
     return camera, "Apache-2.0", "recorded in the project's own simulation"
 
 
-def _recorded(data: Path) -> tuple[dict[str, Any], str, str]:
-    """What the recordings' meta.json say, and the range of their depth."""
+def _recorded(data: Path, size: tuple[int, int]) -> tuple[dict[str, Any], str, str]:
+    """What the recordings' meta.json say of the centred window that a generator of `size` (H, W) is fitted
+    to, and the range of its depth; no focal length where the recordings are of several.
+    """
     recordings = find_recordings(data)
-    first, metas = recordings[0], [recording.meta for recording in recordings]
-    depth = np.concatenate([r.depth_m(i)[::8, ::8].ravel() for r in recordings for i in range(len(r))])
+    metas = [recording.meta for recording in recordings]
+    seen = (crop_nearest(r.depth_m(i), size) for r in recordings for i in range(len(r)))
+    depth = np.concatenate([frame[::4, ::4].ravel() for frame in seen])
     near, far = np.quantile(depth[depth > 0], RANGE_QUANTILES)
+    height, width = _window(recordings[0], size)
+    optics = {(*_window(recording, size), recording.fx_px) for recording in recordings}
     camera = {
         "name": _joined(metas, "sensor"),
-        "width_px": first.width_px,
-        "height_px": first.height_px,
-        "fx_px": first.meta.get("fx_px"),
+        "width_px": width,
+        "height_px": height,
+        "fx_px": recordings[0].fx_px if len(optics) == 1 else None,
         "near_m": round(float(near), 3),
         "far_m": round(float(far), 3),
     }
     return camera, _joined(metas, "licence"), _joined(metas, "source")
+
+
+def _window(recording: Recording, size: tuple[int, int]) -> tuple[int, int]:
+    """(height, width) of the largest centred window of the shape of `size`, pixels of the recording."""
+    scale = min(recording.height_px / size[0], recording.width_px / size[1])
+    return round(scale * size[0]), round(scale * size[1])
 
 
 def _joined(metas: list[dict[str, Any]], key: str) -> str:

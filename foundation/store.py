@@ -66,6 +66,7 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float
 
     arrays = read_checkpoint(file)
     network = recognise({key: tuple(array.shape) for key, array in arrays.items()})
+    _check_version(file, network)
     _check_metric(file, network, max_depth_m)
     variables = convert(network, arrays)
     name = f"{network}_metric" if max_depth_m else network
@@ -136,6 +137,15 @@ def _folders(weights_dir: Path) -> dict[str, WeightsManifest | UserError]:
         except UserError as error:
             found[path.parent.name] = error
     return found
+
+
+def _check_version(file: Path, network: str) -> None:
+    """Depth Anything's first version has the same arrays as its second, and reads other layers of them."""
+    if network.startswith(catalog.IMAGE_DEPTH) and file.name.startswith("depth_anything_vit"):
+        raise UserError(
+            f"{file.name} looks like a model of Depth Anything's first version, which is another network: "
+            f"take {catalog.get_entry(network).file}."
+        )
 
 
 def _check_metric(file: Path, network: str, max_depth_m: float) -> None:

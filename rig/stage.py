@@ -21,7 +21,8 @@ from ddgrasp.progress import Progress
 from mjx_envs.camera import nominal_camera
 from rig.camera import RigCamera, jittered_pose, make_camera
 from rig.world import RigWorld, make_world
-from sensors.recordings.recording import Recording, RecordingWriter, is_recording
+from sensors.recordings.recording import Recording, is_recording
+from sensors.recordings.writer import RecordingWriter
 from sensors.statistics import stats
 
 STATIC_FRAMES = 10

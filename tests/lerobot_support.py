@@ -8,7 +8,7 @@ import numpy as np
 from ddgrasp import artifacts
 from ddgrasp.presets import get_preset
 from demos.store import EpisodeStore
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 
 SIZE = (48, 64)
 LENGTHS = (7, 4, 5)

@@ -16,7 +16,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
 from learning import memory
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 from sensors.statistics.holes import fill_from_background
 
 

@@ -27,7 +27,7 @@ from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress, read_curves
 from job_support import make_job
 from learning.params import load_params
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 
 CONFIG = Config(
     preset="test",

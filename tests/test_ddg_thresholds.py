@@ -17,7 +17,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config, DDGConfig, DDGDepthConfig, SamplingConfig, UNetConfig
 from ddgrasp.progress import Progress
 from learning.params import save_params
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 
 CONFIG = DDGConfig(
     depth=DDGDepthConfig(height_px=16, width_px=24),

@@ -11,6 +11,7 @@ import pytest
 
 from ddgrasp import generator_metadata as names
 from ddgrasp.errors import UserError
+from deploy import depth_noise
 from deploy.depth_noise import DepthGenerator, check_count
 from tutorial_support import code
 
@@ -202,6 +203,14 @@ def test_files_that_are_no_generators_are_refused(tmp_path):
     for device in ("tpu", "cuda:one"):
         with pytest.raises(UserError, match=f"device is '{device}'; expected cpu"):
             DepthGenerator(FILE, device=device)
+
+
+def test_a_gpu_that_onnxruntime_cannot_load_is_no_cpu(monkeypatch):
+    """An onnxruntime-gpu without its libraries lists CUDA, and makes a session without."""
+    listed = ["CUDAExecutionProvider", "CPUExecutionProvider"]
+    monkeypatch.setattr(depth_noise.ort, "get_available_providers", lambda: listed)
+    with pytest.raises(UserError, match="device is cuda, which onnxruntime could not load"):
+        DepthGenerator(FILE, device="cuda")
 
 
 def test_neither_jax_nor_pytorch_is_loaded():

@@ -42,7 +42,7 @@ from deploy_support import (
     describe,
     write_policy,
 )
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 
 SIZE = (45, 80)
 

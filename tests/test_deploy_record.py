@@ -18,8 +18,9 @@ from deploy.devices.options import SessionOptions
 from deploy.interfaces import CameraError, Frame
 from deploy_support import KinematicRobot, constant_bias, describe, write_policy
 from evaluation.report import deployments
-from sensors.recordings import recording as recording_files
-from sensors.recordings.recording import Recording, RecordingWriter, find_recordings
+from sensors.recordings import writer as writing
+from sensors.recordings.recording import Recording, find_recordings
+from sensors.recordings.writer import RecordingWriter
 
 DEPTH_MM = np.full((180, 320), 700, np.uint16)
 DEPTH_MM[:20] = 0
@@ -189,14 +190,14 @@ def test_a_disk_that_takes_no_frames_stops_nothing(run, monkeypatch):
     def full(self, rgb, depth_mm):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("sensors.recordings.recording.RecordingWriter.add", full)
+    monkeypatch.setattr("sensors.recordings.writer.RecordingWriter.add", full)
     report, folder = run()
     kept = json.loads((folder / "report.json").read_text())
     assert report.steps == 5 and "No space left" in kept["frames_lost"] and not (folder / "depth").exists()
 
 
 def test_a_disk_that_is_full_after_three_frames_keeps_them(run, monkeypatch):
-    write, files = recording_files._write, []
+    write, files = writing._write, []
 
     def filling(path, data, sync=False):
         files.append(path)
@@ -205,7 +206,7 @@ def test_a_disk_that_is_full_after_three_frames_keeps_them(run, monkeypatch):
             raise OSError(28, "No space left on device")
         write(path, data, sync)
 
-    monkeypatch.setattr(recording_files, "_write", filling)
+    monkeypatch.setattr(writing, "_write", filling)
     report, folder = run(seconds=0.8)
     kept = json.loads((folder / "report.json").read_text())
     rows = [json.loads(line) for line in (folder / "steps.jsonl").read_text().splitlines()]

@@ -153,6 +153,29 @@ def test_what_an_earlier_parent_led_to_is_left_out(tmp_path):
     assert rows["deploy"] == "left out: made of export, which is left out"
 
 
+def test_a_score_of_an_earlier_generator_is_said_to_be_left_out(tmp_path):
+    ddg = artifacts.finish(tmp_path / "ddg", "ddg", CONFIG, seconds=1, metrics={"loss": 0.02})
+    artifacts.finish(tmp_path / "score", "score", CONFIG, seconds=1, metrics={}, parents=[ddg])
+    artifacts.write_manifest(tmp_path / "ddg", replace(ddg.manifest, metrics={"loss": 0.01}))
+    rows = {row[0]: row[3] for row in summary_rows(build_report(tmp_path))}
+    assert rows["score"] == "left out: made of another ddg than is here"
+
+
+def test_a_generator_of_recordings_from_elsewhere_is_not_left_out_with_the_run_s(tmp_path):
+    teacher = artifacts.finish(tmp_path / "teacher", "teacher", CONFIG, seconds=1, metrics=METRICS["teacher"])
+    artifacts.finish(tmp_path / "record", "record", CONFIG, seconds=1, metrics={}, parents=[teacher])
+    artifacts.finish(tmp_path / "ddg", "ddg", CONFIG, seconds=1, metrics={"loss": 0.02})  # ddg fit --data
+    artifacts.write_manifest(tmp_path / "teacher", replace(teacher.manifest, metrics={}))
+    assert build_report(tmp_path)["outdated"] == {"record": "teacher"}
+
+
+def test_names_of_folders_are_no_markup(tmp_path, capsys):
+    config = replace(CONFIG, student=StudentConfig(init_from="runs/old[v2]:cat:[/x]"))
+    artifacts.finish(tmp_path / "student", "student", config, seconds=1, metrics={})
+    print_summary(build_report(tmp_path))
+    assert "runs/old[v2]:cat:[/x]" in capsys.readouterr().out.replace("\n", "")
+
+
 def test_a_machine_too_slow_for_the_real_clock_is_said(tmp_path):
     """Where a simulated camera's picture takes longer than frames may be old, no step runs the network."""
     nothing = {"p50": None, "p99": None}

@@ -48,7 +48,7 @@ from evaluation.depth_score.figures import draw_efficiency
 from evaluation.report.stage import write_report
 from job_support import make_job
 from sensors.inpainting import inpainted
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 from weights_support import depth_anything_v2_small
 
 ROOT = Path(__file__).parents[1]

@@ -22,7 +22,7 @@ from evaluation.depth_score import table as score_table
 from evaluation.depth_score.domains import FLOOR, RAW, Methods
 from evaluation.depth_score.resampling import Sample
 from foundation import store
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 
 QUIET = Progress(quiet=True)
 

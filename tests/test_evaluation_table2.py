@@ -389,6 +389,15 @@ def test_the_paper_s_generator_is_taken_from_elsewhere_and_stays_the_same(tmp_pa
         planned("--paper-generator", another)
     with pytest.raises(UserError, match=r"--paper-generator is \S+student, which is of stage 'student'"):
         planned("--paper-generator", "pretrained/student")
+    begun = command(
+        "--rows", "paper_ddg", "--out", str(tmp_path / "begun"), "--paper-generator", paper
+    ).planned()
+    artifacts.begin(tmp_path / "begun" / "paper" / "ddg", "ddg", begun.row_config(ROWS["paper_ddg"]))
+    (tmp_path / "begun" / "paper" / "ddg" / "checkpoint").touch()
+    with pytest.raises(
+        UserError, match=r"paper/ddg was begun with another .*ddg.init_from is '\S+paper' there"
+    ):
+        command("--rows", "paper_ddg", "--out", str(tmp_path / "begun"), "--resume").planned()
     fitted("study/paper", init_from=paper)  # as the study leaves it when it has taken that one
     assert planned("--paper-generator", paper, "--resume") == paper
     with pytest.raises(

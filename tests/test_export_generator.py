@@ -29,7 +29,7 @@ from export import prior_graph
 from export.builder import GraphBuilder, tensor
 from export.generator_graph import build_model
 from export.parity import open_session
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 from sensors.statistics import holes
 
 SMALL = DDGConfig(
@@ -188,6 +188,30 @@ def test_a_generator_from_elsewhere_is_not_the_rig_s(tmp_path, origin, licence):
     assert described.licence == licence and bool(described.camera) == (origin == "trained")
 
 
+@pytest.mark.parametrize(
+    ("sizes", "fx_px", "window"),
+    [
+        ([(48, 64)], [40.0], (48, 64, 40.0)),
+        ([(48, 96)], [40.0], (48, 64, 40.0)),  # the generator is 4:3, and sees the middle
+        ([(96, 64)], [40.0], (48, 64, 40.0)),
+        ([(48, 64), (48, 64)], [40.0, 41.0], (48, 64, None)),
+        ([(48, 96), (48, 64)], [40.0, 40.0], (48, 64, 40.0)),
+    ],
+)
+def test_optics_in_the_file_are_those_of_what_the_generator_sees(tmp_path, sizes, fx_px, window):
+    finished(made(CAMERA), tmp_path / "ddg")
+    config = replace(CAMERA, depth=replace(CAMERA.depth, height_px=24, width_px=32))
+    for number, (size, fx) in enumerate(zip(sizes, fx_px, strict=True)):
+        with RecordingWriter(tmp_path / "all" / str(number), {"fx_px": fx}) as writer:
+            depth_mm = np.full(size, 9000, np.uint16)
+            rows, columns = (size[0] - 48) // 2, (size[1] - 64) // 2
+            depth_mm[rows : rows + 48, columns : columns + 64] = 1000
+            writer.add(np.zeros((*size, 3), np.uint8), depth_mm)
+    camera = exported.describe(artifacts.read_artifact(tmp_path / "ddg"), config, tmp_path / "all").camera
+    assert (camera["height_px"], camera["width_px"], camera["fx_px"]) == window
+    assert camera["near_m"] == camera["far_m"] == 1.0
+
+
 def test_the_file_names_the_recordings_camera(tmp_path):
     generator = made(CAMERA)
     finished(generator, tmp_path / "ddg")
@@ -202,10 +226,10 @@ def test_the_file_names_the_recordings_camera(tmp_path):
     assert (camera["name"], camera["width_px"], camera["height_px"], camera["fx_px"]) == (
         "D435",
         64,
-        48,
+        36,  # of 48: the generator is 16:9
         40.0,
     )
-    assert 0.7 <= camera["near_m"] < 0.75 and 1.35 < camera["far_m"] <= 1.5
+    assert 0.8 <= camera["near_m"] < 0.85 and 1.25 < camera["far_m"] <= 1.4
     assert exported.describe(artifact, CAMERA, room, "CC0").licence == "CC0"
     assert exported.describe(artifact, CAMERA).camera == {}  # not a run's own recordings
     assert described.planes(3) == 1 + 2 * 3 and described.stochastic

@@ -245,6 +245,12 @@ def test_metric_weights_lie_beside_the_relative_ones_and_state_their_range(tmp_p
     assert store.read_manifest(directory).licence == catalog.METRIC_NOTE
 
 
+def test_weights_of_depth_anything_s_first_version_are_refused(tmp_path):
+    with pytest.raises(UserError, match=r"_vits14.pth looks like .* first version.*: take depth_any"):
+        store._check_version(Path("depth_anything_vits14.pth"), "depth_anything_v2_small")
+    store._check_version(Path("depth_anything_v2_vits.pth"), "depth_anything_v2_small")
+
+
 def test_metric_weights_of_the_video_network_are_refused(tmp_path):
     shapes = {key: target.shape for key, target in convert.targets("video_depth_anything_small").items()}
     file = tmp_path / "metric_video_depth_anything_vits.safetensors"

@@ -17,7 +17,7 @@ from ddgrasp.presets import PRESETS
 from demos import memory as demos_memory
 from learning import memory
 from learning.memory import Need, check, compiled_bytes, traced_bytes
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 from student_jax import memory as student_memory
 
 MB = 2**20

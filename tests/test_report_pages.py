@@ -160,3 +160,17 @@ def test_the_same_trials_are_compared_in_pairs(trials, tmp_path, capsys):
     assert last[-2:] == ("3 won, 1 lost of 4, p 0.62", "other trials")
     with pytest.raises(UserError, match="no finished trials to set beside"):
         parse("report", [str(trials), str(tmp_path)]).run()
+
+
+def test_a_film_too_wide_for_webp_is_kept_as_it_is(tmp_path):
+    folder = _trials(tmp_path / "long", [("cube", True)])
+    wide = np.zeros((4, 16_384, 3), np.uint8)
+    assert cv2.imwrite(str(folder / "cube-0-success.png"), wide)
+    page = trials_page.write(trials_page.find(folder)).read_text()
+    assert "data:image/png" in page and "data:image/webp" not in page
+
+
+def test_a_dollar_in_a_folder_s_name_is_no_formula(tmp_path):
+    folders = [_trials(tmp_path / name, [("cube", True)]) for name in ("a$^$b", "c")]
+    page = trials_page.write_comparison([trials_page.find(folder) for folder in folders]).read_text()
+    assert "a$^$b" in page

@@ -12,7 +12,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from evaluation import camera_comparison as compare
 from rig.scenes import StandingScene, standing_scenes
-from sensors.recordings.recording import RecordingWriter
+from sensors.recordings.writer import RecordingWriter
 from sensors.statistics import curves, figures
 from sensors.statistics.curves import Stream
 

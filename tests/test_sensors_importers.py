@@ -1,6 +1,8 @@
 """Recordings from elsewhere: what is kept, what is named and left out, what is refused."""
 
 import json
+import shutil
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from ddgrasp.contract import CONTRACT_VERSION
 from ddgrasp.errors import UserError
 from realsense_support import full_after
 from sensors.recordings import importers
-from sensors.recordings import recording as recording_files
+from sensors.recordings import writer as writing
 from sensors.recordings.recording import Recording
 
 SIZE = (24, 32)
@@ -62,7 +64,9 @@ def test_colour_of_a_lens_of_its_own_is_called_so(tmp_path):
 
 
 def test_bad_frames_are_named_and_counted(tmp_path, capsys):
-    root = make_folder(tmp_path / "desk", frames=6)
+    root = make_folder(tmp_path / "desk", frames=7)
+    (root / "depth" / "0006_depth.png").unlink()
+    (root / "depth" / "0006_depth.png").mkdir()
     cv2.imwrite(str(root / "depth" / "0001_depth.png"), depth_mm(1, (30, 40)))
     cv2.imwrite(str(root / "depth" / "0002_depth.png"), np.zeros(SIZE, np.uint16))
     (root / "rgb" / "0003_rgb.png").unlink()
@@ -76,9 +80,24 @@ def test_bad_frames_are_named_and_counted(tmp_path, capsys):
         ("0003", "colour is missing"),
         ("0004", "depth cannot be read"),
         ("0005", "depth is uint8"),
+        ("0006", "depth cannot be read"),
     ):
         assert any(name in line and reason in line for line in shown.splitlines()), name
-    assert shown.splitlines()[-1] == "1 recordings with 1 frames imported; left out: 5 frames, 0 recordings"
+    assert shown.splitlines()[-1] == "1 recordings with 1 frames imported; left out: 6 frames, 0 recordings"
+
+
+def test_a_telephone_that_was_held_upright_turns_no_colour(tmp_path):
+    root = make_folder(tmp_path / "desk", frames=1)
+    (root / "rgb" / "0000_rgb.png").unlink()
+    jpeg = cv2.imencode(".jpg", np.zeros((*SIZE, 3), np.uint8))[1].tobytes()
+    turned = b"Exif\0\0II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)  # orientation 6
+    exif = b"\xff\xe1" + struct.pack(">H", len(turned) + 2) + turned
+    (root / "rgb" / "0000_rgb.jpg").write_bytes(jpeg[:2] + exif + jpeg[2:])
+    assert cv2.imread(str(root / "rgb" / "0000_rgb.jpg")).shape[:2] == SIZE[::-1]
+    run(root, "--out", tmp_path / "out")
+    shutil.copy(root / "rgb" / "0000_rgb.jpg", tmp_path / "out" / "desk" / "color" / "000000.jpg")
+    recording = Recording.open(tmp_path / "out" / "desk")
+    assert recording.color_aligned and recording.rgb(0).shape[:2] == SIZE
 
 
 @pytest.mark.parametrize(("lost", "consecutive"), [((0, 1), True), ((5,), True), ((2,), False)])
@@ -242,7 +261,7 @@ def test_arrays_that_are_no_numbers_are_left_out(tmp_path, capsys):
 
 def test_a_full_disk_leaves_nothing_of_what_can_be_imported_again(tmp_path, monkeypatch):
     root = make_folder(tmp_path / "desk")
-    monkeypatch.setattr(recording_files, "_write", full_after(recording_files._write, files=4))
+    monkeypatch.setattr(writing, "_write", full_after(writing._write, files=4))
     with pytest.raises(OSError, match="No space left"):
         run(root, "--out", tmp_path / "out")
     assert list((tmp_path / "out").iterdir()) == []

@@ -21,7 +21,7 @@ from realsense_support import (
     depth_mm,
     full_after,
 )
-from sensors.recordings import recording as recording_files
+from sensors.recordings import writer as writing
 from sensors.recordings.realsense_live import Pace, Take, frame_count
 from sensors.recordings.recording import Recording, check_fields
 
@@ -176,7 +176,7 @@ def test_a_camera_that_stops_keeps_what_it_gave(tmp_path, monkeypatch, capsys):
 
 def test_a_full_disk_ends_the_take_and_keeps_it(tmp_path, monkeypatch, capsys):
     library = scripted(monkeypatch, [*range(1, 20), *range(28, 40)])  # 22 and 25 are lost before the last
-    monkeypatch.setattr(recording_files, "_write", full_after(recording_files._write, files=5))
+    monkeypatch.setattr(writing, "_write", full_after(writing._write, files=5))
     with pytest.raises(UserError, match=r"could not be written \(No space left on device\).*kept") as error:
         record(tmp_path, "--frames", 100)
     assert "USB" not in str(error.value) and library.stopped
@@ -189,7 +189,7 @@ def test_a_full_disk_ends_the_take_and_keeps_it(tmp_path, monkeypatch, capsys):
 
 def test_a_disk_that_takes_no_frame_leaves_nothing(tmp_path, monkeypatch):
     scripted(monkeypatch, count(1))
-    monkeypatch.setattr(recording_files, "_write", full_after(recording_files._write, files=0))
+    monkeypatch.setattr(writing, "_write", full_after(writing._write, files=0))
     with pytest.raises(OSError, match="No space left"):
         record(tmp_path, "--frames", 100)
     assert list(tmp_path.iterdir()) == []

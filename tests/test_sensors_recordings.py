@@ -12,8 +12,9 @@ from app import pipeline
 from app.commands.ddg import DDGFit
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
-from sensors.recordings import recording as recording_module
-from sensors.recordings.recording import Recording, RecordingWriter, contents, find_recordings
+from sensors.recordings import writer as writer_module
+from sensors.recordings.recording import Recording, contents, find_recordings
+from sensors.recordings.writer import RecordingWriter
 
 REAL = Path(__file__).parents[2] / "shared" / "real_depth"
 
@@ -107,7 +108,7 @@ def test_a_recording_that_cannot_be_ended_leaves_what_was_there_and_nothing_else
 
     with pytest.raises(OSError, match="No space left"), RecordingWriter(path, {}) as writer:
         writer.add(*_frame(0))
-        monkeypatch.setattr(recording_module, step, fail)
+        monkeypatch.setattr(writer_module, step, fail)
     assert [p.name for p in tmp_path.iterdir()] == ["a"] and len(Recording.open(path)) == 2
 
 

@@ -155,7 +155,7 @@ def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         shown.add_column(title, overflow="fold")
     for row in rows:
         shown.add_row(*row)
-    Console().print(shown)
+    Console(markup=False, emoji=False).print(shown)  # names of folders are no markup
 
 
 @dataclass(frozen=True)

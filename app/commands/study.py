@@ -104,6 +104,9 @@ class StudyTable2(FromPreset):
         names = tuple(name for name in names if name not in left_out)
         for name in names:
             _check_row(config, name, shared, self.paper_generator)
+            if rows.ROWS[name].paper_generator:
+                begun_by = rows.row_config(config, rows.ROWS[name], self.paper_generator)
+                artifacts.check_place(self.out / results.PAPER / "ddg", "ddg", begun_by)
         check_devices(config, shared)
         return Study(config, self.out, names, series, self.workers, left_out, self.paper_generator)
 

@@ -45,9 +45,9 @@ def print_result(directory: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = Console(markup=False, emoji=False)  # names of folders are no markup
     if not console.is_terminal:
-        console = Console(width=220)
+        console = Console(markup=False, emoji=False, width=220)
     for title, rows in _tables(artifacts.read_manifest(directory).metrics).items():
         drawn = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False)
         for column in rows[0]:

@@ -40,7 +40,8 @@ def _draw_bars(axes: Axes, rows: Rows) -> None:
     whiskers = np.abs(np.array([[s["low"], s["high"]] for s in total]).T - rates)
     places = np.arange(len(rows))
     axes.barh(places, 100 * rates, xerr=100 * whiskers, height=0.6, color="#7a9cc6", capsize=3)
-    axes.set_yticks(places, list(rows), fontsize=8)
+    names = [name.replace("$", r"\$") for name in rows]  # matplotlib's sign of a formula
+    axes.set_yticks(places, names, fontsize=8)
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlim(0, 100)
     axes.set_xlabel("%", fontsize=8)

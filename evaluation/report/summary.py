@@ -96,7 +96,7 @@ def _outdated(found: Mapping[str, Artifact]) -> dict[str, str]:
     for name, artifact in found.items():  # parents come first
         for parent in get_stage(name).parents:
             made_of = artifact.manifest.parents.get(parent)
-            if parent in outdated or (made_of and parent in found and found[parent].hash != made_of):
+            if made_of and (parent in outdated or (parent in found and found[parent].hash != made_of)):
                 outdated[name] = parent
     return outdated
 
@@ -118,7 +118,8 @@ def with_intervals(value: Any) -> Any:
 def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     """(stage, made or loaded, time, result) per line; the last line is the exported student in the rig."""
     rows = []
-    asked_for = [stage for stage in ON_REQUEST if stage.name in report["stages"]]
+    there = {*report["stages"], *report.get("outdated", {})}
+    asked_for = [stage for stage in ON_REQUEST if stage.name in there]
     for stage in (*STAGES[:-1], *asked_for, STAGES[-1]):
         entry = report["stages"].get(stage.name)
         if entry is None:
@@ -173,9 +174,9 @@ def print_summary(report: Mapping[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = Console(markup=False, emoji=False)  # names of folders are no markup
     if not console.is_terminal:
-        console = Console(width=140)
+        console = Console(markup=False, emoji=False, width=140)
     if warning := trial_run(report):
         console.print(warning, style="bold", highlight=False)
     judged = targets(report)

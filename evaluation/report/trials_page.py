@@ -21,6 +21,8 @@ _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
 _KINDS = ("rig", "row")
 """The header of a log has one of them: of `deploy trials`, or of `study causes`."""
 _QUALITY = 75
+_WEBP_MOST_PX = 16_383
+"""A side of a WebP picture (RFC 9649: 14 bits)."""
 """The films' WebP takes a sixth of the PNG files that they are made from."""
 
 
@@ -177,5 +179,7 @@ def _film(strip: Path) -> str:
     picture = cv2.imread(str(strip))
     if picture is None:
         return f"<p>{escape(strip.name)} cannot be shown: it is no whole PNG.</p>"
+    if max(picture.shape) > _WEBP_MOST_PX:
+        return film(strip.read_bytes(), strip.stem)
     _, data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
     return film(data.tobytes(), strip.stem, "webp")

@@ -19,14 +19,15 @@ from ddgrasp.contract import DEPTH_UNIT_M
 from ddgrasp.depth import from_counts
 from ddgrasp.errors import UserError
 from sensors.recordings.recording import (
+    COLOR_AS_STORED,
     FARTHEST_MEDIAN_M,
     META_FILE,
     NEAREST_MEDIAN_M,
     UNIT_CHECK_FRAMES,
-    RecordingWriter,
     check_fields,
 )
 from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, in_time
+from sensors.recordings.writer import RecordingWriter
 
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 _COLOR_NAMES = ", ".join(f"{name}/" for name in COLOR_FOLDERS)
@@ -294,12 +295,21 @@ def _read_depth(file: Path) -> np.ndarray | None:
             return np.load(file, allow_pickle=False)
         except (ValueError, EOFError, OSError):
             return None
-    return cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED) if file.stat().st_size else None
+    return _read_picture(file, cv2.IMREAD_UNCHANGED)
 
 
 def _read_rgb(file: Path) -> np.ndarray | None:
-    bgr = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR) if file.stat().st_size else None
+    bgr = _read_picture(file, COLOR_AS_STORED)
     return None if bgr is None else cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def _read_picture(file: Path, how: int) -> np.ndarray | None:
+    """None of what cannot be read: a folder of that name, a bad disk, no permission, no picture."""
+    try:
+        data = np.fromfile(file, np.uint8)
+    except OSError:
+        return None
+    return cv2.imdecode(data, how) if data.size else None
 
 
 # --- anything --------------------------------------------------------------------------------------

@@ -1,0 +1,132 @@
+"""Writing a recording (`sensors.recordings.recording`) whole or not at all."""
+
+import json
+import os
+import shutil
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ddgrasp.alone import alone_in
+from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
+from ddgrasp.errors import UserError
+from ddgrasp.files import replace_folder
+from sensors.recordings.recording import META_FILE
+
+JPEG_QUALITY = 95
+PNG_COMPRESSION = 3
+
+
+class RecordingWriter:
+    """Writes one recording; it appears under its name only when complete.
+
+    Use as a context manager: frames go to a hidden folder beside the target, `meta.json` is
+    written last, then the folder is renamed. Leaving by an exception (or Ctrl-C), or failing at the end,
+    removes the hidden folder; a previous recording of that name stays as it was.
+
+    Raises UserError on entering if another one is at work under that name.
+    """
+
+    def __init__(self, path: str | os.PathLike, meta: dict[str, Any]):
+        self.path = Path(path)
+        self.meta = dict(meta)
+        self._temporary = self.path.parent / f".{self.path.name}.partial"
+        self._alone = ExitStack()
+        self._size: tuple[int, int] | None = None
+        self._frames = 0
+        self._invalid = 0.0
+
+    def __enter__(self) -> "RecordingWriter":
+        self._temporary.mkdir(parents=True, exist_ok=True)
+        try:
+            self._alone.enter_context(alone_in(self._temporary))
+        except UserError:
+            raise UserError(
+                f"{self.path} is being recorded by another process: choose another name."
+            ) from None
+        for folder in ("color", "depth"):  # what a killed process has left goes
+            shutil.rmtree(self._temporary / folder, ignore_errors=True)
+            (self._temporary / folder).mkdir()
+        return self
+
+    def __exit__(self, kind, value, traceback) -> None:
+        with self._alone:
+            try:
+                if kind is None:
+                    self._finish()
+            except BaseException:
+                shutil.rmtree(self._temporary, ignore_errors=True)
+                raise
+            if kind is not None:
+                shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def add(self, rgb: np.ndarray, depth_mm: np.ndarray) -> None:
+        """Append a frame.
+
+        Args:
+            rgb: (h, w, 3) uint8.
+            depth_mm: (H, W) uint16 millimetres, 0 = invalid.
+
+        Raises:
+            UserError: another type or shape, or another size of depth than the frames before.
+            OSError: a full disk; the frames before are as they were.
+        """
+        if depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
+            raise UserError(
+                f"depth of a recording is (H, W) uint16 millimetres, got {depth_mm.dtype} "
+                f"{depth_mm.shape}; convert metres with np.rint(depth_m * 1000).astype(np.uint16)."
+            )
+        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+            raise UserError(f"colour of a recording is (h, w, 3) uint8, got {rgb.dtype} {rgb.shape}.")
+        if self._size is not None and depth_mm.shape != self._size:
+            raise UserError(f"a recording has one depth size: {self._size}, got {depth_mm.shape}.")
+        self._size = depth_mm.shape
+        name, bgr = f"{self._frames:06d}", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+        files = {
+            f"color/{name}.jpg": _encode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]),
+            f"depth/{name}.png": _encode(".png", depth_mm, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]),
+        }
+        try:
+            for file, data in files.items():
+                _write(self._temporary / file, data)
+        except OSError:
+            for file in files:
+                (self._temporary / file).unlink(missing_ok=True)
+            raise
+        self._frames += 1
+        self._invalid += float(np.mean(depth_mm == 0))
+
+    def _finish(self) -> None:
+        if self._size is None:
+            raise UserError(f"{self.path}: a recording needs at least one frame.")
+        meta = {
+            "frames": self._frames,
+            "width": self._size[1],
+            "height": self._size[0],
+            "depth_unit_m": DEPTH_UNIT_M,
+            "invalid_value": 0,
+            "contract_version": CONTRACT_VERSION,
+            "invalid_fraction_mean": round(self._invalid / self._frames, 4),
+        }
+        text = json.dumps({**self.meta, **meta}, indent=1) + "\n"
+        _write(self._temporary / META_FILE, text.encode(), sync=True)
+        replace_folder(self._temporary, self.path)
+
+
+def _encode(extension: str, image: np.ndarray, options: list[int]) -> bytes:
+    ok, data = cv2.imencode(extension, image, options)
+    if not ok:
+        raise RuntimeError(f"OpenCV could not encode a {image.dtype} {image.shape} image as {extension}")
+    return data.tobytes()
+
+
+def _write(path: Path, data: bytes, sync: bool = False) -> None:
+    # Not cv2.imwrite: it reports a full disk as False, without saying why.
+    with open(path, "wb") as file:
+        file.write(data)
+        if sync:
+            file.flush()
+            os.fsync(file.fileno())
