@@ -43,8 +43,9 @@ class ReplayCamera:
 
         recording = Recording.open(path)
         hz = recording.meta.get("hz")
-        faster = isinstance(hz, int | float) and math.isfinite(hz) and hz > contract.CONTROL_HZ
-        return cls(recording, clock, 1.0 / hz if faster else contract.CONTROL_DT_S)
+        if not isinstance(hz, int | float) or not math.isfinite(hz):
+            return cls(recording, clock)
+        return cls(recording, clock, 1.0 / max(hz, contract.CONTROL_HZ))
 
     def __len__(self) -> int:
         return len(self._recording)
