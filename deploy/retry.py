@@ -1,4 +1,4 @@
-"""What a hand that stands still or closed on nothing does: it closes, lifts what it has, or looks again.
+"""What a hand that stands still or closes on nothing does: it closes, lifts what it has, or looks again.
 
 A policy sees three frames, 0.3 s. Nothing tells it that it has stood for a second around something taller
 than it believes, waiting to get lower, or that it closes beside the object again and again, where its own
@@ -25,6 +25,9 @@ EMPTY_WIDTH_M = 0.006
 """A closed hand narrower than this holds nothing."""
 EMPTY_STEPS = 2
 """Control steps in a row for which it is to be so."""
+VAIN_CLOSINGS, VAIN_WIDTH_M = 2, 0.050
+"""A hand that has been closed so often, to less than this, and opened again where it was has found nothing: a
+policy opens again before the fingers meet, so that they never are as close as `EMPTY_WIDTH_M`."""
 STILL_STEPS, STILL_M = 10, 0.030
 """A hand stands still that has moved by less within so many control steps. One that has a finger on what it
 is to grasp pushes it away by 10 to 25 mm in them; coming down slowly is 60 mm."""
@@ -107,11 +110,11 @@ class _Now:
 class Retry:
     """Acts instead of the policy for a while; call it with the robot's state in every control step.
 
-    A hand that is empty goes up with open fingers, then towards the start pose. One that is low and open and
-    stands still closes once; if it comes to stand still again it goes up. One that has a finger on what it is
-    to grasp steps aside (`deploy.aside`) and closes. One that has closed on something, or stays low with
-    something in it, lifts it, straight up, then to where objects are lifted to. One that has lifted something
-    stays there for as long as it has it.
+    A hand that is empty, or has closed and opened again and again, goes up with open fingers, then towards
+    the start pose. One that is low and open and stands still closes once; if it comes to stand still again it
+    goes up. One that has a finger on what it is to grasp steps aside (`deploy.aside`) and closes. One that
+    has closed on something, or stays low with something in it, lifts it, straight up, then to where objects
+    are lifted to. One that has lifted something stays there for as long as it has it.
 
     Each of these but the last is a generator that yields an action (8,) for every control step, `self._now`;
     `self._doing` is the one that acts. The one that ends says so before its last action (`_end`), and what
@@ -172,9 +175,18 @@ class Retry:
         grip_m = grip_position(q_rad)
         self._places.append(grip_m)
         self._widths.append(float(state[STATE.width][0]))
+        self._count_closings(float(grip_m[2]), closed)
         pressed_m = pressed_at(q_rad, self._tared(grip_m, felt_nm, closed))
         landed = self._landing(float(grip_m[2]), pressed_m)
         return _Now(state, q_rad, grip_m, met, closed, pressed_m, landed)
+
+    def _count_closings(self, height_m: float, closed: bool) -> None:
+        """Closings of a low hand that ended in opening it again."""
+        if height_m > LOW_M:
+            self._vain_closings = 0
+        elif self._was_closed and not closed and self._widths[-1] < VAIN_WIDTH_M:
+            self._vain_closings += 1
+        self._was_closed = closed
 
     def _tared(
         self, grip_m: Float[np.ndarray, "3"], felt_nm: Float[np.ndarray, "7"] | None, closed: bool
@@ -208,6 +220,8 @@ class Retry:
         widths = [*self._widths]
         if len(widths) >= EMPTY_STEPS and max(widths[-EMPTY_STEPS:]) < EMPTY_WIDTH_M:
             return self._go_up(f"the hand closed to {1e3 * widths[-1]:.1f} mm, on nothing")
+        if self._vain_closings >= VAIN_CLOSINGS:
+            return self._go_up(f"the hand has closed and opened again {VAIN_CLOSINGS} times")
         if len(widths) <= STILL_STEPS:
             return None
         if self._keeps():
@@ -278,6 +292,7 @@ class Retry:
         """What was until now does not count; `then` acts from the next control step on."""
         self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
         self._widths: deque[float] = deque(maxlen=STILL_STEPS + 1)
+        self._vain_closings, self._was_closed = 0, False
         self._landing.forget()
         self._doing = then
 

@@ -91,6 +91,40 @@ def test_a_hand_that_closed_on_nothing_opens_and_goes_up_for_a_while_at_most():
     assert told(retry, LOW, OPEN, 1) == [None], "an arm that cannot get up does not try for ever"
 
 
+def close_and_open(retry: Retry, q_rad: np.ndarray, narrowest_m: float) -> list[np.ndarray | None]:
+    """A closing that the policy takes back, from open to open, a step each 10 mm."""
+    widths = [*np.arange(OPEN, narrowest_m, -0.01), narrowest_m, *np.arange(narrowest_m, OPEN, 0.01)]
+    told_closed = [0 < i <= widths.index(narrowest_m) for i in range(len(widths))]
+    pushed = q_rad + np.array([0.06, *[0] * 6])  # it moves: it does not stand still
+    return [
+        retry(state(pushed if i % 2 else q_rad, width), closed=closed)
+        for i, (width, closed) in enumerate(zip(widths, told_closed, strict=True))
+    ]
+
+
+def test_a_hand_that_closes_and_opens_again_in_one_place_goes_up_the_second_time():
+    retry = Retry()
+    assert not any(action is not None for action in close_and_open(retry, LOW, 0.015))
+    begun = [action is not None for action in close_and_open(retry, LOW, 0.015)]
+    assert begun.index(True) == 1 + np.argmin([*np.arange(OPEN, 0.015, -0.01), 0.015]), "as it opens"
+    way_up = told(retry, LOW, OPEN, 3)
+    assert all(a is not None and not closes(a) and a[ACTION.arm].any() for a in way_up)
+
+
+@pytest.mark.parametrize("narrowest_m", [0.055, 0.065])
+def test_a_hand_that_lets_go_of_something_wide_has_not_closed_on_nothing(narrowest_m):
+    retry = Retry()
+    for _ in range(4):
+        assert not any(action is not None for action in close_and_open(retry, LOW, narrowest_m))
+
+
+def test_closings_before_the_hand_went_up_do_not_count():
+    retry = Retry()
+    for _ in range(4):
+        assert not any(action is not None for action in close_and_open(retry, LOW, 0.015))
+        told(retry, HOME, OPEN, 1)
+
+
 def test_a_hand_that_has_held_something_for_a_while_lifts_it_and_keeps_it():
     aside = LOW + np.array([0.4, 0.25, 0, 0, 0, 0, 0])
     retry, q_rad = Retry(), aside.copy()
