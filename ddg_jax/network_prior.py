@@ -14,6 +14,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from ddg_jax.inverse_depth import invert, normalise
 from ddgrasp.config import DDGConfig
+from ddgrasp.depth import window
 from ddgrasp.errors import UserError
 from foundation import catalog, store
 from foundation.long_video import fit_scale_shift
@@ -107,12 +108,10 @@ def at_size(image: Float[np.ndarray, "H W"], size: tuple[int, int]) -> Float[np.
     """(H, W) -> `size`, averaged after a centred crop to its aspect ratio: the part of the scene that depth
     resized by `ddgrasp.depth.crop_nearest` shows.
     """
-    height, width = image.shape
-    scale = min(height / size[0], width / size[1])
-    rows, columns = round(size[0] * scale), round(size[1] * scale)
+    (height, width), (rows, columns) = image.shape, window(image.shape, size)
     top, left = (height - rows) // 2, (width - columns) // 2
     cropped = np.ascontiguousarray(image[top : top + rows, left : left + columns])
-    mode = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
+    mode = cv2.INTER_AREA if rows > size[0] else cv2.INTER_LINEAR
     return cv2.resize(cropped, size[::-1], interpolation=mode)
 
 

@@ -67,13 +67,21 @@ def read(path: Path) -> Config:
     if not isinstance(values, dict) or not isinstance(values.get(_PRESET), str):
         raise UserError(f"--config {path} names no preset: its first line is to be `preset: demo`.")
     try:
-        preset = get_preset(values[_PRESET])
+        preset = _preset(values)
         if (scale := values.get("scale", 1.0)) != 1:
             preset = scaled(replace(preset, scale=scale), scale)
         merged = _merged(to_json(preset), _of_this_release(values), "")
         return config_from_json(merged)
     except UserError as error:
         raise UserError(f"--config {path}: {error}") from None
+
+
+def _preset(values: Mapping[str, Any]) -> Config:
+    """The preset that is named; one that is gone does not matter to a file that has every setting."""
+    name = values[_PRESET]
+    if upgrades.VERSION_FIELD in values and name not in PRESETS:
+        return Config(name)
+    return get_preset(name)
 
 
 def _of_this_release(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -98,6 +98,13 @@ def crop_nearest(
     return maps[..., _under_centres(height, rows, had, n)[:, None], _under_centres(width, columns, had, n)]
 
 
+def window(had: Sequence[int], size: Sequence[int]) -> tuple[int, int]:
+    """(height, width) of the largest centred window of a picture `had` (H, W) that has the shape of `size`:
+    what `crop_nearest` shows of it."""
+    scale = min(had[0] / size[0], had[1] / size[1])
+    return round(scale * size[0]), round(scale * size[1])
+
+
 def at_profile(
     maps: Shaped[np.ndarray, "*b H W"], had: CameraProfile, wanted: CameraProfile
 ) -> Shaped[np.ndarray, "*b {wanted.height_px} {wanted.width_px}"]:

@@ -67,6 +67,7 @@ def replace_folder(folder: Path, path: Path) -> None:
     old = path.with_name(f"{TEMPORARY}{os.getpid()}-old-{path.name}")
     try:
         if path.exists():
+            shutil.rmtree(old, ignore_errors=True)  # a killed process of that number may have left it
             os.replace(path, old)
         os.replace(folder, path)
     except BaseException:

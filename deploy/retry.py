@@ -26,8 +26,9 @@ EMPTY_WIDTH_M = 0.006
 EMPTY_STEPS = 2
 """Control steps in a row for which it is to be so."""
 VAIN_CLOSINGS, VAIN_WIDTH_M = 2, 0.050
-"""A hand that has been closed so often, to less than this, and opened again where it was has found nothing: a
-policy opens again before the fingers meet, so that they never are as close as `EMPTY_WIDTH_M`."""
+"""A hand that has been closed so often, to less than this, and was opened again before its fingers stood on
+something, has found nothing: a policy may open again before they meet, so that they are never as close as
+`EMPTY_WIDTH_M`. In between they are farther apart than this."""
 STILL_STEPS, STILL_M = 10, 0.030
 """A hand stands still that has moved by less within so many control steps. One that has a finger on what it
 is to grasp pushes it away by 10 to 25 mm in them; coming down slowly is 60 mm."""
@@ -181,11 +182,13 @@ class Retry:
         return _Now(state, q_rad, grip_m, met, closed, pressed_m, landed)
 
     def _count_closings(self, height_m: float, closed: bool) -> None:
-        """Closings of a low hand that ended in opening it again."""
+        """Closings of a low hand that were taken back with nothing between the fingers."""
         if height_m > LOW_M:
             self._vain_closings = 0
-        elif self._was_closed and not closed and self._widths[-1] < VAIN_WIDTH_M:
-            self._vain_closings += 1
+        if self._widths[-1] > VAIN_WIDTH_M:
+            self._was_wide = True
+        elif self._was_wide and self._was_closed and not closed and not self._stood():
+            self._vain_closings, self._was_wide = self._vain_closings + 1, False
         self._was_closed = closed
 
     def _tared(
@@ -292,7 +295,7 @@ class Retry:
         """What was until now does not count; `then` acts from the next control step on."""
         self._places: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
         self._widths: deque[float] = deque(maxlen=STILL_STEPS + 1)
-        self._vain_closings, self._was_closed = 0, False
+        self._vain_closings, self._was_closed, self._was_wide = 0, False, True
         self._landing.forget()
         self._doing = then
 
@@ -312,6 +315,12 @@ class Retry:
         same = max(self._widths) - min(self._widths) < SAME_WIDTH_M
         stays = height_m - float(self._places[0][2]) < self._still_m and height_m < LOW_M
         return stays and same and EMPTY_WIDTH_M < self._widths[-1] < _open_m(self._now.closed)
+
+    def _stood(self) -> bool:
+        """Whether the fingers had not moved before this step, and were not shut."""
+        widths_m = [*self._widths][-STAND_STEPS - 1 : -1]
+        stood = len(widths_m) == STAND_STEPS and max(widths_m) - min(widths_m) < SAME_WIDTH_M
+        return stood and widths_m[-1] > EMPTY_WIDTH_M
 
     def _holds(self) -> bool:
         return EMPTY_WIDTH_M < self._widths[-1] < WIDEST_HELD_M

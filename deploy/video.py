@@ -13,7 +13,7 @@ from jaxtyping import UInt8, UInt16
 from ddgrasp import contract
 from ddgrasp.depth import to_millimetres
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_path
+from ddgrasp.files import atomic_path, atomic_write_bytes
 from deploy.interfaces import Depth, Filmed, Simulated
 from deploy.loop import Step
 from rig.film import colored
@@ -178,9 +178,10 @@ class _Animation:
         film.frames = self._pictures
         film.durations = [round(1e3 * contract.CONTROL_DT_S)] * len(self._pictures)
         quality = [cv2.IMWRITE_WEBP_QUALITY, ANIMATION_QUALITY]
-        with atomic_path(self._path) as temporary:
-            if not cv2.imwriteanimation(str(temporary), film, quality):
-                raise UserError("This OpenCV cannot write .webp films: try another ending.")
+        ok, data = cv2.imencodeanimation(ANIMATION, film, quality)
+        if not ok:
+            raise UserError("This OpenCV cannot write .webp films: try another ending.")
+        atomic_write_bytes(self._path, data.tobytes())
 
 
 def depth_picture(depth: Depth) -> UInt8[np.ndarray, "H W 3"]:

@@ -15,7 +15,7 @@ from ddg_jax.sample import Generator, frame_noise, generate
 from ddgrasp import artifacts, generator_metadata
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE, DDGConfig
-from ddgrasp.depth import crop_nearest
+from ddgrasp.depth import crop_nearest, window
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.generator_metadata import GeneratorMetadata
@@ -25,7 +25,7 @@ from export.parity import open_session
 from export.sampler_tables import MOST_STEPS, is_stochastic
 from learning import diffusion
 from mjx_envs.precision import exact
-from sensors.recordings.recording import Recording, find_recordings
+from sensors.recordings.recording import find_recordings
 
 PARITY_SCENES = 4
 MOST_SHARE = 2e-3
@@ -127,6 +127,8 @@ def _rig(artifact: Artifact) -> tuple[dict[str, Any], str, str]:
     if "record" not in artifact.manifest.parents or artifact.manifest.origin == "loaded":
         return {}, "", ""
     config = artifacts.config_from_json(artifact.manifest.config)
+    if config.ddg.init_from:  # distilled here, and fitted elsewhere
+        return {}, "", ""
     profile, stereo = config.world.profile, config.record.stereo
     camera = {
         "name": "the rig's simulated stereo camera, with a D455's optics",
@@ -148,23 +150,17 @@ def _recorded(data: Path, size: tuple[int, int]) -> tuple[dict[str, Any], str, s
     seen = (crop_nearest(r.depth_m(i), size) for r in recordings for i in range(len(r)))
     depth = np.concatenate([frame[::4, ::4].ravel() for frame in seen])
     near, far = np.quantile(depth[depth > 0], RANGE_QUANTILES)
-    height, width = _window(recordings[0], size)
-    optics = {(*_window(recording, size), recording.fx_px) for recording in recordings}
+    optics = [(*window((r.height_px, r.width_px), size), r.fx_px) for r in recordings]
+    height, width, fx_px = optics[0]
     camera = {
         "name": _joined(metas, "sensor"),
         "width_px": width,
         "height_px": height,
-        "fx_px": recordings[0].fx_px if len(optics) == 1 else None,
+        "fx_px": fx_px if len({*optics}) == 1 else None,
         "near_m": round(float(near), 3),
         "far_m": round(float(far), 3),
     }
     return camera, _joined(metas, "licence"), _joined(metas, "source")
-
-
-def _window(recording: Recording, size: tuple[int, int]) -> tuple[int, int]:
-    """(height, width) of the largest centred window of the shape of `size`, pixels of the recording."""
-    scale = min(recording.height_px / size[0], recording.width_px / size[1])
-    return round(scale * size[0]), round(scale * size[1])
 
 
 def _joined(metas: list[dict[str, Any]], key: str) -> str:

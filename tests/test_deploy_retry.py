@@ -23,6 +23,7 @@ from deploy.retry import (
     LIFTING_STEPS,
     LOW_M,
     RETREAT_STEPS,
+    STAND_STEPS,
     STILL_M,
     STILL_STEPS,
     Retry,
@@ -91,10 +92,14 @@ def test_a_hand_that_closed_on_nothing_opens_and_goes_up_for_a_while_at_most():
     assert told(retry, LOW, OPEN, 1) == [None], "an arm that cannot get up does not try for ever"
 
 
-def close_and_open(retry: Retry, q_rad: np.ndarray, narrowest_m: float) -> list[np.ndarray | None]:
-    """A closing that the policy takes back, from open to open, a step each 10 mm."""
-    widths = [*np.arange(OPEN, narrowest_m, -0.01), narrowest_m, *np.arange(narrowest_m, OPEN, 0.01)]
-    told_closed = [0 < i <= widths.index(narrowest_m) for i in range(len(widths))]
+def close_and_open(
+    retry: Retry, q_rad: np.ndarray, narrowest_m: float, stands: int = 0
+) -> list[np.ndarray | None]:
+    """A closing that the policy takes back, from open to open, a step each 10 mm; at its narrowest the hand
+    `stands` for so many steps more."""
+    way_m, there = np.arange(OPEN, narrowest_m, -0.01), [narrowest_m] * (1 + stands)
+    widths = [*way_m, *there, *np.arange(narrowest_m, OPEN, 0.01), OPEN]
+    told_closed = [0 < i < len(way_m) + len(there) for i in range(len(widths))]
     pushed = q_rad + np.array([0.06, *[0] * 6])  # it moves: it does not stand still
     return [
         retry(state(pushed if i % 2 else q_rad, width), closed=closed)
@@ -106,16 +111,41 @@ def test_a_hand_that_closes_and_opens_again_in_one_place_goes_up_the_second_time
     retry = Retry()
     assert not any(action is not None for action in close_and_open(retry, LOW, 0.015))
     begun = [action is not None for action in close_and_open(retry, LOW, 0.015)]
-    assert begun.index(True) == 1 + np.argmin([*np.arange(OPEN, 0.015, -0.01), 0.015]), "as it opens"
+    assert begun.index(True) == 1 + len(np.arange(OPEN, 0.015, -0.01)), "as it opens"
     way_up = told(retry, LOW, OPEN, 3)
     assert all(a is not None and not closes(a) and a[ACTION.arm].any() for a in way_up)
 
 
-@pytest.mark.parametrize("narrowest_m", [0.055, 0.065])
-def test_a_hand_that_lets_go_of_something_wide_has_not_closed_on_nothing(narrowest_m):
+@pytest.mark.parametrize("held_m", [0.025, 0.055, 0.065])
+def test_a_hand_that_lets_go_of_something_has_not_closed_on_nothing(held_m):
     retry = Retry()
     for _ in range(4):
-        assert not any(action is not None for action in close_and_open(retry, LOW, narrowest_m))
+        assert not any(
+            action is not None for action in close_and_open(retry, LOW, held_m, stands=STAND_STEPS)
+        )
+
+
+def test_a_command_that_flickers_does_not_let_go_of_what_is_held():
+    retry = Retry()
+    for step, width in enumerate([0.08, 0.06, 0.04, 0.04, 0.045, 0.04, 0.045, 0.04, 0.045]):
+        pushed = LOW + np.array([0.06 * (step % 2), *[0] * 6])
+        assert retry(state(pushed, width), closed=step in (1, 2, 3, 5, 7)) is None
+
+
+@pytest.mark.parametrize("forget", ["held", "reset"])
+def test_closings_before_the_arm_was_held_do_not_count(forget):
+    retry = Retry()
+    for _ in range(4):
+        assert not any(action is not None for action in close_and_open(retry, LOW, 0.015))
+        getattr(retry, forget)()
+
+
+def test_a_closing_of_the_loop_s_own_is_the_first():
+    retry = Retry()
+    told(retry, LOW, OPEN, STILL_STEPS + CLOSING_STEPS)
+    assert retry(state(LOW, 0.02), closed=True) is None, "the policy's again"
+    assert retry(state(LOW, 0.03), closed=False) is None
+    assert any(action is not None for action in close_and_open(retry, LOW, 0.015))
 
 
 def test_closings_before_the_hand_went_up_do_not_count():

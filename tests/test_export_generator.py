@@ -188,6 +188,15 @@ def test_a_generator_from_elsewhere_is_not_the_rig_s(tmp_path, origin, licence):
     assert described.licence == licence and bool(described.camera) == (origin == "trained")
 
 
+def test_a_generator_from_elsewhere_that_is_distilled_here_is_not_the_rig_s(tmp_path):
+    ddg = replace(SMALL, init_from="pretrained/ddg", sampling=SamplingConfig(sampler="progressive"))
+    config = Config("test", ddg=ddg)
+    record = artifacts.finish(tmp_path / "record", "record", config, seconds=1.0, metrics={})
+    made_here = {"seconds": 1.0, "metrics": {}, "parents": [record], "origin": "trained"}
+    described = exported.describe(artifacts.finish(tmp_path / "ddg", "ddg", config, **made_here), ddg)
+    assert (described.camera, described.licence, described.source) == ({}, "", "")
+
+
 @pytest.mark.parametrize(
     ("sizes", "fx_px", "window"),
     [

@@ -246,9 +246,14 @@ def test_metric_weights_lie_beside_the_relative_ones_and_state_their_range(tmp_p
 
 
 def test_weights_of_depth_anything_s_first_version_are_refused(tmp_path):
-    with pytest.raises(UserError, match=r"_vits14.pth looks like .* first version.*: take depth_any"):
-        store._check_version(Path("depth_anything_vits14.pth"), "depth_anything_v2_small")
-    store._check_version(Path("depth_anything_v2_vits.pth"), "depth_anything_v2_small")
+    shapes = {key: target.shape for key, target in convert.targets("depth_anything_v2_small").items()}
+    file = tmp_path / "depth_anything_vits14.safetensors"  # the same arrays, of which it reads other layers
+    files.write_safetensors(file, {key: np.zeros(shape, np.float32) for key, shape in shapes.items()})
+    with pytest.raises(UserError, match=r"_vits14.safetensors looks like .* first version.*: take depth_any"):
+        store.convert_file(file, tmp_path / "weights")
+    assert not (tmp_path / "weights").exists()
+    file = file.rename(tmp_path / "depth_anything_v2_vits.safetensors")
+    assert store.convert_file(file, tmp_path / "weights").name == "depth_anything_v2_small"
 
 
 def test_metric_weights_of_the_video_network_are_refused(tmp_path):

@@ -1,6 +1,7 @@
 """Recordings: round trip, damaged frames, wrong units, real files."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from app import pipeline
 from app.commands.ddg import DDGFit
 from ddgrasp.errors import UserError
+from ddgrasp.files import TEMPORARY
 from ddgrasp.presets import PRESETS
 from sensors.recordings import writer as writer_module
 from sensors.recordings.recording import Recording, contents, find_recordings
@@ -110,6 +112,32 @@ def test_a_recording_that_cannot_be_ended_leaves_what_was_there_and_nothing_else
         writer.add(*_frame(0))
         monkeypatch.setattr(writer_module, step, fail)
     assert [p.name for p in tmp_path.iterdir()] == ["a"] and len(Recording.open(path)) == 2
+
+
+def test_what_a_killed_process_of_the_same_number_left_costs_no_recording(tmp_path):
+    path = _write(tmp_path / "a", frames=2)
+    old = tmp_path / f"{TEMPORARY}{os.getpid()}-old-a"
+    shutil.copytree(path, old)
+    assert len(Recording.open(_write(path, frames=3))) == 3
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_writer_whose_folder_ends_as_it_waits_for_it_makes_its_own(tmp_path, monkeypatch):
+    first, alone_in = RecordingWriter(tmp_path / "a", {}), writer_module.alone_in
+    first.__enter__()
+    first.add(*_frame(1))
+
+    def late(folder):
+        monkeypatch.setattr(writer_module, "alone_in", alone_in)
+        first.__exit__(None, None, None)
+        return alone_in(folder)
+
+    monkeypatch.setattr(writer_module, "alone_in", late)
+    with RecordingWriter(tmp_path / "a", {}) as second:
+        for number in range(2):
+            second.add(*_frame(number))
+        assert len(Recording.open(tmp_path / "a")) == 1
+    assert len(Recording.open(tmp_path / "a")) == 2
 
 
 def test_what_a_killed_writer_left_is_not_part_of_the_next(tmp_path):

@@ -55,6 +55,16 @@ def test_a_run_comes_back_after_its_preset_has_changed(tmp_path, monkeypatch):
     assert config_file.read(path) == replace(later, seed=3)
 
 
+def test_a_run_comes_back_after_its_preset_is_gone(tmp_path, monkeypatch):
+    path, ran = tmp_path / "config.yaml", _changed()
+    config_file.write(ran, path)
+    monkeypatch.delitem(PRESETS, "debug")
+    assert config_file.read(path) == ran
+    path.write_text("preset: debug\n")
+    with pytest.raises(UserError, match="Unknown preset 'debug'"):
+        config_file.read(path)
+
+
 def test_a_file_of_an_earlier_release_keeps_what_it_did_then(tmp_path):
     path = tmp_path / "config.yaml"
     config_file.write(PRESETS["debug"], path)

@@ -81,9 +81,10 @@ class DeployConfig(Section, name="deploy"):
     execute_steps: Annotated[int, Range(0, 1000)] = 0
     """Actions played from a chunk before the network runs again; 0 takes the exported file's own."""
     retry: bool = True
-    """A hand that has closed on nothing goes up and looks again; one that stands still, low and open, closes;
-    one that feels a finger on something steps aside, closes and lifts; one that has held something for a
-    second lifts it, and stays there (deploy/retry.py). Without it the policy alone acts."""
+    """A hand that has closed on nothing, or twice opened again, goes up and looks again; one that stands
+    still, low and open, closes; one that feels a finger on something steps aside, closes and lifts; one that
+    has held something for a second lifts it, and stays there (deploy/retry.py). Without it the policy alone
+    acts."""
     stale_periods: Annotated[float, Range(0, 1000, above=True)] = 2.0
     """A frame older than this many control periods makes the robot hold position."""
     acceleration_scale: Annotated[float, Range(0, 100, above=True)] = 2.0

@@ -21,9 +21,9 @@ _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
 _KINDS = ("rig", "row")
 """The header of a log has one of them: of `deploy trials`, or of `study causes`."""
 _QUALITY = 75
+"""The films' WebP takes a sixth of the PNG files that they are made from."""
 _WEBP_MOST_PX = 16_383
 """A side of a WebP picture (RFC 9649: 14 bits)."""
-"""The films' WebP takes a sixth of the PNG files that they are made from."""
 
 
 @dataclass(frozen=True)

@@ -40,13 +40,7 @@ class RecordingWriter:
         self._invalid = 0.0
 
     def __enter__(self) -> "RecordingWriter":
-        self._temporary.mkdir(parents=True, exist_ok=True)
-        try:
-            self._alone.enter_context(alone_in(self._temporary))
-        except UserError:
-            raise UserError(
-                f"{self.path} is being recorded by another process: choose another name."
-            ) from None
+        self._lock()
         for folder in ("color", "depth"):  # what a killed process has left goes
             shutil.rmtree(self._temporary / folder, ignore_errors=True)
             (self._temporary / folder).mkdir()
@@ -62,6 +56,23 @@ class RecordingWriter:
                 raise
             if kind is not None:
                 shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def _lock(self) -> None:
+        """Makes the hidden folder and keeps others out of it."""
+        while True:
+            self._temporary.mkdir(parents=True, exist_ok=True)
+            before = self._temporary.stat().st_ino
+            try:
+                self._alone.enter_context(alone_in(self._temporary))
+            except UserError:
+                raise UserError(
+                    f"{self.path} is being recorded by another process: choose another name."
+                ) from None
+            except FileNotFoundError:
+                continue
+            if self._temporary.exists() and self._temporary.stat().st_ino == before:
+                return
+            self._alone.close()  # another one has ended meanwhile, and that was its folder
 
     def add(self, rgb: np.ndarray, depth_mm: np.ndarray) -> None:
         """Append a frame.
