@@ -1,5 +1,6 @@
 """Recordings as training arrays: noisy depth in diffusion space and its prior, at the generator's size."""
 
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from ddg_jax.prior import Prior
 from ddg_jax.representation import encode
 from ddgrasp import artifacts
 from ddgrasp.config import PIECEWISE, PLANES, DDGConfig
-from ddgrasp.depth import crop_nearest
+from ddgrasp.depth import crop_nearest, window
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import memory
@@ -189,13 +190,9 @@ def _read(
 
 
 def _tell_of_crop(recording: Recording, config: DDGConfig, progress: Progress) -> None:
-    height, width, rows, columns = (
-        recording.height_px,
-        recording.width_px,
-        config.depth.height_px,
-        config.depth.width_px,
-    )
-    kept = min(height / rows, width / columns) ** 2 * rows * columns / (height * width)
+    height, width = recording.height_px, recording.width_px
+    rows, columns = config.depth.height_px, config.depth.width_px
+    kept = math.prod(window((height, width), (rows, columns))) / (height * width)
     if kept < LEAST_KEPT:
         progress.note(
             f"{recording.path}: the generator sees {kept:.0%} of each {width}x{height} frame, a centred "
