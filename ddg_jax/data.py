@@ -114,7 +114,7 @@ def _read_all(
 ) -> tuple[dict[int, np.ndarray], list[np.ndarray], int, list[UserError]]:
     """Depth of each recording that can be used, by its number, among the first `left` frames; their priors;
     number of frames left out of them; why the other recordings were."""
-    depth, priors, skipped, refused = {}, [], 0, []
+    depth, priors, skipped, refused, sizes = {}, [], 0, [], set()
     for number, folder in enumerate(progress.track(folders, "reading recordings")):
         if not left:
             break
@@ -122,7 +122,8 @@ def _read_all(
             recording = find_recordings(folder)[0]
             count = min(left, len(recording))
             left -= count
-            if number == 0:
+            if (size := (recording.height_px, recording.width_px)) not in sizes:  # each crop is told once
+                sizes.add(size)
                 _tell_of_crop(recording, config, progress)
             frames, rgb, left_out = _read(recording, count, config, prior, progress)
         except UserError as error:

@@ -22,6 +22,8 @@ from sensors.statistics.figures import CURVES, SCALARS, Figures
 
 PERCENT = {"invalid_fraction", "flicker_fraction", "grid_share", "shadow_invalid"}
 """Scalars printed in per cent; so are the curves of invalid pixels."""
+_LABEL_WIDTH, _CELL_WIDTH = 26, 8
+"""Characters of a table's first column, which may take several lines, and of its numbers, which must not."""
 
 
 @dataclass(frozen=True)
@@ -128,19 +130,39 @@ def print_tables(result: Comparison) -> None:
     from rich.console import Console
 
     console = Console(markup=False, emoji=False)  # names of recordings are no markup
-    cameras = [*result.real, result.rig]
-    console.print(_table("", cameras, [(SCALARS[n], [_scalar(n, f) for f in cameras]) for n in SCALARS]))
+    groups = side_by_side(result, console.width)
+    for group in groups:
+        console.print(_table("", group, [(SCALARS[n], [_scalar(n, f) for f in group]) for n in SCALARS]))
     for name, title in CURVES.items():
-        shown = [camera for camera in cameras if name in camera.curves]
-        edges = result.rig.curves[name].edges
-        rows = [
-            (_bin(edges, i), [_value(name, camera.curves[name].value[i]) for camera in shown])
-            for i in range(len(edges) - 1)
-        ]
-        console.print(_table(title, shown, rows))
+        for group in groups:
+            console.print(_curve_table(name, title, [camera for camera in group if name in camera.curves]))
     console.print(_object_table(result.objects))
     for line in result.skipped:
         console.print(f"left out: {line}", soft_wrap=True)
+
+
+def side_by_side(result: Comparison, width: int) -> list[list[Figures]]:
+    """Groups of cameras, the rig's last in each, whose columns fit into `width` characters uncut."""
+
+    def columns(camera: Figures) -> int:
+        return 2 + max(_CELL_WIDTH, len(camera.camera))
+
+    room = width - _LABEL_WIDTH - columns(result.rig)
+    groups: list[list[Figures]] = [[]]
+    for camera in result.real:
+        if groups[-1] and sum(map(columns, groups[-1])) + columns(camera) > room:
+            groups.append([])
+        groups[-1].append(camera)
+    return [[*group, result.rig] for group in groups]
+
+
+def _curve_table(name: str, title: str, cameras: list[Figures]):
+    edges = cameras[-1].curves[name].edges
+    rows = [
+        (_bin(edges, i), [_value(name, camera.curves[name].value[i]) for camera in cameras])
+        for i in range(len(edges) - 1)
+    ]
+    return _table(title, cameras, rows)
 
 
 def _table(title: str, cameras: list[Figures], rows: list[tuple[str, list[str]]]):

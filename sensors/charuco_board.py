@@ -19,6 +19,8 @@ DICTIONARIES: tuple[Dictionary, ...] = get_args(Dictionary)
 PAPERS_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0)}
 HELD_AT_M = 0.020
 """From the point between the finger pads to the pattern's upper edge: the plate's margin is between them."""
+_FEWEST_CORNERS = 6
+"""Calibration uses no view with fewer (`deploy.calibration.hand_eye.MIN_CORNERS`)."""
 _SMALLEST_MARKER_M = 0.001
 _INCH_MM = 25.4
 _PRINT_DPI = 300
@@ -57,8 +59,8 @@ class CharucoBoard:
     def __post_init__(self) -> None:
         if self.dictionary not in DICTIONARIES:
             raise UserError(f"board dictionary {self.dictionary!r}: choose one of {', '.join(DICTIONARIES)}.")
-        if min(self.columns, self.rows) < 3:
-            raise UserError(f"a board of {self.columns} x {self.rows} squares: give at least 3 x 3.")
+        if min(self.columns, self.rows) < 3 or self.corner_count < _FEWEST_CORNERS:
+            raise UserError(f"a board of {self.columns} x {self.rows} squares: give at least 3 x 4.")
         if not 0 < self.marker_m < self.square_m:
             raise UserError(
                 f"board markers of {1e3 * self.marker_m:g} mm in squares of {1e3 * self.square_m:g} mm: "

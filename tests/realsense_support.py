@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -70,14 +70,15 @@ class SoftwareCamera:
             frame.profile = profile.as_video_stream_profile()
             sensor.on_video_frame(frame)
 
-    def write(self, file: Path, frames: int) -> None:
-        """Records `frames` frames with librealsense's recorder. RuntimeError: it writes no such files."""
+    def write(self, file: Path, numbers: Sequence[int]) -> None:
+        """Records frames of these numbers with librealsense's recorder. RuntimeError: it writes no such
+        files."""
         recorder = self._rs.recorder(str(file), self.device)
-        queue, sensors = self._rs.frame_queue(2 * frames), recorder.query_sensors()
+        queue, sensors = self._rs.frame_queue(2 * len(numbers)), recorder.query_sensors()
         for sensor in sensors:
             sensor.open(sensor.get_stream_profiles()[0])
             sensor.start(queue)
-        for number in range(1, frames + 1):
+        for number in numbers:
             self.give(number)
             time.sleep(0.01)
         time.sleep(0.3)  # a thread of its own writes

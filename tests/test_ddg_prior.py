@@ -195,6 +195,15 @@ def test_a_crop_is_told(tmp_path):
     )
 
 
+def test_a_crop_of_any_recording_is_told_once(tmp_path):
+    _record(tmp_path / "a", depth_unit_m=0.00001)  # refused
+    _record(tmp_path / "b")
+    for name in "cd":
+        _record(tmp_path / name, size=(64, 64))
+    told = [line for line in load(tmp_path)[1] if "sees" in line]
+    assert len(told) == 1 and f"{tmp_path / 'c'}: the generator sees 56%" in told[0]
+
+
 def test_what_cannot_be_used_is_named_and_counted(recordings):
     _depth(recordings, "a", 1, np.zeros((36, 64), np.uint16))  # nothing valid
     (recordings / "b" / "color" / "000000.jpg").unlink()  # no colour

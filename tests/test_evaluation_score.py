@@ -188,7 +188,8 @@ def test_a_real_cameras_recordings_are_fitted_and_scored(tmp_path, capsys):
     table = result["tables"]["depthfeat-v1"]
     assert "Nobody modelled that room" in result["setting"]
     assert table["sim_gt"]["fid"]["value"] > table["floor"]["fid"]["value"] >= 0
-    assert "score.html" in capsys.readouterr().out
+    told, said = "room: meta.json does not say that frames follow each other", capsys.readouterr()
+    assert "score.html" in said.out and told in said.err and told in result["setting"]
     assert cli.main([*command, "--resume"]) == 0
     assert "finished before" in capsys.readouterr().err
 
@@ -201,6 +202,17 @@ def test_disparity_is_the_recorded_cameras_own(tmp_path):
     meta.write_text(meta.read_text().replace("D435", "of another make"))
     with pytest.raises(UserError, match="add fx_px and baseline_m to meta.json"):
         score_data.load_real(tmp_path / "room", 32, 2)
+
+
+def test_recordings_of_frames_that_may_not_follow_each_other_are_known(tmp_path):
+    for name, follow in (("a", False), ("b", True), ("c", False)):
+        write_recording(tmp_path / name, 8, (48, 64))
+        meta = tmp_path / name / "meta.json"
+        meta.write_text(json.dumps({**json.loads(meta.read_text()), "consecutive_frames": follow}))
+    assert score_data.load_real(tmp_path, 32, 16).apart == (tmp_path / "c",)
+    assert score_data.load_real(tmp_path / "b", 32, 8).apart == ()
+    (tmp_path / "b" / "color" / "000003.jpg").unlink()  # between others
+    assert score_data.load_real(tmp_path / "b", 32, 7).apart == (tmp_path / "b",)
 
 
 def test_blocks_are_of_one_recording_each(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -166,6 +167,22 @@ def test_objects_fail_by_their_materials():
     assert min(lost[name] for name in ("wheel", "can", "starfruit")) > 0.07
     assert max(lost[name] for name in ("banana", "bread", "apple")) < 0.07
     assert max(lost.values()) < 0.5
+
+
+def test_no_number_is_cut_however_many_recordings_there_are(monkeypatch, capsys):
+    """Tables of as many as fit, the rig's camera beside each."""
+    monkeypatch.setenv("COLUMNS", "80")
+    full = next(camera for camera in figures.published() if camera.curves.keys() == figures.CURVES.keys())
+    rig, *known = (replace(full, camera=f"take{i} 848x480") for i in range(8))
+    result = compare.Comparison(known, rig, {}, [])
+    compare.print_tables(result)
+    shown = capsys.readouterr().out
+    assert "…" not in shown and max(map(len, shown.splitlines())) <= 80
+    groups = compare.side_by_side(result, 80)
+    assert [camera for group in groups for camera in group[:-1]] == known
+    assert all(group[-1] is rig and len(group) > 1 for group in groups)
+    assert shown.count("take0") == len(groups) * (1 + len(figures.CURVES))
+    assert compare.side_by_side(replace(result, real=known[:1]), 10) == [[known[0], rig]]
 
 
 def test_compare_writes_table_json_and_picture(tmp_path, capsys):

@@ -1,10 +1,14 @@
 """RealSense into recordings: files and a live camera, through librealsense where it is, else a stand-in."""
 
+import math
 import os
 import signal
 import sys
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +25,12 @@ from realsense_support import (
     depth_mm,
     full_after,
 )
+from sensors.recordings import realsense
 from sensors.recordings import writer as writing
+from sensors.recordings.realsense import Gaps, once
 from sensors.recordings.realsense_live import Pace, Take, frame_count
 from sensors.recordings.recording import Recording, check_fields
+from sensors.recordings.sources import RawFrame
 
 SMALL = ("--width", str(SIZE[1]), "--height", str(SIZE[0]))
 TIMEOUT = RuntimeError("Frame didn't arrive within 3000")
@@ -61,18 +68,31 @@ def numbers_in(path: Path) -> list[int]:
 def test_a_file_that_librealsense_wrote_becomes_a_recording(rs, tmp_path, capsys):
     file = tmp_path / "desk.bag"
     try:
-        SoftwareCamera(rs).write(file, 20)
+        SoftwareCamera(rs).write(file, range(1, 21))
     except RuntimeError:  # newer versions read .bag, but write .db3 alone
         file = tmp_path / "desk.db3"
-        SoftwareCamera(rs).write(file, 20)
+        SoftwareCamera(rs).write(file, range(1, 21))
     parse("record import", [str(file), "--out", str(tmp_path / "out")]).run()
     numbers = numbers_in(tmp_path / "out" / "desk")
-    # librealsense's pipeline leaves out a .bag's first frame.
-    assert numbers == list(range(1 if file.suffix == ".db3" else numbers[0], 21)) and len(numbers) >= 19
+    assert numbers == list(range(1, 21))
     meta = Recording.open(tmp_path / "out" / "desk").meta
     assert (meta["sensor"], meta["fx_px"], meta["baseline_m"], meta["hz"]) == (NAME, FX_PX, 0.095, 30)
     assert meta["consecutive_frames"] and not meta["color_aligned_to_depth"]
     assert capsys.readouterr().out.splitlines()[-1].endswith("left out: 0 frames, 0 recordings")
+
+
+def test_frames_that_a_file_lacks_end_consecutive_frames(rs, tmp_path):
+    """The recorder wrote 1 to 3 and 9 to 12; librealsense gives 9 twice, first with the colour of 3."""
+    camera = SoftwareCamera(rs)
+    try:
+        camera.write(tmp_path / "desk.bag", (1, 2, 3, 9, 10, 11, 12))
+    except RuntimeError:  # see above
+        camera = SoftwareCamera(rs)
+        camera.write(tmp_path / "desk.db3", (1, 2, 3, 9, 10, 11, 12))
+    file = next(tmp_path.glob("desk.*"))
+    parse("record import", [str(file), "--out", str(tmp_path / "out")]).run()
+    assert numbers_in(tmp_path / "out" / "desk") == [1, 2, 3, 9, 10, 11, 12]
+    assert not Recording.open(tmp_path / "out" / "desk").consecutive
 
 
 def test_a_live_camera_becomes_a_recording(rs, tmp_path, monkeypatch, capsys):
@@ -107,6 +127,42 @@ def test_a_size_the_camera_does_not_have_is_named(rs, tmp_path, monkeypatch):
     ):
         record(tmp_path, "--width", 65)
     assert list(tmp_path.iterdir()) == []
+
+
+# --- a file's frames -------------------------------------------------------------------------------
+
+
+def test_a_depth_picture_that_is_given_again_counts_once_with_its_own_colour():
+    frames = [RawFrame(f"depth {d}, colour {c}", None, None) for d, c in ((1, 1), (9, 1), (9, 9), (9, 10))]
+    nothing = RawFrame("no depth", None, None)
+    sets = [*zip((1, 9, 9, 9), (2.0, 270.0, 3.0, 31.0), frames, strict=True), (None, math.inf, nothing)]
+    given = list(once([*sets, (None, math.inf, nothing)]))
+    assert given == [(1, frames[0]), (9, frames[2]), (None, nothing), (None, nothing)]
+    assert list(once([])) == []
+
+
+@pytest.mark.parametrize(("numbers", "gaps"), [((7, 8, 9), False), ((1, 2, 4), True), ((5, 6, 1), True)])
+def test_numbers_that_are_missing_between_a_files_frames_are_a_gap(numbers, gaps):
+    counted = Gaps()
+    for number in numbers:
+        counted.count(number)
+    assert counted.meta() == ({"consecutive_frames": False} if gaps else {})
+
+
+def test_a_file_plays_once_both_streams_have_started(monkeypatch):
+    said: list[str] = []
+
+    def say(what: str, answer: Any = None) -> Callable[..., Any]:
+        return lambda *_: (said.append(what), answer)[1]
+
+    playback = SimpleNamespace(set_real_time=say("speed"), pause=say("pause"), resume=say("resume"))
+    profile = SimpleNamespace(get_device=lambda: SimpleNamespace(as_playback=lambda: playback))
+    pipeline = SimpleNamespace(
+        start=say("start"), stop=say("stop"), try_wait_for_frames=say("wait", (False, None))
+    )
+    monkeypatch.setattr(realsense, "_opened", lambda rs, file: (pipeline, None, profile))
+    assert list(realsense._frames(None, Path("desk.bag"), Gaps())) == []
+    assert said == ["speed", "pause", "start", "resume", "wait", "stop"]
 
 
 # --- a scripted camera -----------------------------------------------------------------------------

@@ -187,6 +187,8 @@ class RealFrames:
     baseline_m: float
     unaligned: tuple[Path, ...] = ()
     """Recordings among them whose colour is not aligned to depth."""
+    apart: tuple[Path, ...] = ()
+    """Recordings among them whose frames may be of different moments (`Recording.consecutive`)."""
 
     @property
     def blocks(self) -> list[int]:
@@ -219,11 +221,12 @@ def load_real(root: Path, width_px: int, last: int) -> RealFrames:
     scored = [recordings[number] for number in np.unique(numbers)]
     focal_px, baseline_m = _optics(scored)
     unaligned = tuple(r.path for r in scored if not r.color_aligned)
+    apart = tuple(r.path for r in scored if not r.consecutive)
     size, chosen = _size(recordings[0], width_px), [(recordings[number], i) for number, i in frames[-last:]]
     depth_mm = np.stack([depth.crop_nearest(r.depth_mm(i), size) for r, i in chosen])
     rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
     focal_px *= width_px / recordings[0].width_px
-    return RealFrames(len(frames), depth_mm, rgb, numbers, focal_px, baseline_m, unaligned)
+    return RealFrames(len(frames), depth_mm, rgb, numbers, focal_px, baseline_m, unaligned, apart)
 
 
 def _optics(recordings: Sequence[Recording]) -> tuple[float, float]:

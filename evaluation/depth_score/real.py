@@ -24,6 +24,11 @@ SETTING = (
     "(ddg_jax/piecewise.py); recorded depth is the even frames, a frame earlier. So the layout is the same "
     "on both sides, and errors of valid pixels are relative to that stand-in."
 )
+APART = (
+    "{first}{more}: meta.json does not say that frames follow each other (consecutive_frames), or some "
+    "between them were left out. Where they show different scenes, the layouts of the two sides differ, and "
+    "flicker and persistence say nothing."
+)
 
 _FEWEST_BLOCKS = 2
 """On either side: resampling needs two."""
@@ -61,15 +66,24 @@ def run(job: Job) -> Artifact:
             "more frames."
         )
     extractors = [score_features.load(name) for name in config.score.features]  # before hours of fitting
+    if frames.apart:
+        job.progress.note(_apart(frames))
     fitted = _fit(job, root, fit_frames)
     methods = Methods(config.score, config.seed, Generator.load(fitted.directory))
     episodes = score_data.real_episodes(frames, methods.needs_rgb)
     loads: list[Load] = [partial(lambda e: e, episode) for episode in episodes]
     text = SETTING.format(root=root.name, fit=fit_frames, score=score_frames)
+    if frames.apart:
+        text += f" {_apart(frames)}"
     blocks = f"{len(frames.blocks)} runs of {2 * score_data.BLOCK_FRAMES} consecutive frames"
     if len(frames.blocks) < _FEW_BLOCKS:
         blocks += ", of which there are few: the true intervals are wider"
     return score_setting(replace(job, parents={"ddg": fitted}), text, blocks, methods, extractors, loads)
+
+
+def _apart(frames: score_data.RealFrames) -> str:
+    first, *others = frames.apart
+    return APART.format(first=first.name, more=f" and {len(others)} more" if others else "")
 
 
 def _fit(job: Job, root: Path, fit_frames: int) -> Artifact:
