@@ -260,8 +260,11 @@ class ControlLoop:
             frame = self._camera.read()
         except CameraError as error:
             return None, f"no frame: {error}"
-        previous_s, self._last_frame_s = self._last_frame_s, max(frame.timestamp_s, self._last_frame_s)
         age_s = self._clock.now() - frame.timestamp_s
+        if age_s < -self._settings.period_s:
+            ahead = f"{1e3 * -age_s:.0f} ms ahead"
+            return frame, f"frame of the future: {ahead}, its time is not of the loop's clock"
+        previous_s, self._last_frame_s = self._last_frame_s, max(frame.timestamp_s, self._last_frame_s)
         age = f"{1e3 * age_s:.0f} ms old"
         if frame.timestamp_s == previous_s:
             return frame, f"stale frame: the same one again ({age})"

@@ -58,8 +58,11 @@ def _run(
         execute_steps=config.deploy.execute_steps or None,
     )
     options.out.mkdir(parents=True, exist_ok=True)  # before an arm moves that could not be recorded
-    if options.robot == "franka" and not (options.yes or options.dry_run or sys.stdin.isatty()):
-        raise UserError("robot 'franka' asks before it moves, and nobody can be asked here: give --yes.")
+    real = options.robot != "sim"
+    if real and not (options.yes or options.dry_run or sys.stdin.isatty()):
+        raise UserError(
+            f"robot {options.robot!r} asks before it moves, and nobody can be asked here: give --yes."
+        )
     place = standing(config, options)
     if place.line:
         say(place.line)
@@ -68,7 +71,7 @@ def _run(
     robot, camera = make_devices(Setup(config, options, policy.info, clock, confirm, say))
     keep_time_of(robot, clock, options)
     safety = safety_filter(config.deploy, policy.info, options.robot)
-    if options.robot == "franka" and (notice := speed_notice(config.deploy, policy.info)):
+    if real and (notice := speed_notice(config.deploy, policy.info)):
         say(notice)
     driven = DryRun(robot, say) if options.dry_run else robot
     loop = ControlLoop(camera, driven, policy, safety, clock, loop_settings(config.deploy, policy.info), say)

@@ -17,10 +17,14 @@ def loop_settings(config: DeployConfig, info: PolicyMetadata) -> LoopSettings:
 
 
 def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim") -> SafetyFilter:
-    """Limits narrow enough for both `robot` (as `--robot` names it) and the policy."""
-    arm = contract.ARMS[config.franka.model] if robot == "franka" else contract.PANDA
-    speed = config.franka.speed_rad_s if robot == "franka" else arm.joint_velocity_rad_s
-    margin = JOINT_MARGIN_RAD if robot == "franka" else 0.0
+    """Limits narrow enough for both `robot` (as `--robot` names it) and the policy.
+
+    Whatever is no simulation is the configured arm, by whichever driver.
+    """
+    real = robot != "sim"
+    arm = contract.ARMS[config.franka.model] if real else contract.PANDA
+    speed = config.franka.speed_rad_s if real else arm.joint_velocity_rad_s
+    margin = JOINT_MARGIN_RAD if real else 0.0
     limits = SafetyLimits(
         lower_rad=tuple(
             max(a + margin, p) for a, p in zip(arm.joint_lower_rad, info.joint_lower_rad, strict=True)
@@ -30,13 +34,13 @@ def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim"
         ),
         velocity_rad_s=speed,
         acceleration_rad_s2=tuple(config.acceleration_scale * a for a in arm.joint_acceleration_rad_s2),
-        braking_rad_s2=arm.braking_rad_s2 if robot == "franka" else None,
+        braking_rad_s2=arm.braking_rad_s2 if real else None,
         braking_reserve_rad_s=arm.braking_reserve_rad_s,
         workspace_lower_m=config.workspace_lower_m,
         workspace_upper_m=config.workspace_upper_m,
         arm_lower_m=config.arm_lower_m,
         arm_upper_m=config.arm_upper_m,
-        approach_below_m=config.franka.approach_below_m if robot == "franka" else 0.0,
+        approach_below_m=config.franka.approach_below_m if real else 0.0,
         approach_m_s=config.franka.approach_m_s,
         period_s=1.0 / info.control_hz,
     )

@@ -258,13 +258,20 @@ class ObjectSpec:
         widest = 0.0
         if self.box is not None:
             corners = np.add(self.box.center_m, np.outer((-1, 1), self.box.half_m))
-            widest = np.abs(self._turned(corners)[:, 1]).max()
+            x, y = self._from_grasp(corners)
+            if x.min() < PAD_HALF_WIDTH_M and x.max() > -PAD_HALF_WIDTH_M:
+                widest = np.abs(y).max()
         for capsule in self.capsules:
-            axis = self._turned(np.linspace(capsule.start_m, capsule.end_m, _AXIS_POINTS))
-            x, y = (axis - self.grasp_offset_m)[:, :2].T
-            at_pads = np.abs(x) < PAD_HALF_WIDTH_M
-            widest = max(widest, np.abs(y[at_pads]).max(initial=-capsule.radius_m) + capsule.radius_m)
+            x, y = self._from_grasp(np.linspace(capsule.start_m, capsule.end_m, _AXIS_POINTS))
+            beyond = np.maximum(np.abs(x) - PAD_HALF_WIDTH_M, 0.0)
+            nearest = beyond == beyond.min()  # of a capsule beside the pads, its round end
+            if (reach := capsule.radius_m**2 - beyond.min() ** 2) > 0.0:
+                widest = max(widest, np.abs(y[nearest]).max() + math.sqrt(reach))
         return float(widest)
+
+    def _from_grasp(self, points_m: np.ndarray) -> np.ndarray:
+        """(2, N) x and y, from the grasp, of points (N, 3) of the parts' frame."""
+        return (self._turned(points_m) - self.grasp_offset_m)[:, :2].T
 
     def _bounds_m(self) -> np.ndarray:
         """(2, 3) lower and upper corner of the box and the capsules together, object frame."""

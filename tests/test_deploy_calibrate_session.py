@@ -398,6 +398,7 @@ def test_without_a_calibration_deploy_says_what_it_assumes(tmp_path, monkeypatch
         "not calibrated: assumes the camera at (0.94, 0.00, 0.56) m in the robot's base frame, looking at "
         "(0.48, 0.00, 0.05), within ±10 mm and ±0.86 degrees on each axis; `ddgrasp calibrate` measures it"
     )
+    assert standing.standing(CONFIG, SessionOptions("mine", "realsense")) == place  # by another driver
     assert place.as_dict() is None and standing.standing(CONFIG, SessionOptions()).line == ""
 
 

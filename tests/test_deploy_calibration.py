@@ -181,7 +181,8 @@ def test_the_printed_page_has_the_pattern_in_its_true_size():
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"columns": 2}, "2 x 7 squares: give at least 3 x 3"),
+        ({"columns": 2}, "2 x 7 squares: give at least 3 x 4"),
+        ({"columns": 3, "rows": 3}, "3 x 3 squares: give at least 3 x 4"),  # 4 corners: no view is used
         ({"marker_m": 0.03}, "30 mm in squares of 30 mm"),
         ({"square_m": 0.0005, "marker_m": 0.0003}, "markers of 0.3 mm: .* less than 1 mm"),
         ({"columns": 11, "rows": 11}, "needs 60 markers, DICT_4X4_50 has 50"),
@@ -191,3 +192,4 @@ def test_the_printed_page_has_the_pattern_in_its_true_size():
 def test_boards_that_cannot_be_are_refused(values, said):
     with pytest.raises(UserError, match=said):
         CharucoBoard(**values)
+    assert CharucoBoard(columns=3, rows=4).corner_count == hand_eye.MIN_CORNERS

@@ -255,6 +255,11 @@ def test_an_arm_without_its_hand_is_told_from_no_arm(monkeypatch, answers):
         robot._gripper()
 
 
+def test_a_mistyped_address_is_no_franka():
+    with pytest.raises(UserError, match=r"no Franka at '172\.16\.\.0\.2' \(.*check --host"):
+        franka_probe.check_arm("172.16..0.2", "fr3")
+
+
 class Homing:
     """A hand that homes, or does not; a future of franky's too."""
 
@@ -622,9 +627,12 @@ def test_a_deployment_that_a_fault_ended_exits_with_1_and_one_that_kept_no_rate_
     assert "ended by: lost connection" in said and "did not keep its rate" in said
 
 
-def test_an_arm_is_not_asked_for_where_nobody_can_answer(monkeypatch, tmp_path):
+@pytest.mark.parametrize("robot", ["franka", "mine"])
+def test_an_arm_is_not_asked_for_where_nobody_can_answer(robot, monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: False))
+    monkeypatch.setitem(registry.ROBOTS, "mine", lambda setup: KinematicRobot(setup.clock))
     policy, said = write_policy(tmp_path / "policy.onnx", describe()), []
-    with pytest.raises(UserError, match="nobody can be asked here: give --yes"):
-        deploy(get_preset("debug"), policy, SessionOptions("franka", "realsense"), said.append)
+    options = SessionOptions(robot, "realsense", out=tmp_path)
+    with pytest.raises(UserError, match=f"'{robot}' asks .*nobody can be asked here: give --yes"):
+        deploy(get_preset("debug"), policy, options, said.append)
     assert said == []

@@ -64,6 +64,7 @@ def test_good_frames_move_the_robot_one_step_per_period(tmp_path):
 
 BAD = {
     "stale": (depth_mm(), 0.25),
+    "time of day": (depth_mm(), -1.7e9),
     "repeated": "repeat",
     "unplugged": "unplugged",
     "shape": depth_mm()[1:],
@@ -76,6 +77,7 @@ BAD = {
     ("name", "reason"),
     [
         ("stale", "stale frame: 250 ms old"),
+        ("time of day", "frame of the future: 1700000000000 ms ahead, its time is not of the loop's clock"),
         ("repeated", "stale frame: the same one again"),
         ("unplugged", "no frame: unplugged"),
         ("shape", "wrong depth: size (8, 16)"),

@@ -232,9 +232,9 @@ def test_the_page_s_lines_do_what_the_policy_class_does(tmp_path, monkeypatch):
     (lines,) = (block for block in code("../data.md") if "InferenceSession" in block)
     page: dict = {}
     exec(lines, page)
-    policy, closed = OnnxPolicy(path), []
+    policy, closed, depth = OnnxPolicy(path), [], depth_mm()
     for _ in range(12):
-        depth, width_m = depth_mm(int(rng.integers(400, 900))), float(rng.uniform(0, 0.08))
+        depth[:], width_m = rng.integers(400, 900), float(rng.uniform(0, 0.08))  # a camera's own buffer
         q_rad = HOME_RAD + rng.normal(0, 0.1, 7)
         action = policy.act(depth, np.append(q_rad, width_m).astype(np.float32))
         target_rad, close = page["act"](depth, q_rad, width_m)

@@ -64,6 +64,13 @@ def test_a_real_arm_keeps_off_the_ends_of_its_range():
     np.testing.assert_allclose(np.subtract(FR3.joint_upper_rad, limits.upper_rad), 0.02)
 
 
+def test_another_driver_s_arm_has_the_configured_arm_s_limits():
+    """`deploy/devices/mine.py`: another way to the same arm is no simulation."""
+    limits = safety_filter(DEPLOY, describe(), "mine").limits
+    assert limits == safety_filter(DEPLOY, describe(), "franka").limits
+    assert max(limits.velocity_rad_s) < 0.6 and limits.approach_below_m > 0 and limits.braking_rad_s2
+
+
 def test_the_loop_has_the_policy_s_rate_and_the_configured_patience():
     info = replace(describe(), control_hz=20)
     for stale, retry in ((2.5, True), (1.5, False)):

@@ -209,6 +209,29 @@ def test_the_grasp_offset_turns_with_the_object():
     np.testing.assert_allclose(pos, [0.5, 0.08, 0.3], atol=1e-12)
 
 
+def grasped(*parts: Box | Capsule, offset_m=(0.0, 0.0, 0.0)) -> ObjectSpec:
+    """An object of those parts."""
+    boxes = [part for part in parts if isinstance(part, Box)]
+    return ObjectSpec(
+        "thing", 99, 0.1, 0.5, (0.5, 0.5, 0.5), 0.02, 2, box=boxes[0] if boxes else None,
+        capsules=tuple(part for part in parts if isinstance(part, Capsule)), grasp_offset_m=offset_m,
+    )  # fmt: skip
+
+
+def test_what_lies_beside_the_pads_does_not_count_as_between_them():
+    head, handle = Box((0.010, 0.035, 0.010), (0.060, 0.0, 0.0)), Capsule((-0.06, 0, 0), (0.05, 0, 0), 0.010)
+    assert grasped(head, handle).half_width_m() == pytest.approx(0.010)
+    assert grasped(head, handle, offset_m=(0.045, 0.0, 0.0)).half_width_m() == pytest.approx(0.035)
+    assert grasped(head, handle, offset_m=(0.0, 0.004, 0.0)).half_width_m() == pytest.approx(0.014)
+
+
+def test_the_round_end_of_what_begins_beside_the_pads_counts():
+    balls = [Capsule((x, 0.0, 0.0), (x, 0.0, 0.0), 0.020) for x in (-0.0225, 0.0225)]
+    # a pad reaches to 10.5 mm, 12 mm from the middle of a ball: sqrt(20^2 - 12^2) = 16 mm
+    assert grasped(*balls).half_width_m() == pytest.approx(0.016)
+    assert grasped(*balls, offset_m=(0.06, 0.0, 0.0)).half_width_m() == 0.0
+
+
 # --- slots ---------------------------------------------------------------------------------------
 
 

@@ -102,7 +102,7 @@ def offset(T_base_cam: Float[np.ndarray, "4 4"], T_reference: Float[np.ndarray, 
 
 def standing(config: Config, options: SessionOptions) -> Standing:
     """What deploy says of its camera. Raises UserError for a file that is named and does not fit."""
-    if options.robot != "franka":
+    if options.robot == "sim":
         return Standing()
     spread = config.world.random
     path = options.calibration or DEFAULT_FILE

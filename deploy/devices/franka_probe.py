@@ -61,10 +61,10 @@ def _server_version(host: str) -> int:
             f"the control unit at {host!r} does not answer within {ANSWER_S:g} s: end other programs that "
             "drive it (it takes one), and check --host."
         ) from error
-    except OSError as error:
+    except (OSError, UnicodeError) as error:  # a name with two dots in a row is no text that IDNA knows
+        said = getattr(error, "strerror", None) or error
         raise UserError(
-            f"no Franka at {host!r} ({error.strerror or error}): unlock the joints, activate FCI in Desk and "
-            "check --host."
+            f"no Franka at {host!r} ({said}): unlock the joints, activate FCI in Desk and check --host."
         ) from error
     if len(answer) < _ANSWER.size:
         raise UserError(f"the control unit at {host!r} refuses connections: activate FCI in Desk.")

@@ -4,7 +4,9 @@ The body's frame has its origin at the centre of mass and is upright as the obje
 stable one nearest to the shape's own (`trimesh.poses`, Goldberg et al. 1999), found for the convex parts.
 """
 
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.util import find_spec
 
@@ -19,15 +21,19 @@ from ddgrasp.errors import UserError
 from ddgrasp.install import pip_install
 from rig.meshes.convex import convex_parts
 from rig.meshes.objects import MeshObject, get_mesh_object
-from rig.meshes.solids import Part, Vector, union
+from rig.meshes.solids import Part, Vector, one_surface, union
 
 Points = Float64[np.ndarray, "_ 3"]
+LEAST_MM = 1.0
+"""A shape that is shorter in every direction is one in metres."""
 MAX_TILT_RAD = 0.5
 """Between the shape as described and as it rests."""
 CONTACT_SOLREF = (0.005, 1.0)
 """Time constant (s) and damping ratio of contacts; half of the time constant bounds the time step."""
 VISUAL_GROUP, CONTACT_GROUP = 1, 3
 """MuJoCo draws groups 0 to 2 by default."""
+_CONTACT = re.compile(r"contact\d+")
+"""What `make_spec` calls contact parts."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +81,16 @@ def make_body(name: str) -> MeshBody:
 def body_of(described: MeshObject) -> MeshBody:
     """What MuJoCo takes of `described`.
 
-    Raises UserError for a surface that is not closed, a shape that no two opposite sides of fit between the
-    fingers, one that does not rest as described, and for a concave one where CoACD is not installed.
+    Raises UserError for parts that cannot be told apart, a surface that is not closed, a shape in metres, one
+    that no two opposite sides of fit between the fingers, one that does not rest as described, and for a
+    concave one where CoACD is not installed.
     """
     _check_libraries()
     parts = described.shape()
+    _check_names(described.name, parts)
     for part in parts:
         _check_closed(described.name, part)
+    parts = [replace(part, mesh=one_surface(part.mesh)) for part in parts]
     solid = union([part.mesh for part in parts])
     _check_fits(described.name, solid)
     hulls = [hull for part in parts for hull in convex_parts(part)]
@@ -180,9 +189,23 @@ def _check_libraries() -> None:
         raise UserError(f"Mesh objects need {' and '.join(missing)}: {pip_install('fr3')}.")
 
 
+def _check_names(name: str, parts: Sequence[Part]) -> None:
+    names = [part.name for part in parts]
+    if not all(names) or len(set(names)) < max(len(names), 1) or any(map(_CONTACT.fullmatch, names)):
+        raise UserError(
+            f"The parts of {name!r} are called {names}; expected one or more, each with a name of its own, "
+            "none of them contact0, contact1, ...: give Part another name."
+        )
+
+
 def _check_closed(name: str, part: Part) -> None:
     if part.mesh.is_volume:
         return
+    if part.mesh.is_watertight:
+        raise UserError(
+            f"The surface {part.name!r} of {name!r} is closed, but inside out, or its faces disagree on what "
+            "is outside: mend it with trimesh.repair.fix_normals."
+        )
     edges = part.mesh.edges_sorted
     _, counts = np.unique(edges, axis=0, return_counts=True)
     raise UserError(
@@ -192,6 +215,11 @@ def _check_closed(name: str, part: Part) -> None:
 
 
 def _check_fits(name: str, solid: trimesh.Trimesh) -> None:
+    if (longest_mm := float(solid.extents.max())) < LEAST_MM:
+        raise UserError(
+            f"{name!r} is {longest_mm:.2g} mm long: shapes are given in millimetres; if this one is in "
+            "metres, take Part.scaled(1000)."
+        )
     directions = trimesh.creation.icosphere(subdivisions=3).vertices
     thinnest_mm = float(np.ptp(solid.convex_hull.vertices @ directions.T, axis=0).min())
     widest_mm = 1000 * contract.GRIPPER_MAX_WIDTH_M

@@ -13,6 +13,8 @@ from scipy.interpolate import CubicSpline
 
 SIDES = 48
 """Points around a ring."""
+_INSIDE = 1e-3
+"""A shell of which no larger share stands out of another lies inside of it."""
 
 Points = Sequence[Sequence[float]]
 Vector = tuple[float, float, float]
@@ -123,6 +125,25 @@ def lathe(profile: Points, transform: Float64[np.ndarray, "4 4"] | None = None) 
 def union(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """One surface around all of `meshes`, which must be closed."""
     return trimesh.boolean.union(list(meshes), engine="manifold") if len(meshes) > 1 else meshes[0]
+
+
+def one_surface(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """`mesh`, closed, without what lies inside of it: shells that overlap become one, hollows stay.
+
+    Overlaps would weigh twice, and CoACD does not survive them. A shell that is inside out and no hollow is
+    turned.
+    """
+    if mesh.body_count == 1:
+        return mesh
+    shells = mesh.split(only_watertight=False)
+    outer, inverted = ([s for s in shells if (s.volume > 0) == sign] for sign in (True, False))
+    solid, hollows = union(outer), []
+    for shell in inverted:
+        shell.invert()
+        beyond = without(shell, [solid])
+        inside = beyond.is_empty or beyond.volume < _INSIDE * shell.volume
+        (hollows if inside else outer).append(shell)
+    return without(union(outer), hollows) if hollows else union(outer)
 
 
 def without(mesh: trimesh.Trimesh, removed: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
