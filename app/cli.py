@@ -3,6 +3,7 @@
 Imports nothing heavy: `--help` and typing errors answer at once, and Ctrl-C is handled from the first moment.
 """
 
+import atexit
 import contextlib
 import errno
 import io
@@ -10,6 +11,8 @@ import os
 import sys
 from collections.abc import Sequence
 
+_INTERRUPTED = 130
+"""The exit status after Ctrl-C."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _OPEN_GL = ("glGetError", "eglQueryString")
 """What PyOpenGL looks for in a library that it has not found."""
@@ -18,6 +21,9 @@ _OPEN_GL = ("glGetError", "eglQueryString")
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit status: 0 fine, 1 trouble, 2 wrong input, 130 interrupted."""
     _mend_streams()
+    interrupted: list[bool] = []
+    if argv is None:
+        atexit.register(_leave, interrupted)
     # JAX's GPU build takes most of the device's memory at its start unless told otherwise.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     # Compiled programs are kept: the second run of a stage starts in seconds.
@@ -28,7 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return _dispatch(list(sys.argv[1:] if argv is None else argv))
     except KeyboardInterrupt as interrupt:
-        return _fail(str(interrupt) or "Interrupted.", 130)
+        interrupted.append(True)
+        return _fail(str(interrupt) or "Interrupted.", _INTERRUPTED)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -36,6 +43,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         if (message := _one_line(error)) is None:
             raise
         return _fail(message, 2 if type(error).__name__ == "UserError" else 1)
+
+
+def _leave(interrupted: Sequence[bool]) -> None:
+    """Ends an interrupted program where it stands, once all others that wait for its end have had their turn:
+    a thread of JAX may be in the C engine, and comes back to a Python that is no more."""
+    if interrupted:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):  # whoever read it may have gone
+                stream.flush()
+        os._exit(_INTERRUPTED)
 
 
 def _mend_streams() -> None:

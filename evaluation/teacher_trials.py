@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Real
 
-from ddgrasp import artifacts, contract
+from ddgrasp import artifacts
+from ddgrasp.artifacts import Artifact
 from ddgrasp.config import WorldConfig
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, read_json, to_json
 from ddgrasp.progress import PICTURES
@@ -18,23 +19,24 @@ TRIALS_FILE = "trials.json"
 SHEET_FILE = "episodes.png"
 
 
-def summarise(result: Mapping[str, Any], teacher: str, world: WorldConfig, seed: int) -> dict[str, Any]:
+def summarise(result: Mapping[str, Any], teacher: Artifact, world: WorldConfig, seed: int) -> dict[str, Any]:
     """`result` of `ppo.trials.measure` as it is kept.
 
     Args:
       result: see there.
-      teacher: hash of the teacher's artifact.
+      teacher: what was measured.
       world: where it was measured.
       seed: of the episodes.
 
-    Keys: teacher, seed, world; success, and the same of the objects the paper trains on (`seen`) and of the
-    others (`unseen`), if there are any: {rate, n, successes, low, high}; objects: a row per object and one
-    for all, {object, success, motion and visibility}.
+    Keys: teacher (its hash), seed, world; success, and the same of the objects of its own run (`seen`) and of
+    the others (`unseen`), if there are any: {rate, n, successes, low, high}; objects: a row per object and
+    one for all, {object, success, motion and visibility}.
     """
     counts = {**result["objects"], "all": result["success"]}
+    trained = teacher.manifest.config["world"]["objects"]
     groups = {
-        "seen": [c for name, c in result["objects"].items() if name in contract.SEEN_OBJECTS],
-        "unseen": [c for name, c in result["objects"].items() if name not in contract.SEEN_OBJECTS],
+        "seen": [c for name, c in result["objects"].items() if name in trained],
+        "unseen": [c for name, c in result["objects"].items() if name not in trained],
     }
     pooled = {name: _pool(some) for name, some in groups.items() if some}
     rows = [
@@ -42,7 +44,7 @@ def summarise(result: Mapping[str, Any], teacher: str, world: WorldConfig, seed:
         | {key: value for key, value in row.items() if key != "object"}
         for row in result["motion"]
     ]
-    origin = {"teacher": teacher, "seed": seed, "world": to_json(world)}
+    origin = {"teacher": teacher.hash, "seed": seed, "world": to_json(world)}
     return origin | {"success": _pool([result["success"]])} | pooled | {"objects": rows}
 
 

@@ -89,7 +89,8 @@ class PickEnv(GraspEnv):
         episode = jax.tree.map(lambda a, b: jnp.where(put_back, a, b), first, now)
         new = super().step(replace(state, info=state.info | {"episode": episode}), action)
         lost = new.done * (1 - new.info["truncation"])
-        return replace(new, done=lost, metrics=_without_counts(new.metrics))
+        # Wrappers keep metrics of their own there, and scan over this: what came in goes out.
+        return replace(new, done=lost, metrics={**state.metrics, **_without_counts(new.metrics)})
 
     def render(
         self,

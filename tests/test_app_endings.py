@@ -4,6 +4,7 @@ import ctypes.util
 import errno
 import io
 import os
+import signal
 import subprocess
 import sys
 from functools import partial
@@ -58,6 +59,36 @@ def test_a_run_s_place_is_looked_at_before_what_lies_in_it(out, tmp_path):
         with pytest.raises(UserError, match=r"cannot be created \(.+\): choose another --out\.$"):
             pipeline.check_place(PRESETS["debug"], tmp_path / out, resume=resume)
     assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+
+
+# --- Ctrl-C --------------------------------------------------------------------------------------
+
+WORKS_ON = """
+import atexit, os, sys, time, types
+from app import cli, commands
+class Engine:
+    def __del__(self, write=os.write):
+        write(1, b"taken apart")
+engine = Engine()
+def run():
+    atexit.register(print, "tidied up")
+    print("working", flush=True)
+    time.sleep(60)
+commands.parse = lambda name, args: types.SimpleNamespace(run=run)
+sys.argv = ["ddgrasp", "objects", "list"]
+sys.exit(cli.main())
+"""
+
+
+def test_an_interrupted_program_ends_where_it_stands():
+    """JAX's thread, in a physics step of the C engine, crashed a Python that was taken apart around it."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", WORKS_ON], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout and process.stdout.readline() == "working\n"
+    process.send_signal(signal.SIGINT)
+    out, told = process.communicate(timeout=30)
+    assert (process.returncode, out, told) == (130, "tidied up\n", "ddgrasp: Interrupted.\n")
 
 
 # --- devices -------------------------------------------------------------------------------------

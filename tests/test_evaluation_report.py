@@ -191,12 +191,16 @@ def test_what_is_no_run_is_refused_for_what_it_is(run_dir, tmp_path):
     log = tmp_path / "tried" / "ddg" / "trials.jsonl"
     log.parent.mkdir(parents=True)
     log.touch()
+    row = tmp_path / "table2" / "trials" / "development-test-0" / "ddg"
+    row.mkdir(parents=True)
+    (tmp_path / "table2" / "study.html").touch()
     for place, said in (
         ("empty", "holds no finished stage: nothing to report"),
         ("file", "is a file: name the folder"),
         ("absent", "is not there"),
         ("teacher", f"is one finished stage: name the run that it is of, {run_dir}"),
         ("tried", "holds trials, of ddg: name one of these folders"),
+        ("table2", f"is a study, whose tables are in {tmp_path}/table2/study.html: name folders of its rows"),
     ):
         with pytest.raises(UserError, match=said):
             build_report(tmp_path / place)

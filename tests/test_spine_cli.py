@@ -478,5 +478,6 @@ def test_a_teacher_s_world_is_its_run_s_wherever_the_run_stands(tmp_path):
     for place in (str(tmp_path), str(tmp_path / "teacher")):
         for args in ([place, "--trials", "5"], ["--trials", "5", place]):
             assert parse("teacher eval", args).world == config.world
+            assert parse("teacher eval", [*args, "--out", place]).world == config.world
     student = artifacts.finish(tmp_path / "student", "student", config, seconds=1.0, metrics={}).directory
     assert parse("teacher eval", [str(student)]).world == PRESETS["demo"].world  # and `run` says what it is

@@ -142,7 +142,7 @@ def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     student = StudentConfig(picture=PictureConfig(height_px=56, width_px=72))
     config = Config(preset="mine", world=replace(WORLD, objects=("cube",)), student=student)
     artifact = artifacts.finish(directory, "teacher", config, seconds=1.0, metrics={})
-    summary = teacher_trials.summarise(result, artifact.hash, WORLD, seed=3)
+    summary = teacher_trials.summarise(result, artifact, WORLD, seed=3)
     teacher_trials.save(directory, summary, pictures, MOMENTS)
     saved = json.loads((directory / teacher_trials.TRIALS_FILE).read_text())
     assert saved["seen"]["n"] == saved["unseen"]["n"] == 4
@@ -157,6 +157,18 @@ def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     for change in ({"teacher": "another"}, {"world": elsewhere}):
         teacher_trials.save(directory, summary | change, pictures, MOMENTS)
         assert "trials" not in build_report(tmp_path)["teacher"]
+
+
+def test_what_a_teacher_was_trained_on_is_seen_whatever_the_paper_trains_on(tmp_path):
+    config = Config(preset="mine", world=WorldConfig(objects=("lemon", "tower")))
+    artifact = artifacts.finish(tmp_path, "teacher", config, seconds=1.0, metrics={})
+    counts = {"lemon": (1, 2), "tower": (2, 2), "cube": (0, 3)}
+    objects = {name: {"successes": k, "n": n} for name, (k, n) in counts.items()}
+    result = {"success": {"successes": 3, "n": 7}, "objects": objects, "motion": []}
+    summary = teacher_trials.summarise(result, artifact, WORLD, seed=0)
+    assert (summary["seen"]["successes"], summary["seen"]["n"]) == (3, 4)
+    assert (summary["unseen"]["successes"], summary["unseen"]["n"]) == (0, 3)
+    assert summary["teacher"] == artifact.hash
 
 
 @pytest.mark.parametrize(

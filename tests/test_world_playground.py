@@ -1,5 +1,7 @@
 """The grasping task in Playground's and Brax's registries, under the wrappers of both."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -114,6 +116,28 @@ def test_braxs_own_wrappers_take_it():
     assert (env.observation_size, env.action_size, env.backend) == (40, 8, "cpu")
     start, after = traced(wrapped, jax.ShapeDtypeStruct((2,), jnp.uint32))
     assert start == after
+
+
+@pytest.mark.parametrize("of", ["brax", "playground"])
+def test_braxs_training_evaluates_it(of):
+    """`EvalWrapper`, around what `brax.training` trains on, keeps a metric of its own in the state."""
+    env: Any
+    if of == "brax":
+        env = envs.create(brax_env.NAME, episode_length=2, batch_size=4, config_overrides=ON_CPU)
+        keys = jax.random.PRNGKey(0)
+    else:
+        loaded = playground_env.PickEnv(config_overrides=ON_CPU)
+        env = wrapper.wrap_for_brax_training(loaded, episode_length=2)
+        keys = jax.random.split(jax.random.PRNGKey(0), 4)
+    env = envs.training.EvalWrapper(env)
+    state = jax.jit(env.reset)(keys)
+    step, rewards = jax.jit(env.step), []
+    for _ in range(3):  # into the next episode, which does not count
+        state = step(state, jnp.full((4, 8), 0.3))
+        rewards.append(np.asarray(state.reward))
+    counted: Any = state.info["eval_metrics"]
+    np.testing.assert_allclose(counted.episode_metrics["reward"], rewards[0] + rewards[1], rtol=1e-6)
+    assert counted.episode_steps.tolist() == [2, 2, 2, 2]
 
 
 def test_episodes_repeat_under_braxs_wrappers():

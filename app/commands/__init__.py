@@ -150,7 +150,8 @@ def _place(value: Any) -> Any:
 
 def _teacher_s_run(args: Sequence[str]) -> Path | None:
     """The run, or its teacher's folder, among the arguments of `teacher eval`, wherever it stands."""
-    places = (shipped(arg) for arg in args if arg and arg != _option(args, "--out"))
+    words = zip(("", *args), args, strict=False)
+    places = (shipped(arg) for before, arg in words if arg and before != "--out")
     return next((place for place in places if _has_teacher(place)), None)
 
 

@@ -72,7 +72,7 @@ class TeacherEval:
         if self.out is None:
             _check_own(directory, "give --out FOLDER")
         check_folder("--out", self.out or directory)
-        teacher = artifacts.read_artifact(directory).hash
+        teacher = artifacts.read_artifact(directory)
         from ddgrasp.progress import Progress
         from evaluation import teacher_trials
         from mjx_envs.grasp_env import GraspEnv

@@ -17,6 +17,8 @@ from evaluation.report.targets import MISSED, targets, verdict
 
 REPORT = "report.json"
 _TOP_LEVEL = "student_"
+_STUDY = "study.html"
+"""Page of `ddgrasp study table2`, which it writes itself."""
 TESTS_PRESET = "debug"
 """Whose figures mean nothing."""
 
@@ -85,6 +87,8 @@ def _why_nothing(run_dir: Path) -> str:
         return "is a file: name the folder it is in." if run_dir.exists() else "is not there: name a run."
     if artifacts.is_finished(run_dir):
         return f"is one finished stage: name the run that it is of, {run_dir.resolve().parent}."
+    if (study := run_dir / _STUDY).is_file():
+        return f"is a study, whose tables are in {study}: name folders of its rows, in {run_dir / 'trials'}."
     if inside := sorted(path.parent.name for path in run_dir.glob("*/trials.jsonl")):
         return f"holds trials, of {', '.join(inside)}: name one of these folders, or several."
     return "holds no finished stage: nothing to report. Start one with `ddgrasp run`."
