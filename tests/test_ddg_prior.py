@@ -262,10 +262,12 @@ def test_more_recordings_than_memory_are_refused_before_any_is_read(recordings, 
 
 def test_one_long_recording_takes_what_is_said_of_it(tmp_path):
     _record(tmp_path / "long", frames=50, size=(54, 96))
+    _record(tmp_path / "short", frames=1, size=(54, 96))
     config = DDGConfig(depth=DDGDepthConfig(height_px=54, width_px=96))
+    load(tmp_path / "short", config)  # what compiling takes is not the recording's
     tracemalloc.start()
     try:
-        frames, _ = load(tmp_path, config)
+        frames, _ = load(tmp_path / "long", config)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
