@@ -100,6 +100,8 @@ hand that has closed on nothing can try again. The paper gives a trial no limit.
 SEEN_OBJECTS = ("apple", "pear", "peach", "banana", "cube", "block")
 """The paper trains on these and tests on the others as well; `mjx_envs.objects` describes them all."""
 UNSEEN_OBJECTS = ("persimmon", "starfruit", "lemon", "can", "wheel", "bread")
+PLAIN_SHAPES = ("tower", "slab", "stick", "puck", "ring", "tin")
+"""None of the paper's: to train on besides."""
 
 # --- depth -----------------------------------------------------------------------------------
 DEPTH_FRAMES = 3

@@ -70,6 +70,11 @@ SAME_WIDTH_M = 0.002
 """Fingers that have moved by less stand on what is between them."""
 DONE_STEPS = 20
 """Control steps in a row that a hand has held something where objects are lifted to: it is done."""
+HELD_AT_M = (contract.LIFT_TARGET_M[0], contract.LIFT_TARGET_M[1], contract.LIFT_TARGET_M[2] + 0.020)
+"""Where the grip takes what it holds, so that it is where objects are lifted to: what is not held by its
+middle hangs lower, a can that is held by its end by 4 cm."""
+ARRIVED_M = 0.010
+"""A grip is there that is closer."""
 OPEN = -1.0
 """The gripper's command while it goes up."""
 
@@ -202,19 +207,29 @@ class Retry:
         return felt_nm - np.mean(self._free_nm, axis=0) if self._free_nm else felt_nm
 
     def _stay(self) -> Float[np.ndarray, "8"] | None:
-        """(8,) action of a hand that has held something at the lift's place for long enough; else None."""
+        """(8,) action of a hand that has held something at the lift's place for long enough; else None.
+
+        It goes to `HELD_AT_M`, and stays.
+        """
         state = self._now.state
         away_m = float(np.linalg.norm(self._now.grip_m - contract.LIFT_TARGET_M))
-        there = self._stay_rad is not None or away_m < contract.LIFT_TOLERANCE_M
+        there = self._lifted_steps >= DONE_STEPS or away_m < contract.LIFT_TOLERANCE_M
         if not (there and self._holds()):
             self._lifted_steps, self._stay_rad = 0, None
             return None
         self._lifted_steps += 1
+        if self._lifted_steps < DONE_STEPS:
+            return None
         if self._lifted_steps == DONE_STEPS:
-            self._stay_rad = np.array(state[STATE.arm])
             self.begun, self.done = "what was grasped is lifted; stays there", True
             self._asides_left = ASIDES
-        return None if self._stay_rad is None else _towards(self._stay_rad, state, CLOSE)
+        way_m = HELD_AT_M - self._now.grip_m
+        late = self._lifted_steps > DONE_STEPS + self._retreat_steps
+        if self._stay_rad is None and not late and np.linalg.norm(way_m) > ARRIVED_M:
+            return _moved(state, way_m, CLOSE)
+        if self._stay_rad is None:
+            self._stay_rad = np.array(state[STATE.arm])
+        return _towards(self._stay_rad, state, CLOSE)
 
     def _look(self) -> Iterator[np.ndarray] | None:
         """What to do instead of the policy, None to let it act."""
@@ -274,7 +289,7 @@ class Retry:
         for left in reversed(range(self._lifting_steps)):
             if not (left and self._holds()):
                 self._end()
-            way_m = contract.LIFT_TARGET_M - self._now.grip_m
+            way_m = HELD_AT_M - self._now.grip_m
             if self._now.grip_m[2] < ABOVE_M:
                 way_m[:2] = 0.0
             yield _moved(self._now.state, way_m, CLOSE)

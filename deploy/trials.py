@@ -101,14 +101,15 @@ def lasting(config: Config, seconds: float) -> Config:
     return replace(config, world=replace(config.world, episode_steps=steps))
 
 
-RULES: dict[str, Any] = {"rules": 4, "ends": "with success, as judged then"}
+RULES: dict[str, Any] = {"rules": 5, "ends": "with success, as judged then"}
 """What a trial is, besides policy, configuration and series: a log goes on by the rules that it began with.
 
 The number goes up with every change of loop, driver or rig that a trial can tell. Before 2026-11-27 there was
 none; with 1 a hand on the FR3 rig began as wide as the trial before had left it; with 2 the safety filter did
-not know the fingers; with 3 a hand might close and open again in one place without end. `ends`: trials of
-before 2026-11-25 were judged when their time was over; until a day later, those that success had ended were
-judged again on the development rig a control period later."""
+not know the fingers; with 3 a hand might close and open again in one place without end; with 4 what a hand
+held by its end hung beside its place for good. `ends`: trials of before 2026-11-25 were judged when their
+time was over; until a day later, those that success had ended were judged again on the development rig a
+control period later."""
 
 
 Watch = Callable[[Step, Filmed], bool | None]

@@ -209,7 +209,7 @@ def check_demos(source: DepthSource, demos: EpisodeStore) -> None:
     if source.needs_rgb and "rgb" not in demos.fields:
         raise UserError(
             f"{demos.path} holds no colour, which the student's depth source needs: collect demos "
-            "without --demos.no-rgb, or take another student.depth_source."
+            "with --demos.rgb, or take another student.depth_source."
         )
     if source.needs_views:
         check_views(demos)

@@ -22,6 +22,6 @@ def check_source(config: Config) -> None:
     needs_rgb = by_network if name in LEARNED else name in (*BY_COLOUR, "monocular")
     if needs_rgb and not config.demos.rgb:
         raise UserError(
-            f"student.depth_source {name!r} needs colour in the demos, and demos.rgb is false: leave "
-            "out --demos.no-rgb, or take another source."
+            f"student.depth_source {name!r} needs colour in the demos, and demos.rgb is false: give "
+            "--demos.rgb, or take another source."
         )

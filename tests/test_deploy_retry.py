@@ -15,11 +15,13 @@ from deploy.loop import ControlLoop, LoopSettings
 from deploy.policy import OnnxPolicy
 from deploy.retry import (
     ABOVE_M,
+    ARRIVED_M,
     CLEAR_M,
     CLOSING_STEPS,
     DONE_STEPS,
     EMPTY_STEPS,
     FELT_STEPS,
+    HELD_AT_M,
     LIFTING_STEPS,
     LOW_M,
     RETREAT_STEPS,
@@ -169,7 +171,7 @@ def test_a_hand_that_has_held_something_for_a_while_lifts_it_and_keeps_it():
     assert begun[0] == "it has held something for 1 s; lifts it" and not any(begun[1:-1]) and retry.done
     low = np.array([way for way in ways_m if way[2] < ABOVE_M])
     assert len(low) > 2 and np.abs(low[:, :2] - low[0, :2]).max() < 0.01, "straight up first"
-    assert np.linalg.norm(ways_m[-1] - contract.LIFT_TARGET_M) < 0.01
+    assert np.linalg.norm(ways_m[-1] - HELD_AT_M) < ARRIVED_M
 
 
 def test_a_hand_that_drags_what_it_holds_along_the_table_lifts_it_too():
@@ -267,6 +269,31 @@ def test_a_hand_that_has_lifted_something_stays_there_until_it_has_lost_it():
     assert action is not None and not retry.begun
     np.testing.assert_allclose(drifted + contract.ACTION_SCALE_RAD * action[ACTION.arm], lifted)
     assert retry(state(lifted, OPEN)) is None, "it has dropped it: the policy's turn"
+
+
+def test_what_hangs_lower_than_the_fingers_is_brought_to_its_place():
+    """An object held by its end, 4 cm below and 2 cm beside the grip, does not count as lifted."""
+    retry, q_rad = Retry(), HOME + np.array([0.05, 0.17, 0, 0.57, 0, -0.58, 0])
+    start_m, hangs_m = grip_position(q_rad), np.array([-0.020, 0.010, -0.040])
+    assert np.linalg.norm(start_m - contract.LIFT_TARGET_M) < contract.LIFT_TOLERANCE_M
+    assert np.linalg.norm(start_m + hangs_m - contract.LIFT_TARGET_M) > contract.LIFT_TOLERANCE_M
+    told(retry, q_rad, HOLDING, DONE_STEPS - 1)
+    for _ in range(10):
+        action = retry(state(q_rad, HOLDING))
+        assert action is not None and closes(action)
+        q_rad = q_rad + contract.ACTION_SCALE_RAD * action[ACTION.arm]
+    assert (
+        np.linalg.norm(grip_position(q_rad) + hangs_m - contract.LIFT_TARGET_M)
+        < 0.9 * contract.LIFT_TOLERANCE_M
+    )
+    assert not told(retry, q_rad, HOLDING, 1)[0][ACTION.arm].any(), "and stays there"
+
+
+def test_an_arm_that_does_not_get_there_stays_where_it_is():
+    retry, q_rad = Retry(), HOME + np.array([0.05, 0.17, 0, 0.57, 0, -0.58, 0])
+    told(retry, q_rad, HOLDING, DONE_STEPS)
+    assert all(action[ACTION.arm].any() for action in told(retry, q_rad, HOLDING, RETREAT_STEPS))
+    assert not any(action[ACTION.arm].any() for action in told(retry, q_rad, HOLDING, 5))
 
 
 def test_a_step_without_a_frame_gives_nothing_that_is_lifted_back_to_the_policy():

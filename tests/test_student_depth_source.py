@@ -269,7 +269,7 @@ def test_the_rigs_camera_looks_at_clean_depth_in_colour(demos, tmp_path):
     assert 0.6 < np.mean(seen > 0) < 1.0
     assert np.median(np.abs(seen.astype(int) - depth)[seen > 0]) < 20
     assert np.mean(source.frames(depth, dark, number, number) > 0) < np.mean(seen > 0) - 0.2
-    with pytest.raises(UserError, match=r"holds no colour, .* --demos.no-rgb"):
+    with pytest.raises(UserError, match=r"holds no colour, .* --demos.rgb"):
         check_demos(source, demos)
 
 
@@ -283,7 +283,7 @@ def test_missing_colour_is_refused_before_the_first_stage():
     preset = get_preset("debug")
     coloured = replace(preset, student=replace(preset.student, depth_source="stereo"))
     wanting = replace(coloured, demos=replace(preset.demos, rgb=False))
-    with pytest.raises(UserError, match=r"'stereo' needs colour in the demos, .* --demos.no-rgb") as error:
+    with pytest.raises(UserError, match=r"'stereo' needs colour in the demos, .* --demos.rgb") as error:
         check_config_values(wanting)
     assert "\n" not in str(error.value)
     check_config_values(replace(coloured, demos=replace(preset.demos, rgb=True)))

@@ -88,6 +88,7 @@ def test_the_paper_s_twelve_are_there_and_told_apart():
     assert (len(set(SEEN)), len(set(UNSEEN)), len(set(TWELVE))) == (6, 6, 12)
     assert set(TWELVE) <= set(OBJECTS)
     assert not set(OBJECTS) & set(SHAPES)
+    assert tuple(SHAPES) == contract.PLAIN_SHAPES
     assert len({spec.category_id for spec in EVERYTHING.values()}) == len(EVERYTHING)
     assert all(spec.category_id >= 1 for spec in EVERYTHING.values())
     assert all(spec.source for spec in EVERYTHING.values())
