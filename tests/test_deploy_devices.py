@@ -573,6 +573,15 @@ def test_every_pair_is_refused_or_can_be_made(recording):
         registry.make_devices(metres)
 
 
+@pytest.mark.parametrize(("camera", "why"), [("stereo", "sees the simulated rig"), ("replay", "blindly")])
+def test_another_driver_s_arm_is_not_driven_by_the_past_or_the_rig_s_camera(camera, why, monkeypatch):
+    monkeypatch.setitem(registry.ROBOTS, "mine", lambda setup: KinematicRobot(setup.clock))
+    options = SessionOptions("mine", camera, Path("r") if camera == "replay" else None)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=f"'{camera}' .*{why}.*use --camera realsense") as refused:
+        registry.check_devices(options)
+    assert "robot 'mine'" in str(refused.value)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -35,14 +35,15 @@ IMAGERS: Mapping[str, Callable[[Setup], Imager]] = {
 }
 """What calibration looks through, by the camera's name."""
 REFUSED: Mapping[tuple[str, str], str] = {
-    ("franka", "stereo"): "camera 'stereo' sees the simulated rig alone, not robot 'franka': "
+    ("franka", "stereo"): "camera 'stereo' sees the simulated rig alone, not robot {robot!r}: "
     "use --camera realsense.",
-    ("franka", "replay"): "camera 'replay' shows the past: robot 'franka' would move blindly; "
+    ("franka", "replay"): "camera 'replay' shows the past: robot {robot!r} would move blindly; "
     "use --camera realsense.",
     ("sim", "rig"): "camera 'rig' sees the FR3 rig, not robot 'sim': use --camera stereo, or --robot franka.",
     ("sim", "rig-ideal"): "camera 'rig-ideal' sees the FR3 rig, not robot 'sim': use --camera stereo.",
 }
-"""(robot, camera) that make no sense together, and why; all others do."""
+"""(robot, camera) that make no sense together, and why; all others do. What holds for 'franka' does for every
+robot that is no simulation."""
 
 
 def check_devices(options: SessionOptions) -> None:
@@ -51,8 +52,9 @@ def check_devices(options: SessionOptions) -> None:
         raise unknown_name("robot", options.robot, ROBOTS)
     if options.camera not in CAMERAS:
         raise unknown_name("camera", options.camera, CAMERAS)
-    if reason := REFUSED.get((options.robot, options.camera)):
-        raise UserError(reason)
+    kind = "sim" if options.robot == "sim" else "franka"
+    if reason := REFUSED.get((kind, options.camera)):
+        raise UserError(reason.format(robot=options.robot))
     if options.camera == "replay" and options.recording is None:
         raise UserError("camera 'replay' needs --recording DIR (one recording, as `ddgrasp record` writes).")
 
