@@ -64,8 +64,9 @@ def test_a_run_s_place_is_looked_at_before_what_lies_in_it(out, tmp_path):
 # --- Ctrl-C --------------------------------------------------------------------------------------
 
 WORKS_ON = """
-import atexit, os, sys, time, types
+import atexit, os, signal, sys, time, types
 from app import cli, commands
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has it ignored in the background
 class Engine:
     def __del__(self, write=os.write):
         write(1, b"taken apart")
