@@ -223,11 +223,11 @@ class Retry:
         if self._lifted_steps == DONE_STEPS:
             self.begun, self.done = "what was grasped is lifted; stays there", True
             self._asides_left = ASIDES
-        way_m = HELD_AT_M - self._now.grip_m
-        late = self._lifted_steps > DONE_STEPS + self._retreat_steps
-        if self._stay_rad is None and not late and np.linalg.norm(way_m) > ARRIVED_M:
-            return _moved(state, way_m, CLOSE)
         if self._stay_rad is None:
+            way_m = HELD_AT_M - self._now.grip_m
+            late = self._lifted_steps > DONE_STEPS + self._retreat_steps
+            if not late and np.linalg.norm(way_m) > ARRIVED_M:
+                return _moved(state, way_m, CLOSE)
             self._stay_rad = np.array(state[STATE.arm])
         return _towards(self._stay_rad, state, CLOSE)
 
