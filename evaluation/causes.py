@@ -107,9 +107,12 @@ def run(
         row's own and count for nothing. UserError for what rig fr3 alone has: contact, shapes, coarse camera.
     """
     series = replace(series, rig="development")
-    config = one_pose(series.configured(config, policy))
+    trained, config = config.world.objects, one_pose(series.configured(config, policy))
     trials = series.plan()
-    belong_to = rig_trials.made_with(config, policy) | {"number": series.number, "seconds": series.seconds}
+    belong_to = rig_trials.made_with(config, policy, trained) | {
+        "number": series.number,
+        "seconds": series.seconds,
+    }
     headers = {name: belong_to | {"row": name} for name in names}
     for name, header in headers.items():
         rig_trials.check_log(out / name, header)

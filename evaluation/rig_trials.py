@@ -35,9 +35,10 @@ EVERYTHING = "all"
 _SAME = ("rig", "shapes", "split", "number", "seconds", "ends", "rules")
 """What the headers of two logs agree on where trial i of an object is the same trial, besides `_DRAWS`."""
 _DRAWS = "draws_hash"
-_ADDED = ("seconds", _DRAWS)
-"""What older headers do not name, those of `study causes` the seconds, and what `config_hash` covers: a log
-goes on without."""
+_TRAINED = "trained"
+_ADDED = ("seconds", _DRAWS, _TRAINED)
+"""What older headers do not name, those of `study causes` the seconds, and what `config_hash` covers or tells
+of the policy: a log goes on without."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class Series:
         """`config` with the trials' length, seed, objects and the arm's limits. UserError if `policy` is no
         policy that can be run, or a limit not one that an arm has."""
         OnnxPolicy(policy, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None)
-        world = replace(config.world, objects=_trained())
+        world = replace(config.world, objects=_listed())
         deploy = config.deploy if self.retry is None else replace(config.deploy, retry=self.retry)
         if self.contact is not None:
             deploy = stopping_at(deploy, self.contact)
@@ -122,10 +123,10 @@ class Series:
     def known(self) -> tuple[str, ...]:
         """Every object that the rig has."""
         if self.rig == "development" or self.shapes == "primitive":
-            return _trained()
+            return _listed()
         from rig.meshes.objects import MESH_OBJECTS
 
-        return (*_trained(), *(name for name in MESH_OBJECTS if name not in _trained()))
+        return (*_listed(), *(name for name in MESH_OBJECTS if name not in _listed()))
 
 
 def run(
@@ -137,13 +138,14 @@ def run(
     Leaves trials.jsonl, table.json and films in `out`: each object's first success, its first `failures`;
     with `record` a folder in `EPISODES` for every trial, as a deployment leaves it.
     """
+    header = _header(config, policy, series)
     config = series.configured(config, policy)
-    header, make = _header(config, policy, series), series.make(config)
+    make = series.make(config)
     if record:
         _check_recorded(out)
         make = RecordedBench(make, out / EPISODES, {"robot": f"rig {series.rig}", "camera": series.camera})
     results = run_missing(config, policy, series.plan(), make, header, out, workers, progress, failures)
-    table = tabulate(results)
+    table = tabulate(results, trained_on(header))
     atomic_write_text(out / TABLE_FILE, json.dumps({"series": asdict(series), **table}, indent=1) + "\n")
     return table
 
@@ -177,7 +179,7 @@ def run_missing(
 
 def check_place(config: Config, policy: Path, series: Series, out: Path) -> None:
     """UserError if `out` has trials of something else than `run` would add to them. Writes nothing."""
-    check_log(out, _header(series.configured(config, policy), policy, series))
+    check_log(out, _header(config, policy, series))
 
 
 def check_log(out: Path, header: dict[str, Any]) -> None:
@@ -208,14 +210,27 @@ def _keep(out: Path, result: TrialResult, film: Film) -> None:
     atomic_write_bytes(out / f"{result.object_name}-{result.index}-{outcome}.png", sheet)
 
 
-def tabulate(results: Sequence[TrialResult]) -> dict[str, Any]:
-    """Success with Wilson intervals by object and in total: of all, seen, unseen and other objects; failures
-    by mode (`evaluation.failure_modes.count`)."""
+def trained_on(header: Mapping[str, Any]) -> tuple[str, ...]:
+    """The objects that a log's policy was trained on; headers of before 2026-11-28 do not say, and are taken
+    for those of the paper's."""
+    return tuple(header.get(_TRAINED, contract.SEEN_OBJECTS))
+
+
+def tabulate(
+    results: Sequence[TrialResult], trained: Sequence[str] = contract.SEEN_OBJECTS
+) -> dict[str, Any]:
+    """Success with Wilson intervals by object and in total; failures by mode
+    (`evaluation.failure_modes.count`).
+
+    Totals are of all objects, of seen ones, which are those `trained` on, of the paper's other ones (unseen)
+    and of those that no list has (other).
+    """
     names = tuple(dict.fromkeys(result.object_name for result in results))
+    new = [name for name in names if name not in trained]
     groups = {
-        "seen": contract.SEEN_OBJECTS,
-        "unseen": contract.UNSEEN_OBJECTS,
-        "other": tuple(name for name in names if name not in _trained()),
+        "seen": trained,
+        "unseen": [name for name in new if name in _listed()],
+        "other": [name for name in new if name not in _listed()],
         "all": names,
     }
     rows = {
@@ -236,8 +251,8 @@ def describe(table: dict[str, Any]) -> str:
     return "\n".join([*lines, f"failures: {failure_modes.describe(table['failures'])}"])
 
 
-def _trained() -> tuple[str, ...]:
-    """The twelve objects of training's lists."""
+def _listed() -> tuple[str, ...]:
+    """The paper's twelve objects, seen and unseen."""
     return (*contract.SEEN_OBJECTS, *contract.UNSEEN_OBJECTS)
 
 
@@ -247,11 +262,16 @@ def _success(results: Iterable[TrialResult]) -> dict[str, Any]:
 
 
 def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
-    """What the trials belong to; how many of which objects may grow."""
+    """What the trials belong to; how many of which objects may grow.
+
+    Args:
+      config: the policy's own, with the objects that it was trained on.
+    """
+    trained, config = config.world.objects, series.configured(config, policy)
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
     deploy = config.deploy
-    return made_with(config, policy) | bench | {
+    return made_with(config, policy, trained) | bench | {
         "contact": deploy.franka.contact_force_n, "retry": deploy.retry,
     }  # fmt: skip
 
@@ -278,12 +298,13 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any], alike: Sequence[
     return [f"{key} is {here}, not {there}" for key, (here, there) in pairs.items() if here != there]
 
 
-def made_with(config: Config, policy: Path) -> dict[str, Any]:
-    """Policy, configuration and rule in the header of a log of trials."""
+def made_with(config: Config, policy: Path, trained: Sequence[str]) -> dict[str, Any]:
+    """Policy, what it was `trained` on, configuration and rule in the header of a log of trials."""
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),
         _DRAWS: _draws_hash(config),
+        _TRAINED: list(trained),
     } | RULES
 
 

@@ -139,6 +139,9 @@ def test_the_table_counts_groups_and_faults():
     assert counts == {"seen": (3, 4), "unseen": (0, 1), "other": (1, 1), "all": (4, 6)}
     assert table["faults"] == 1 and table["objects"]["apple"]["rate"] == 0.75
     assert "apple        75.0 % of 4" in rig_trials.describe(table)
+    trained_otherwise = rig_trials.tabulate(results, ("wheel", "mug"))
+    assert [trained_otherwise[group]["n"] for group in ("seen", "unseen")] == [2, 4]
+    assert "other" not in trained_otherwise
 
 
 def test_the_arm_s_limits_are_the_configuration_s_or_the_series_in_proportion(tmp_path):

@@ -201,13 +201,25 @@ def test_a_log_of_before_goes_on_and_keeps_its_header(tmp_path, policy):
     rig_trials.run(CONFIG, policy, SERIES, tmp_path, 0, QUIET)
     log = tmp_path / rig_trials.TRIALS_FILE
     header, *trials = log.read_text().splitlines(keepends=True)
-    before = {key: value for key, value in json.loads(header).items() if key != "draws_hash"}
+    before = {key: value for key, value in json.loads(header).items() if key not in ("draws_hash", "trained")}
     log.write_text("".join([json.dumps(before) + "\n", *trials]))
     rig_trials.run(CONFIG, policy, replace(SERIES, trials=2), tmp_path, 0, QUIET)
     assert read_log(log)[0] == before and len(read_log(log)[1]) == 2
     other = replace(CONFIG, world=replace(CONFIG.world, random=replace(CONFIG.world.random, joint_rad=0.0)))
     with pytest.raises(UserError, match="begun otherwise: config_hash is"):
         rig_trials.run(other, policy, SERIES, tmp_path, 0, QUIET)
+
+
+def test_what_a_policy_was_trained_on_is_seen_whichever_list_has_it(tmp_path, policy):
+    config = replace(CONFIG, world=replace(CONFIG.world, objects=("wheel", "tin")))
+    series = replace(SERIES, objects=("wheel", "apple"), trials=1)
+    table = rig_trials.run(config, policy, series, tmp_path, 0, QUIET)
+    assert read_log(tmp_path / rig_trials.TRIALS_FILE)[0]["trained"] == ["wheel", "tin"]
+    found = trials_page.find(tmp_path)
+    assert found
+    for made in (table, found.table):
+        assert made["seen"]["n"] == made["unseen"]["n"] == 1
+    assert "wheel, tin" in trials_page.write(found).read_text()
 
 
 # --- one process at a time -----------------------------------------------------------------------

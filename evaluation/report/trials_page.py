@@ -14,7 +14,7 @@ from evaluation import failure_modes, paired, wilson
 from evaluation.report import success_chart
 from evaluation.report.comparison import COMPARISON_HTML, COMPARISON_PNG
 from evaluation.report.html import REPORT_HTML, contents, film, heading, image, page, table
-from evaluation.rig_trials import TRIALS_FILE, differing, shown, tabulate
+from evaluation.rig_trials import TRIALS_FILE, differing, shown, tabulate, trained_on
 from evaluation.treatments import RECORDED
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
@@ -44,7 +44,7 @@ class Trials:
     @cached_property
     def table(self) -> dict[str, Any]:
         """See `evaluation.rig_trials.tabulate`."""
-        return tabulate(self.results)
+        return tabulate(self.results, trained_on(self.belong_to))
 
 
 def find(folder: Path) -> Trials | None:
@@ -132,7 +132,8 @@ def _settings(trials: Trials) -> list[tuple[str, str]]:
     said = {"trials": f"{sum(counts)}, {each}"}
     if "rig" in trials.belong_to:
         said["depth"] = RECORDED  # what the header leaves out
-    return [(name, str(value)) for name, value in (said | shown(trials.belong_to)).items()]
+    given = said | shown(trials.belong_to)
+    return [(k, ", ".join(v) if isinstance(v, list) else str(v)) for k, v in given.items()]
 
 
 def _outcomes(trials: Trials) -> dict[tuple[int, str], bool]:

@@ -103,7 +103,10 @@ def _set(folder: Path) -> dict[str, Any]:
     belong_to = headers.get(TABLES["main"].reference) or next(iter(headers.values()), {})
     return {
         "trials": {key: value for key, value in rig_trials.shown(belong_to).items() if key in same},
-        "rows": {name: rig_trials.tabulate(results) for name, results in tried.items()},
+        "rows": {
+            name: rig_trials.tabulate(results, rig_trials.trained_on(headers[name]))
+            for name, results in tried.items()
+        },
         "tables": {name: compare(table, _without(apart[name], tried)) for name, table in TABLES.items()},
         "apart": apart,
     }
