@@ -91,7 +91,8 @@ def load_frames(
     (sensors/recordings/recording.py), or memory is too small for them, before any is read.
     """
     folders = _folders(root)
-    pictures = sum(1 for folder in folders for _ in (folder / "depth").glob("*.png"))
+    files = (file for folder in folders for file in (folder / "depth").glob("*"))
+    pictures = sum(file.suffix.lower() == ".png" for file in files)
     host = frames_bytes(config, pictures if max_frames is None else min(pictures, max_frames))
     memory.check(memory.Need("ddg", 0, host, remedy="the number of recordings"), root)
     most = sys.maxsize if max_frames is None else max_frames

@@ -252,11 +252,19 @@ def test_arrays_that_are_no_numbers_are_left_out(tmp_path, capsys):
     for file, array in zip(names, arrays, strict=True):
         np.save(file.with_suffix(".npy"), array)
         file.unlink()
+    np.savez(root / "depth" / "0005_depth", metres)
+    (root / "depth" / "0005_depth.npz").rename(root / "depth" / "0005_depth.npy")
+    with open(root / "depth" / "0006_depth.npy", "wb") as file:  # says more than any machine holds
+        np.lib.format.write_array_header_1_0(
+            file, np.lib.format.header_data_from_array_1_0(metres) | {"shape": (2**20, 2**21)}
+        )
     run(root, "--out", tmp_path / "out")
     np.testing.assert_array_equal(Recording.open(tmp_path / "out" / "desk").depth_mm(0), depth_mm(4))
     shown = capsys.readouterr().out
     for kind in ("<U3", "bool", "complex128", "int8"):
         assert f"depth is {kind}" in shown, kind
+    for name in ("0005", "0006"):
+        assert f"left out {name}_depth.npy: depth cannot be read" in shown, name
 
 
 def test_a_full_disk_leaves_nothing_of_what_can_be_imported_again(tmp_path, monkeypatch):
@@ -275,6 +283,38 @@ def test_numbers_in_names_count_as_numbers(tmp_path):
     importers.import_recording(importers.folder_source(root, 0.0, {}), tmp_path / "out")
     read = Recording.open(tmp_path / "out")
     assert [int(read.depth_mm(i).max()) for i in range(12)] == list(range(600, 612))
+
+
+def test_pictures_named_by_their_times_have_the_nearest_colour(tmp_path, capsys):
+    root = make_folder(tmp_path / "desk", frames=0)
+    for i in range(6):  # as TUM's: seconds, the colour camera 11 ms later and once silent
+        stamp = 1305031102.16 + i / 30
+        cv2.imwrite(str(root / "depth" / f"{stamp:.6f}.png"), 5 * depth_mm(i))
+        if i != 3:
+            colour = np.full((*SIZE, 3), 10 * i, np.uint8)
+            cv2.imwrite(str(root / "rgb" / f"{stamp + 0.011:.6f}.png"), colour)
+    run(root, "--out", tmp_path / "out", "--depth-unit-m", "0.0002", "--consecutive")
+    read = Recording.open(tmp_path / "out" / "desk")
+    assert [int(read.rgb(i)[0, 0, 0]) for i in range(len(read))] == [0, 10, 20, 40, 50]
+    np.testing.assert_array_equal(read.depth_mm(4), depth_mm(5))
+    assert not read.consecutive
+    shown = capsys.readouterr().out
+    assert "colour of 5 frames is the nearest by the times in their names, up to 0.011000 away" in shown
+    assert "1305031102.260000.png: colour is missing" in shown
+
+
+@pytest.mark.parametrize("name", ["frame-{:06d}.{}", "{1}-{0:03d}", "{:d}"])
+def test_a_pair_has_one_name_but_for_which_of_the_two_it_is(tmp_path, name):
+    root = make_folder(tmp_path / "desk", frames=0)
+    for i in (0, 1, 2, 10, 11):
+        cv2.imwrite(str(root / "depth" / f"{name.format(i, 'depth')}.png"), depth_mm(i))
+        if i != 2:
+            cv2.imwrite(
+                str(root / "rgb" / f"{name.format(i, 'color')}.png"), np.full((*SIZE, 3), i, np.uint8)
+            )
+    run(root, "--out", tmp_path / "out")
+    read = Recording.open(tmp_path / "out" / "desk")
+    assert [int(read.rgb(i)[0, 0, 0]) for i in range(len(read))] == [0, 1, 10, 11]
 
 
 def test_a_folder_s_recording_has_its_whole_name(tmp_path, monkeypatch):

@@ -315,6 +315,7 @@ def test_a_recording_is_never_overwritten(tmp_path, monkeypatch):
 def test_seconds_and_rate_make_the_number_of_frames():
     assert frame_count(0, 10.0, 30) == 300
     assert frame_count(0, 0.25, 10) == 3
+    assert frame_count(0, 8.3, 30) == 249  # in binary 8.3 x 30 is a little more
     assert frame_count(7, 10.0, 30) == 7
 
 

@@ -238,7 +238,8 @@ def tell_fit(config: Config, data: Path, directory: Path, most: int | None = Non
 
     if config.ddg.sampling.sampler == PROGRESSIVE:
         distil.check(config.ddg)
-    frames = sum(1 for folder in recording_folders(data) for _ in (folder / "depth").glob("*.png"))
+    files = (file for folder in recording_folders(data) for file in (folder / "depth").glob("*"))
+    frames = sum(file.suffix.lower() == ".png" for file in files)
     need = ddg_memory.need(config, frames if most is None else min(most, frames))
     memory.check(need, directory)
     print(need, file=sys.stderr, flush=True)

@@ -26,7 +26,7 @@ from sensors.recordings.recording import (
     UNIT_CHECK_FRAMES,
     check_fields,
 )
-from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, in_time
+from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, in_time, paired
 from sensors.recordings.writer import RecordingWriter
 
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
@@ -38,7 +38,6 @@ KEPT_META = (
     "licence", "source",
 )  # fmt: skip
 """What is taken over of a folder's own meta.json."""
-_ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
 
 
 @dataclass(frozen=True)
@@ -51,12 +50,14 @@ class Imported:
     """Frames left out: name and reason."""
     loss: str = ""
     """What of its depth did not fit into the format, if anything."""
+    note: str = ""
+    """See `Source`."""
 
     @property
     def lines(self) -> list[str]:
-        """For people: what was left out, a line each, and `loss`."""
-        left_out = [f"{self.path}: left out {what}" for what in self.skipped]
-        return [*left_out, f"{self.path}: {self.loss}"] if self.loss else left_out
+        """For people: what was left out, a line each, `loss` and `note`."""
+        said = [f"left out {what}" for what in self.skipped] + [self.loss] + [self.note]
+        return [f"{self.path}: {text}" for text in said if text]
 
 
 def import_recording(source: Source, path: Path) -> Imported:
@@ -104,7 +105,7 @@ def import_recording(source: Source, path: Path) -> Imported:
                 f"{source.path}: none of its {len(skipped)} frames can be used "
                 f"({skipped[0] if skipped else 'it is empty'})."
             )
-    return Imported(path, frames, tuple(skipped), loss)
+    return Imported(path, frames, tuple(skipped), loss, source.note)
 
 
 def _loss(frame: RawFrame, unit_m: float) -> str:
@@ -139,7 +140,7 @@ def import_all(
 def _name(source: Path) -> str:
     """The name of the recording made of it: a folder's own, a file's without what says its type."""
     source = Path(os.path.abspath(source))  # a link keeps its name
-    return source.stem if source.suffix in REALSENSE_SUFFIXES else source.name
+    return source.stem if source.suffix.lower() in REALSENSE_SUFFIXES else source.name
 
 
 def summary(done: list[Imported], refused: list[str]) -> str:
@@ -225,7 +226,7 @@ def folder_sources(root: Path, depth_unit_m: float, meta: dict[str, Any]) -> tup
 
 
 def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> Source:
-    """Pictures depth/*.png (16 bits), .npy or .tif, matched by name with those of the colour folder.
+    """Pictures depth/*.png (16 bits), .npy or .tif, matched with those of the colour folder (`paired`).
 
     `depth_unit_m` 0 takes that of the folder's own meta.json, if it is or was a recording; without one,
     millimetres for integers, metres for floats. `meta` comes before that file's KEPT_META.
@@ -243,15 +244,16 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
         first = next((d for d in map(_read_depth, files) if d is not None and _is_depth(d)), None)
         floats = first is not None and np.issubdtype(first.dtype, np.floating)
         depth_unit_m = 1.0 if floats else DEPTH_UNIT_M
-    colors = {_key(p): p for p in _color_folder(folder).iterdir() if p.suffix.lower() in COLOR_SUFFIXES}
+    colors = (p for p in _color_folder(folder).iterdir() if p.suffix.lower() in COLOR_SUFFIXES)
+    pairs, note = paired(files, sorted(colors))
 
     def frames() -> Iterator[RawFrame]:
         for file in files:
-            color = colors.get(_key(file))
+            color = pairs.get(file)
             yield RawFrame(file.name, _read_depth(file), None if color is None else _read_rgb(color))
 
     kept = {name: own[name] for name in KEPT_META if name in own}
-    return Source(folder, frames, depth_unit_m, {**kept, **meta})
+    return Source(folder, frames, depth_unit_m, {**kept, **meta}, note=note)
 
 
 def _own_meta(file: Path) -> dict[str, Any]:
@@ -283,18 +285,13 @@ def _color_folder(folder: Path) -> Path:
     return next(folder / name for name in COLOR_FOLDERS if (folder / name).is_dir())
 
 
-def _key(file: Path) -> str:
-    """The file's name without what says whether it is depth or colour: 0007_depth and 0007_rgb are a pair."""
-    words = file.stem.lower().replace("-", "_").split("_")
-    return "_".join(word for word in words if word not in _ROLE_WORDS)
-
-
 def _read_depth(file: Path) -> np.ndarray | None:
     if file.suffix.lower() == ".npy":
         try:
-            return np.load(file, allow_pickle=False)
-        except (ValueError, EOFError, OSError):
+            array = np.load(file, allow_pickle=False)
+        except (ValueError, EOFError, OSError, MemoryError):  # the last of a header that claims too much
             return None
+        return array if isinstance(array, np.ndarray) else None  # several under one name are no picture
     return _read_picture(file, cv2.IMREAD_UNCHANGED)
 
 
@@ -325,10 +322,10 @@ def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple
         raise UserError(
             f"{path}: no such file or folder; expected a .bag or .db3, a folder of them, or one of pictures."
         )
-    if path.is_file() and path.suffix not in REALSENSE_SUFFIXES:
+    if path.is_file() and path.suffix.lower() not in REALSENSE_SUFFIXES:
         raise UserError(f"{path}: a file of type {path.suffix!r}; expected a RealSense .bag or .db3.")
     inside = [path] if path.is_file() else _visible(path)
-    files = [file for file in inside if file.suffix in REALSENSE_SUFFIXES]
+    files = [file for file in inside if file.suffix.lower() in REALSENSE_SUFFIXES]
     if not files:
         return folder_sources(path, depth_unit_m, meta)
     from sensors.recordings.realsense import file_source

@@ -102,7 +102,7 @@ def frame_count(frames: int, seconds: float, hz: int) -> int:
         return frames
     if not 0 < seconds <= LONGEST_S:
         raise UserError(f"--seconds is {seconds:g}; expected more than 0, up to {LONGEST_S:g}.")
-    return max(1, math.ceil(seconds * hz))
+    return max(1, math.ceil(round(seconds * hz, 6)))  # 8.3 s at 30 Hz are 249 frames, not one more
 
 
 def new_path(out: Path, name: str) -> Path:

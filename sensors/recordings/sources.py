@@ -1,10 +1,13 @@
 """Where recordings come from: frames in time order, as a file, a folder or a camera has them."""
 
 import re
-from collections.abc import Callable, Iterator
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,7 @@ from jaxtyping import UInt8
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 """Those of colour pictures, in small or capital letters."""
+_ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,8 @@ class Source:
     """Whether depths that cannot be a D4xx's are the scene's fault, not the unit's."""
     closing_meta: Callable[[], dict[str, Any]] = dict
     """Fields of meta.json that are known after the last frame alone."""
+    note: str = ""
+    """What people ought to know of its frames, if anything."""
     cut_short: Callable[[OSError], None] | None = None
     """What is told that a frame could not be written, where the frames before are kept then, since they come
     but once; None keeps none."""
@@ -51,3 +57,42 @@ def in_time(file: Path) -> list[tuple[Decimal, str]]:
     """
     parts = enumerate(re.split(r"(\d+(?:\.\d+)?)", file.name))  # text and numbers in turn
     return [(Decimal(part), "") if place % 2 else (Decimal(-1), part) for place, part in parts]
+
+
+def paired(depth: Sequence[Path], color: Sequence[Path]) -> tuple[dict[Path, Path], str]:
+    """(the colour picture of each depth picture that has one, what is to be said of that).
+
+    A pair has one name but for what says which of the two it is (0007_depth and 0007_rgb). A picture without
+    such a partner, but named by its time, has the nearest in time, if that is less than half a period away:
+    half of the median between depth pictures, in whatever unit the names are.
+    """
+    named = {_key(file): file for file in color}
+    pairs = {file: named[_key(file)] for file in depth if _key(file) in named}
+    times = {file: time for file in depth if (time := _time(file)) is not None}
+    colors = sorted((time, file) for file in color if (time := _time(file)) is not None)
+    if len(pairs) == len(depth) or len(times) < 2 or not colors:
+        return pairs, ""
+    half = median(b - a for a, b in pairwise(sorted(times.values()))) / 2
+    apart = [Decimal(0)]
+    for file in times.keys() - pairs.keys():
+        at = bisect_left(colors, (times[file],))
+        around = colors[max(0, at - 1) : at + 1]
+        away, nearest = min((abs(time - times[file]), other) for time, other in around)
+        if away < half:
+            pairs[file] = nearest
+            apart.append(away)
+    count = len(apart) - 1
+    said = f"colour of {count} frames is the nearest by the times in their names, up to {max(apart)} away"
+    return pairs, said if count else ""
+
+
+def _key(file: Path) -> str:
+    """The file's name without what says whether it is depth or colour: 0007_depth and 0007_rgb are a pair."""
+    words = re.split(r"[-_.]", file.stem.lower())
+    return "_".join(word for word in words if word not in _ROLE_WORDS)
+
+
+def _time(file: Path) -> Decimal | None:
+    """The only number in a name; None of one with several or none."""
+    numbers = re.findall(r"\d+(?:\.\d+)?", file.stem)
+    return Decimal(numbers[0]) if len(numbers) == 1 else None
