@@ -32,16 +32,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(user_cache("jax")))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     try:
-        return _dispatch(list(sys.argv[1:] if argv is None else argv))
+        return _printed(list(sys.argv[1:] if argv is None else argv))
     except KeyboardInterrupt as interrupt:
         interrupted.append(True)
         return _fail(str(interrupt) or "Interrupted.", _INTERRUPTED)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _give_up_output()
         return 1
     except Exception as error:
         if (message := _one_line(error)) is None:
             raise
+        _give_up_output()
         return _fail(message, 2 if type(error).__name__ == "UserError" else 1)
 
 
@@ -53,6 +54,25 @@ def _leave(interrupted: Sequence[bool]) -> None:
             with contextlib.suppress(OSError, ValueError):  # whoever read it may have gone
                 stream.flush()
         os._exit(_INTERRUPTED)
+
+
+def _printed(argv: list[str]) -> int:
+    """`_dispatch`, and what it printed written as well: what fails at that can be told now, not later."""
+    try:
+        status = _dispatch(argv)
+    except SystemExit:  # after help, too
+        sys.stdout.flush()
+        raise
+    sys.stdout.flush()
+    return status
+
+
+def _give_up_output() -> None:
+    """What standard output does not take is not tried again, and told again, as Python ends."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _mend_streams() -> None:

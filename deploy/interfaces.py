@@ -49,7 +49,8 @@ class RobotState:
 
 
 class CameraError(Exception):
-    """A camera gave no frame (unplugged, timed out). The loop holds position and tries again."""
+    """A camera gave no frame (unplugged, timed out). Once started, the loop holds position and
+    tries again."""
 
 
 class RobotError(Exception):
@@ -61,7 +62,7 @@ class Camera(Protocol):
     """A depth camera that always hands out its newest frame."""
 
     def start(self) -> None:
-        """Open the device."""
+        """Open the device. Raises CameraError, with which the run ends, or UserError."""
         ...
 
     def read(self) -> Frame:
@@ -90,7 +91,7 @@ class Imager(Protocol):
     """The picture that calibration looks for a board in, from where depth is measured."""
 
     def start(self) -> None:
-        """Open the device."""
+        """Open the device. Raises CameraError or UserError."""
         ...
 
     def lens(self) -> Lens:
@@ -120,7 +121,7 @@ class Robot(Protocol):
     """A seven-joint arm with a parallel gripper, position controlled."""
 
     def start(self) -> None:
-        """Connect."""
+        """Connect. Raises RobotError, with which the run ends, or UserError."""
         ...
 
     def read_state(self) -> RobotState:

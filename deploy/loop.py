@@ -78,7 +78,7 @@ class LoopReport:
     interrupted: bool = False
     """Ended by Ctrl-C, or by SIGTERM in `ddgrasp deploy`."""
     fault: str = ""
-    """What ended the run where the robot did: a reflex, a lost connection."""
+    """What ended the run where a device did: a reflex, a lost connection, a camera that does not start."""
     width_m: float | None = None
     """The gripper's opening at the last step."""
     clock_s: float = 0.0
@@ -139,7 +139,8 @@ class ControlLoop:
 
         The last command has its whole period before this returns. Camera and robot are started here
         and stopped whatever happens; on Ctrl-C an arm that has started is told to hold first. The report
-        comes back either way: what the robot failed with is its `fault`, and an event.
+        comes back either way: what the robot failed with, or the camera at its start, is its `fault`, and
+        an event.
         """
         self._start_s = self._clock.now()
         moving = False
@@ -155,7 +156,7 @@ class ControlLoop:
             if moving:
                 after = "the robot holds position" if self._hold_quietly() else "holding failed"
             self._log("stop", f"interrupted; {after}")
-        except RobotError as error:
+        except (CameraError, RobotError) as error:  # a camera's, where it does not start
             self._fail(error)
         finally:
             self._stop_both()
@@ -344,7 +345,7 @@ class ControlLoop:
             return False
         return True
 
-    def _fail(self, error: RobotError) -> None:
+    def _fail(self, error: CameraError | RobotError) -> None:
         """The first fault ends the run; what comes after it is its consequence."""
         self._report.fault = self._report.fault or str(error)
         self._log("fault", str(error))

@@ -93,14 +93,14 @@ class DeploymentRecord:
             rgb = self._camera.picture()
         if rgb is None:
             return
-        depth = step.frame.depth
-        depth_mm = depth if depth.dtype == np.uint16 else to_millimetres(depth)
+        depth = step.frame.depth  # copied: cameras fill their buffers again before the thread has written
+        depth_mm = depth.copy() if depth.dtype == np.uint16 else to_millimetres(depth)
         if step.frame.timestamp_s - self._kept_s > _GAP_S:
             self._meta["consecutive_frames"] = False
         self._kept_s = step.frame.timestamp_s
         row["frame"] = self._queued
         self._queued += 1
-        self._queue.put((rgb, depth_mm))
+        self._queue.put((rgb.copy(), depth_mm))
         self._keep(step.index, rgb, depth_mm)
 
     def finish(

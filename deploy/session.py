@@ -45,7 +45,7 @@ def deploy(
     """
     _check(options)
     with terminable():
-        return _run(for_devices(config, options), policy_path, options, _survived(say))
+        return _run(for_devices(config, options), policy_path, options, survived(say))
 
 
 def _run(
@@ -58,8 +58,7 @@ def _run(
         execute_steps=config.deploy.execute_steps or None,
     )
     options.out.mkdir(parents=True, exist_ok=True)  # before an arm moves that could not be recorded
-    real = options.robot != "sim"
-    if real and not (options.yes or options.dry_run or sys.stdin.isatty()):
+    if options.real and not (options.yes or options.dry_run or sys.stdin.isatty()):
         raise UserError(
             f"robot {options.robot!r} asks before it moves, and nobody can be asked here: give --yes."
         )
@@ -71,16 +70,17 @@ def _run(
     robot, camera = make_devices(Setup(config, options, policy.info, clock, confirm, say))
     keep_time_of(robot, clock, options)
     safety = safety_filter(config.deploy, policy.info, options.robot)
-    if real and (notice := speed_notice(config.deploy, policy.info)):
+    if options.real and (notice := speed_notice(config.deploy, policy.info)):
         say(notice)
     driven = DryRun(robot, say) if options.dry_run else robot
-    loop = ControlLoop(camera, driven, policy, safety, clock, loop_settings(config.deploy, policy.info), say)
+    settings = loop_settings(config.deploy, policy.info, moves=not options.dry_run)
+    loop = ControlLoop(camera, driven, policy, safety, clock, settings, say)
     steps = round(options.seconds * policy.info.control_hz) if math.isfinite(options.seconds) else None
     folder = _new_folder(options.out)
     profile = contract.D455.scaled(policy.info.depth_width / contract.D455.width_px)
     kept = DeploymentRecord(camera, profile, f"{options.camera}, D455 profile", config.deploy.film_every)
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
-    name = options.object_name or (config.world.objects[0] if options.robot == "sim" else "")
+    name = options.object_name or ("" if options.real else config.world.objects[0])
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
     ending = contextlib.ExitStack()
     try:
@@ -103,7 +103,8 @@ def _run(
         ending.close()
         raise
     with ending:
-        if report.interrupted and not report.steps:
+        begun = report.steps or (report.fault and report.timings.sense_s)
+        if not begun:  # interrupted, or a device failed in its start: nothing was tried
             _drop(folder)
             return report
         kept.finish(folder, report.as_dict(), success, about | _object(camera, name))
@@ -124,7 +125,7 @@ def _object(camera: Camera, named: str) -> dict[str, str]:
     return {"object": there or named} if there or named else {}
 
 
-def _survived(say: Callable[[str], None]) -> Callable[[str], None]:
+def survived(say: Callable[[str], None]) -> Callable[[str], None]:
     """`say`, which ends nothing where nobody hears it any more: the terminal may be gone."""
 
     def quietly(text: str) -> None:
@@ -139,7 +140,7 @@ def ask_success(question: str) -> bool | None:
     if not sys.stdin.isatty():
         return None
     try:
-        answer = input(f"{question} [y/n, or Enter for no answer] ").strip().lower()
+        answer = _typed(f"{question} [y/n, or Enter for no answer] ")
     except (EOFError, KeyboardInterrupt):  # whoever leaves here still wants the report
         return None
     return {"y": True, "yes": True, "n": False, "no": False}.get(answer)
@@ -154,11 +155,19 @@ def ask_person(question: str) -> None:
     if not sys.stdin.isatty():
         raise UserError(f"{question} Nobody can be asked here: give --yes.")
     try:
-        answer = input(f"{question} [y/N] ").strip().lower()
+        answer = _typed(f"{question} [y/N] ")
     except EOFError:  # Ctrl-D
         answer = ""
     if answer not in ("y", "yes"):
-        raise UserError("not confirmed: nothing has moved.")
+        raise UserError("not confirmed: the arm stays where it is.")
+
+
+def _typed(question: str) -> str:
+    """What a person answers; where standard output goes to a file the question must not go with it."""
+    shown = sys.stdout.isatty()
+    if not shown:
+        print(question, end="", file=sys.stderr, flush=True)
+    return input(question if shown else "").strip().lower()
 
 
 def _agreed(question: str) -> None:
@@ -245,7 +254,7 @@ def _check(options: SessionOptions) -> None:
         )
     of_an_arm = {"--host": options.host, "--calibration": options.calibration}
     for option, value in of_an_arm.items():
-        if value and options.robot == "sim":
+        if value and not options.real:
             raise UserError(
                 f"{option} is {value}, and robot 'sim' has none: drop it, or choose --robot franka."
             )

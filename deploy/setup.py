@@ -3,6 +3,7 @@
 from ddgrasp import contract
 from ddgrasp.config import DeployConfig
 from ddgrasp.policy_metadata import PolicyMetadata
+from deploy.devices.options import SIMULATION
 from deploy.loop import LoopSettings
 from deploy.safety import SafetyFilter, SafetyLimits
 
@@ -11,17 +12,18 @@ JOINT_MARGIN_RAD = 0.02
 the control unit stops an arm that asks for more than its range."""
 
 
-def loop_settings(config: DeployConfig, info: PolicyMetadata) -> LoopSettings:
-    """The policy's own rate, the configured patience, whether a hand tries again."""
-    return LoopSettings(1.0 / info.control_hz, config.stale_periods, config.retry)
+def loop_settings(config: DeployConfig, info: PolicyMetadata, moves: bool = True) -> LoopSettings:
+    """The policy's own rate, the configured patience, whether a hand tries again: one that is not moved
+    stands still and stays shut whatever it is told, and would try again for ever."""
+    return LoopSettings(1.0 / info.control_hz, config.stale_periods, config.retry and moves)
 
 
-def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = "sim") -> SafetyFilter:
+def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = SIMULATION) -> SafetyFilter:
     """Limits narrow enough for both `robot` (as `--robot` names it) and the policy.
 
     Whatever is no simulation is the configured arm, by whichever driver.
     """
-    real = robot != "sim"
+    real = robot != SIMULATION
     arm = contract.ARMS[config.franka.model] if real else contract.PANDA
     speed = config.franka.speed_rad_s if real else arm.joint_velocity_rad_s
     margin = JOINT_MARGIN_RAD if real else 0.0

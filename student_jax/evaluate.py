@@ -27,7 +27,7 @@ def closed_loop(
     config: Config, teacher: TeacherPolicy, source: DepthSource, params: Any, progress: Progress
 ) -> dict[str, Any]:
     """`student_clean` and `student_ddg` (the source's depth), same seeds: counts per object and in all, and
-    `position_error_mm`, the median before the grasp."""
+    `position_error_mm`, the median before the grasp, where anything has trained perception."""
     roller = Roller(config, teacher, config.evaluation.student_trials, source.needs_rgb)
     cameras = {
         "student_clean": keep_clean,
@@ -42,8 +42,9 @@ def closed_loop(
         )  # fmt: skip
         with progress.task(f"steps of {roller.count} trials, {name}", roller.steps) as task:
             episodes = roller.run(jax.random.PRNGKey(_SEED + config.seed), actor, lambda _: task.advance())  # noqa: B023
-        error_mm = position_error_mm(config, params, episodes, actor.seen)
-        metrics[name] = _counts(episodes, config.world.objects) | {"position_error_mm": error_mm}
+        metrics[name] = _counts(episodes, config.world.objects)
+        if config.student.training.aux_weight or config.student.init_from:
+            metrics[name]["position_error_mm"] = position_error_mm(config, params, episodes, actor.seen)
         best = int(np.argmax(episodes.success))
         length = min(len(actor.seen), int(episodes.length[best]))
         strip = actor.seen.episode(best, length)[np.linspace(0, length - 1, 6).astype(int)]

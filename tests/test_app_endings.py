@@ -4,6 +4,7 @@ import ctypes.util
 import errno
 import io
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -164,6 +165,56 @@ def test_closed_streams_of_this_process_are_made_to_lead_nowhere(monkeypatch):
     assert not sys.stdin.isatty() and sys.stdin.read() == ""
     for stream in (sys.stdin, sys.stdout, sys.stderr):
         stream.close()
+
+
+BUFFERED = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+"""As a user's shell has it: Python keeps what goes into a pipe or a file, unless it is told otherwise."""
+SPEAKS = """
+import sys
+from app import cli
+from deploy import session
+from deploy.calibration import session as calibration
+from deploy.loop import LoopReport
+def run(*given):
+    say = given[-1] if callable(given[-1]) else print  # which it is without one
+    say("an event")
+    sys.stdin.read()
+    return LoopReport(0.1, steps=1)
+session.deploy = calibration.run = run
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("command", ["deploy --policy x.onnx", "calibrate"])
+def test_a_pipe_has_every_event_of_an_arm_as_it_happens(command):
+    """As `| tee log` wants it, and whoever reads along."""
+    line = [sys.executable, "-c", SPEAKS, *command.split()]
+    with subprocess.Popen(
+        line, cwd=ROOT, env=BUFFERED, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        heard = select.select([process.stdout], [], [], 30.0)[0]
+        assert process.communicate()[0].startswith(b"an event\n") and process.returncode == 0
+    assert heard, "it came at the end"
+
+
+@pytest.mark.parametrize("command", ["--version", "--help", "deploy --help"])
+def test_output_that_nobody_takes_is_told_once_or_not_at_all(command):
+    line = [sys.executable, "-m", "app.cli", *command.split()]
+    reader, writer = os.pipe()
+    os.close(reader)
+    for taken_by, told in (
+        (writer, ""),
+        (
+            os.open("/dev/full", os.O_WRONLY),
+            "ddgrasp: No space left on the disk: free some and go on with --resume. What was finished before "
+            "is intact.\n",
+        ),
+    ):
+        done = subprocess.run(
+            line, cwd=ROOT, env=BUFFERED, stdout=taken_by, stderr=subprocess.PIPE, text=True, timeout=60
+        )
+        os.close(taken_by)
+        assert (done.returncode, done.stderr) == (1, told)
 
 
 def test_what_a_terminal_cannot_show_is_escaped(monkeypatch, capsys):

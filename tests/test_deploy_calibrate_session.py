@@ -189,6 +189,17 @@ def test_a_camera_without_pictures_is_told_from_a_board_that_is_not_seen(tmp_pat
     assert "pose 7 of 7: no picture (unplugged)" in said
 
 
+@pytest.mark.parametrize(("device", "error"), [("imager", CameraError), ("arm", RobotError)])
+def test_a_device_that_does_not_start_ends_the_run_in_one_line(tmp_path, bench, monkeypatch, device, error):
+    def failing():
+        raise error("no device is connected")
+
+    monkeypatch.setattr(getattr(bench, device), "start", failing)
+    with pytest.raises(UserError, match=r"^no device is connected\.$"):
+        session.run(fast(), options(tmp_path), lambda text: None)
+    assert bench.imager.calls[-1] == "stop"
+
+
 def test_an_arm_that_stops_ends_the_run_in_one_line(tmp_path, bench):
     bench.arm.fails_at = 30
     with pytest.raises(UserError, match=r"ended at pose \d of 7: the arm stopped itself: .*\.$") as refused:
@@ -282,6 +293,13 @@ def test_taking_the_board_away_costs_no_calibration(tmp_path, bench, monkeypatch
     assert (tmp_path / "cal.json").exists() and "the board" in said[-1]
 
 
+def test_a_log_that_nobody_writes_any_more_costs_no_calibration(tmp_path, bench):
+    def gone(text):
+        raise BrokenPipeError
+
+    assert session.run(fast(), options(tmp_path), gone) is not None and (tmp_path / "cal.json").exists()
+
+
 def test_an_arm_that_does_not_stop_is_said(tmp_path, bench, monkeypatch):
     def refuse():
         raise RobotError("no answer")
@@ -312,6 +330,15 @@ def test_nobody_to_ask_moves_nothing(tmp_path, bench, monkeypatch):
     with pytest.raises(UserError, match=r"Ready\? Nobody can be asked here: give --yes"):
         session.run(fast(), options(tmp_path, yes=False), lambda text: None)
     assert bench.arm.commands == 0
+
+
+def test_a_person_who_is_not_ready_is_not_told_that_nothing_has_moved(tmp_path, bench, monkeypatch):
+    """The arm is at its start pose by then, its gripper homed."""
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr("builtins.input", lambda question: "n")
+    with pytest.raises(UserError, match=r"^not confirmed: the arm stays where it is\.$"):
+        session.run(fast(), options(tmp_path, yes=False), lambda text: None)
+    assert bench.arm.commands == 0 and bench.arm.calls == ["start", "stop"]
 
 
 def test_planned_poses_show_the_whole_board_and_turn_about_several_axes(planned):
@@ -432,6 +459,27 @@ def test_files_that_are_no_calibration(tmp_path, text, said):
         path.write_text(text)
     with pytest.raises(UserError, match=said):
         standing.load(path)
+
+
+@pytest.mark.parametrize("wrong", ["by columns", "mirrored", "no number"])
+def test_poses_that_no_camera_can_have_are_no_calibration(tmp_path, wrong):
+    """Written by hand of what another program measured: by columns, as Franka's own poses are."""
+    T, path = nominal_pose(), tmp_path / "mine.json"
+    if wrong == "by columns":
+        T = T.T
+    elif wrong == "mirrored":
+        T[:3, 0] *= -1.0
+    else:
+        T[0, 3] = np.nan
+    made = {"version": 1, "created": "2026-11-23", "camera": "realsense", "host": "172.16.0.2", "rms_px": 0.1}
+    path.write_text(json.dumps(made | {"T_base_cam": T.tolist()}))
+    with pytest.raises(UserError, match="is no calibration .T_base_cam is no rigid transform"):
+        standing.load(path)
+
+
+def test_a_folder_is_no_calibration_and_the_file_in_it_is_named(tmp_path):
+    with pytest.raises(UserError, match=rf"is a folder: name the file, {tmp_path}/calibration\.json\.$"):
+        standing.load(tmp_path)
 
 
 def test_the_live_rig_s_hand_holds_the_board_where_the_truth_says(open_gl, planned):

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from app.cli import main
 from app.commands import parse
 from ddgrasp import contract
 from ddgrasp.config import CAMERAS, ROBOTS, FrankaConfig
@@ -634,6 +635,21 @@ def test_a_deployment_that_a_fault_ended_exits_with_1_and_one_that_kept_no_rate_
     said = capsys.readouterr().out
     assert stop.value.code == 1
     assert "ended by: lost connection" in said and "did not keep its rate" in said
+
+
+@pytest.mark.parametrize(("seconds", "steps"), [("12", 40), ("12", 0), ("inf", 0)])
+def test_one_that_was_interrupted_is_not_taken_for_done(seconds, steps, monkeypatch, capsys):
+    """`ddgrasp deploy --yes ... && next` is not to go on to the next trial."""
+    report = LoopReport(0.1, steps=steps, interrupted=True)
+    monkeypatch.setattr(session, "deploy", lambda *_: report)
+    assert main(["deploy", "--policy", "policy.onnx", "--seconds", seconds]) == 130
+    said = capsys.readouterr()
+    assert said.err == "ddgrasp: Interrupted.\n" and f"{steps} steps, 0 missed" in said.out
+
+
+def test_one_that_was_to_run_until_ctrl_c_is_done_then(monkeypatch):
+    monkeypatch.setattr(session, "deploy", lambda *_: LoopReport(0.1, steps=40, interrupted=True))
+    assert main(["deploy", "--policy", "policy.onnx", "--seconds", "inf"]) == 0
 
 
 @pytest.mark.parametrize("robot", ["franka", "mine"])

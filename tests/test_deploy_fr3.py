@@ -541,5 +541,5 @@ def test_nobody_to_ask_is_refused(monkeypatch):
     terminal = io.StringIO()  # Ctrl-D
     terminal.isatty = lambda: True
     monkeypatch.setattr("sys.stdin", terminal)
-    with pytest.raises(UserError, match="not confirmed: nothing has moved"):
+    with pytest.raises(UserError, match="not confirmed: the arm stays where it is"):
         ask_person("Is its way clear?")

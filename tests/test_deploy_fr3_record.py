@@ -1,5 +1,6 @@
 """Recording on the FR3 rig: a way that the arm can be led, the development rig's format, going on."""
 
+import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,14 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from deploy import fr3_record, kinematics
+from deploy.clock import RobotClock
+from deploy.devices.franka_robot import LOST
 from deploy.fr3_record import Takes
 from deploy.guided_path import ABOVE_M, GRIP_STEPS, STEP_RAD, GuidedPath, plan
+from deploy.interfaces import RobotError
+from deploy.safety import SafetyFilter
 from deploy.setup import safety_filter
+from deploy_support import KinematicRobot, ScriptedCamera, depth_mm
 from mjx_envs.scene import HOME_RAD
 from rig.fr3.scene import primitive
 from sensors.recordings.recording import find_recordings
@@ -60,6 +66,34 @@ def test_an_arm_that_is_held_up_is_led_on():
     way = GuidedPath(stops)
     asked = [way.action(np.array(HOME_RAD))[7] for _ in range(200)]
     assert max(asked) > 0, "it waits for an arm that does not come"
+
+
+class Refusing(KinematicRobot):
+    """Has a time of its own, and fails as it is to stop."""
+
+    def __init__(self, clock: RobotClock, said: str):
+        super().__init__(clock)
+        self._time_s, self._said = 0.0, said
+        clock.follow(self)
+
+    def time_s(self) -> float:
+        self._time_s += 0.11
+        return self._time_s
+
+    def stop(self) -> None:
+        raise RobotError(self._said)
+
+
+@pytest.mark.parametrize(("said", "lost"), [("the arm stopped itself: joint_reflex", False), (LOST, True)])
+def test_an_arm_that_stops_itself_as_it_is_told_to_costs_none_of_the_frames(said, lost):
+    clock = RobotClock()
+    camera, robot = ScriptedCamera(clock, [depth_mm()]), Refusing(clock, said)
+    way = GuidedPath(plan(primitive("cube"), PLACE, LIMITS, np.random.default_rng(0)))
+    safety = SafetyFilter(LIMITS, contract.ACTION_SCALE_RAD)
+    frames = fr3_record._led(camera, robot, safety, clock, way, 4)
+    with pytest.raises(RobotError, match=LOST) if lost else contextlib.nullcontext():
+        assert len(list(frames)) == 4
+    assert camera.stopped
 
 
 @pytest.mark.parametrize(

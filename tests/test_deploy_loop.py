@@ -12,7 +12,7 @@ import pytest
 from ddgrasp.errors import UserError
 from deploy.clock import RealClock, SimClock
 from deploy.dry_run import DryRun
-from deploy.interfaces import RobotError
+from deploy.interfaces import CameraError, RobotError
 from deploy.kinematics import grip_position
 from deploy.loop import KEPT_EVENTS, ControlLoop, LoopSettings
 from deploy.policy import OnnxPolicy
@@ -317,6 +317,18 @@ def test_a_robot_that_fails_ends_the_run_with_its_words_and_nothing_more_is_told
     assert report.fault == f"{fails_at}: the arm stopped itself"
     assert robot.calls == calls and camera.stopped
     assert report.events[-1].kind == "fault" and not report.interrupted
+
+
+def test_a_camera_that_does_not_start_ends_the_run_with_its_words(tmp_path, monkeypatch):
+    loop, robot, camera = make_loop(tmp_path, [depth_mm()])
+
+    def failing():
+        raise CameraError("no device is connected")
+
+    monkeypatch.setattr(camera, "start", failing)
+    report = loop.run(max_steps=5)
+    assert report.fault == "no device is connected" and report.steps == 0
+    assert robot.calls == ["stop"] and camera.stopped
 
 
 def test_of_two_failures_the_first_is_the_fault(tmp_path, monkeypatch):

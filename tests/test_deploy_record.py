@@ -15,7 +15,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy import session
 from deploy.devices.options import SessionOptions
-from deploy.interfaces import CameraError, Frame
+from deploy.interfaces import CameraError, Frame, RobotError
 from deploy_support import KinematicRobot, constant_bias, describe, write_policy
 from evaluation.report import deployments
 from sensors.recordings import writer as writing
@@ -150,6 +150,25 @@ def test_one_that_is_interrupted_before_its_first_step_leaves_no_folder(run, mon
     assert len(said) == 1 and said[0].endswith(f"stop: interrupted; {after}")
 
 
+@pytest.mark.parametrize(("device", "error"), [(ColourCamera, CameraError), (KinematicRobot, RobotError)])
+def test_one_whose_device_fails_in_its_start_is_no_failed_trial(run, monkeypatch, device, error):
+    def fail(self):
+        raise error("no answer")
+
+    monkeypatch.setattr(device, "start", fail)
+    report, folder = run(yes=True)
+    assert report.fault == "no answer" and not report.steps and folder is None
+
+
+def test_one_whose_arm_fails_at_the_first_command_is_kept(run, monkeypatch):
+    def fail(self, q_target_rad, close):
+        raise RobotError("joint_reflex")
+
+    monkeypatch.setattr(KinematicRobot, "command", fail)
+    report, folder = run(yes=True)
+    assert not report.steps and json.loads((folder / "report.json").read_text())["fault"] == "joint_reflex"
+
+
 def test_two_in_a_second_are_two_recordings_of_one_folder(run, tmp_path):
     folders = {run()[1] for _ in range(2)}
     assert {recording.path for recording in find_recordings(tmp_path / "kept")} == folders
@@ -174,6 +193,16 @@ def test_a_person_says_how_it_ended(run, monkeypatch, answer, success):
     assert json.loads((folder / "report.json").read_text())["success"] is success
 
 
+def test_a_question_is_seen_on_the_terminal_where_output_goes_to_a_file(monkeypatch, capsys):
+    """`ddgrasp deploy ... > log` would wait for an answer to what nobody has read."""
+    monkeypatch.setattr(session.sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: "y")
+    session.ask_person("Is the way clear?")
+    assert session.ask_success("Is it lifted?") is True
+    told = capsys.readouterr()
+    assert told.err == "Is the way clear? [y/N] Is it lifted? [y/n, or Enter for no answer] " and not told.out
+
+
 @pytest.mark.parametrize(("success", "words"), [(True, "lifted and held"), (False, "failed")])
 def test_the_rig_judges_by_itself_and_says_so(run, success, words):
     class Judging(ColourCamera):
@@ -184,6 +213,42 @@ def test_the_rig_judges_by_itself_and_says_so(run, success, words):
     _, folder = run(Judging, said.append, yes=True)
     assert json.loads((folder / "report.json").read_text())["success"] is success
     assert f"verdict: {words}" in said
+
+
+def test_a_dry_run_shows_what_the_policy_would_do_with_a_hand_that_is_shut(run, monkeypatch):
+    """As a hand may be that was not homed: trying again would take over for good."""
+    read = KinematicRobot.read_state
+    monkeypatch.setattr(KinematicRobot, "read_state", lambda self: replace(read(self), width_m=0.0))
+    rows = {}
+    for dry_run in (True, False):
+        lines = (run(dry_run=dry_run, seconds=0.8)[1] / "steps.jsonl").read_text().splitlines()
+        rows[dry_run] = [json.loads(line)["by"] for line in lines]
+    assert rows == {True: ["policy"] * 8, False: ["policy"] + ["retry"] * 7}
+
+
+def test_a_camera_that_fills_its_buffers_again_is_recorded_frame_by_frame(run, monkeypatch):
+    class Reusing(ColourCamera):
+        """Hands out the same two arrays again and again, as a driver may that copies nothing."""
+
+        rgb, depth_mm = np.zeros((480, 848, 3), np.uint8), DEPTH_MM.copy()
+
+        def read(self):
+            frame = super().read()
+            assert frame.rgb is not None
+            np.copyto(self.rgb, frame.rgb)
+            np.copyto(self.depth_mm, frame.depth)
+            return replace(frame, rgb=self.rgb, depth=self.depth_mm)
+
+    add = RecordingWriter.add
+
+    def slowly(self, rgb, depth_mm):
+        time.sleep(0.15)
+        add(self, rgb, depth_mm)
+
+    monkeypatch.setattr(RecordingWriter, "add", slowly)
+    recording = Recording.open(run(Reusing)[1])
+    assert [int(recording.depth_mm(i)[-1, 0]) for i in range(5)] == [701, 702, 703, 704, 705]
+    assert [round(float(recording.rgb(i).mean())) for i in range(5)] == [1, 2, 3, 4, 5]
 
 
 def test_a_disk_that_takes_no_frames_stops_nothing(run, monkeypatch):

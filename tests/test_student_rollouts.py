@@ -319,3 +319,10 @@ def test_both_cameras_see_the_same_trials_and_none_of_them_is_one_of_training_s(
     numbers = np.array([number for number, _ in source.asked])
     assert numbers.min() >= 1_000_000 and numbers.shape == (STEPS, COUNT)
     assert made["student_clean"]["position_error_mm"] != made["student_ddg"]["position_error_mm"]
+
+
+def test_a_perception_that_nothing_has_trained_is_not_measured(teacher, roller, params):
+    untrained = replace(CONFIG.student, training=replace(CONFIG.student.training, aux_weight=0.0))
+    config = replace(CONFIG, student=untrained)
+    made = evaluate.closed_loop(config, teacher, Nearer(), params, Progress(quiet=True))
+    assert not any("position_error_mm" in counts for counts in made.values())

@@ -15,6 +15,11 @@ from ddgrasp.stages import get_stage
 DEFAULT_PRESET = "demo"
 
 
+def say(text: str) -> None:
+    """Prints a line at once: a pipe or a file would have it when the buffer is full, or at the end."""
+    print(text, flush=True)
+
+
 class Command(Protocol):
     """What a parsed command line is."""
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from app.commands.base import say
 from app.commands.checks import check_file
 from ddgrasp.config import Config
 from ddgrasp.config.checks import Range
@@ -75,7 +76,7 @@ class Calibrate:
         run(self.config, CalibrationOptions(
             self.camera, self.host, self.board.made(), self.poses, self.speed,
             dry_run=self.dry_run, yes=self.yes, out=self.out,
-        ))  # fmt: skip
+        ), say)  # fmt: skip
 
 
 @dataclass(frozen=True)

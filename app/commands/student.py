@@ -1,5 +1,6 @@
 """ddgrasp student, export, deploy: the policy."""
 
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from app.commands.base import DEFAULT_PRESET, OneStage, load_config
+from app.commands.base import DEFAULT_PRESET, OneStage, load_config, say
 from app.commands.checks import check_folder, check_objects, check_tried
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Camera, Config, Robot
@@ -42,6 +43,7 @@ class StudentEval:
         config = load_config(self.run_dir, "student")
         from ddgrasp.progress import Progress
         from evaluation import wilson
+        from evaluation.report.summary import perceived
         from learning.params import load_params
         from ppo.policy import load_policy
         from student_jax.depth_source import make_source
@@ -57,7 +59,7 @@ class StudentEval:
         for name, counts in result.items():
             success = counts["success"]
             rate = wilson.describe(wilson.success(success["successes"], success["n"]))
-            print(f"{name:<14} {rate}; grasp perceived to {counts['position_error_mm']:.1f} mm (median)")
+            print(f"{name:<14} {rate}{perceived(counts)}")
 
 
 @dataclass(frozen=True)
@@ -130,22 +132,25 @@ class Deploy:
     def run(self) -> None:
         """Runs the loop until the time is over, Ctrl-C or a fault, and prints how it kept time.
 
-        Raises SystemExit(1) after a fault.
+        Raises SystemExit(1) after a fault, and KeyboardInterrupt where it was interrupted, unless that is
+        how it was to end: what called it is not to go on to the next trial.
         """
         from deploy.session import SessionOptions, deploy, describe
 
-        if self.robot == "sim":  # what else there is to grasp, no configuration knows
-            check_objects(self.config.world)
         options = SessionOptions(
             self.robot, self.camera, self.recording, self.object_name, self.seconds,
             dry_run=self.dry_run, yes=self.yes, host=self.host, out=self.out, calibration=self.calibration,
         )  # fmt: skip
+        if not options.real:  # what else there is to grasp, no configuration knows
+            check_objects(self.config.world)
         _check_policy(self.policy)
         check_folder("--out", self.out)
-        report = deploy(self.config, self.policy, options)
-        print(describe(report))
+        report = deploy(self.config, self.policy, options, say)
+        say(describe(report))
         if report.fault:
             sys.exit(1)
+        if report.interrupted and (math.isfinite(self.seconds) or not report.steps):
+            raise KeyboardInterrupt
 
 
 def _check_policy(policy: Path) -> None:

@@ -24,7 +24,7 @@ from deploy.devices.options import SessionOptions, Setup
 from deploy.devices.registry import IMAGERS, ROBOTS
 from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, Robot, RobotError
 from deploy.interrupts import terminable, unbroken
-from deploy.session import ask_person, for_devices, keep_time_of
+from deploy.session import ask_person, for_devices, keep_time_of, survived
 from deploy.setup import safety_filter
 from sensors.charuco_board import CharucoBoard, Corners
 
@@ -83,6 +83,7 @@ def run(
 
     Raises UserError: a device is absent, nobody agrees, the board is not seen, the views do not suffice.
     """
+    say = survived(say)
     session = SessionOptions(
         "franka", options.camera, dry_run=options.dry_run, yes=options.yes, host=options.host
     )
@@ -322,7 +323,10 @@ def _check_out(options: CalibrationOptions, host: str) -> None:
 
 @contextmanager
 def _started(imager: Imager, robot: Robot, say: Callable[[str], None]):
-    """The imager started, a function that starts the robot; both stopped at the end, come what may."""
+    """The imager started, a function that starts the robot; both stopped at the end, come what may.
+
+    What a device fails with, and nobody else has dealt with, is a UserError.
+    """
     begun = False
 
     def start_robot() -> None:
@@ -333,6 +337,8 @@ def _started(imager: Imager, robot: Robot, say: Callable[[str], None]):
     try:
         imager.start()
         yield start_robot
+    except (CameraError, RobotError) as error:
+        raise UserError(f"{error}.") from error
     finally:
         with unbroken():
             try:

@@ -102,7 +102,7 @@ def offset(T_base_cam: Float[np.ndarray, "4 4"], T_reference: Float[np.ndarray, 
 
 def standing(config: Config, options: SessionOptions) -> Standing:
     """What deploy says of its camera. Raises UserError for a file that is named and does not fit."""
-    if options.robot == "sim":
+    if not options.real:
         return Standing()
     spread = config.world.random
     path = options.calibration or DEFAULT_FILE
@@ -156,18 +156,28 @@ def save(path: Path, calibration: Calibration) -> None:
 
 
 def load(path: Path) -> Calibration:
-    """Raises UserError for a file that is absent, damaged, or no calibration."""
+    """Raises UserError for a file that is absent, damaged, or no calibration, and for a folder."""
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: name the file, {path / DEFAULT_FILE.name}.")
     values = read_json(path)
     try:
         if values["version"] != VERSION:
             raise UserError(f"{path} has version {values['version']!r}, {VERSION} is read: calibrate again.")
         T = np.array(values["T_base_cam"], float)
-        if T.shape != (4, 4) or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6):
+        if not _is_rigid(T):
             raise ValueError("T_base_cam is no rigid transform")
         created, camera, host = (str(values[name]) for name in ("created", "camera", "host"))
         return Calibration(created, camera, host, T, float(values["rms_px"]))
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is no calibration ({error}): `ddgrasp calibrate` writes one.") from None
+
+
+def _is_rigid(T: np.ndarray) -> bool:
+    """Whether it is a (4, 4) turn and shift: no mirror image, none that was written by columns."""
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0)):
+        return False
+    R = T[:3, :3]
+    return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0.0)
 
 
 def check_own(path: Path, camera: str, host: str) -> None:

@@ -9,6 +9,8 @@ from ddgrasp.config import Config
 from ddgrasp.policy_metadata import PolicyMetadata
 from deploy.interfaces import Clock
 
+SIMULATION = "sim"
+"""The robot, as `--robot` names it, that is no arm; whatever else has a driver is one."""
 RIG_CAMERAS = ("rig", "rig-ideal")
 """Cameras of the FR3 rig."""
 RIG_HOST = "127.0.0.1"
@@ -19,7 +21,7 @@ RIG_HOST = "127.0.0.1"
 class SessionOptions:
     """What to drive, what to look through, for how long."""
 
-    robot: str = "sim"
+    robot: str = SIMULATION
     """sim (the pseudo-real rig) or franka."""
     camera: str = "stereo"
     """stereo (the rig's own camera), realsense, replay (a recording; the robot acts on old pictures), rig (a
@@ -40,6 +42,11 @@ class SessionOptions:
     """Folder that every run leaves its report in."""
     calibration: Path | None = None
     """What `ddgrasp calibrate` wrote; without it its usual place is looked at."""
+
+    @property
+    def real(self) -> bool:
+        """Whether an arm moves, or the rig that runs behind an arm's protocol."""
+        return self.robot != SIMULATION
 
 
 @dataclass(frozen=True)

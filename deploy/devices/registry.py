@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import Any
 
 from ddgrasp.errors import UserError, unknown_name
-from deploy.devices.options import SessionOptions, Setup
+from deploy.devices.options import SIMULATION, SessionOptions, Setup
 from deploy.interfaces import Camera, Imager, Robot
 
 
@@ -19,7 +19,7 @@ def _from(file: str, make: str = "make") -> Callable[..., Any]:
 
 
 ROBOTS: Mapping[str, Callable[[Setup], Robot]] = {
-    "sim": _from("rig_robot"),
+    SIMULATION: _from("rig_robot"),
     "franka": _from("franka_robot"),
 }
 CAMERAS: Mapping[str, Callable[[Setup, Robot], Camera]] = {
@@ -39,8 +39,9 @@ REFUSED: Mapping[tuple[str, str], str] = {
     "use --camera realsense.",
     ("franka", "replay"): "camera 'replay' shows the past: robot {robot!r} would move blindly; "
     "use --camera realsense.",
-    ("sim", "rig"): "camera 'rig' sees the FR3 rig, not robot 'sim': use --camera stereo, or --robot franka.",
-    ("sim", "rig-ideal"): "camera 'rig-ideal' sees the FR3 rig, not robot 'sim': use --camera stereo.",
+    (SIMULATION, "rig"): "camera 'rig' sees the FR3 rig, not robot 'sim': "
+    "use --camera stereo, or --robot franka.",
+    (SIMULATION, "rig-ideal"): "camera 'rig-ideal' sees the FR3 rig, not robot 'sim': use --camera stereo.",
 }
 """(robot, camera) that make no sense together, and why; all others do. What holds for 'franka' does for every
 robot that is no simulation."""
@@ -52,7 +53,7 @@ def check_devices(options: SessionOptions) -> None:
         raise unknown_name("robot", options.robot, ROBOTS)
     if options.camera not in CAMERAS:
         raise unknown_name("camera", options.camera, CAMERAS)
-    kind = "sim" if options.robot == "sim" else "franka"
+    kind = "franka" if options.real else SIMULATION
     if reason := REFUSED.get((kind, options.camera)):
         raise UserError(reason.format(robot=options.robot))
     if options.camera == "replay" and options.recording is None:

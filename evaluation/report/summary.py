@@ -213,7 +213,7 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
     if stage == "student":
         named = (("student_clean", "clean depth"), ("student_ddg", _own_depth(report)))
         return [
-            f"{text}: success {rate}{_perceived(report[key])}"
+            f"{text}: success {rate}{perceived(report[key])}"
             for key, text in named
             if (rate := _success(report, key))
         ]
@@ -245,8 +245,8 @@ def _own_depth(report: Mapping[str, Any]) -> str:
     return "generated depth" if source == "learned" else f"depth of its training ({source})"
 
 
-def _perceived(student: Mapping[str, Any]) -> str:
-    """Perception's error in new scenes; nothing in reports from before it was measured."""
+def perceived(student: Mapping[str, Any]) -> str:
+    """Perception's median error in new scenes; nothing where it was not measured."""
     error_mm = student.get("position_error_mm")
     return "" if error_mm is None else f", grasp perceived to {error_mm:.1f} mm"
 
