@@ -1,5 +1,6 @@
 """What goes into a LeRobot dataset; and, where lerobot is installed, what its own reader reads from it."""
 
+import json
 import re
 import sys
 from dataclasses import dataclass, replace
@@ -103,12 +104,14 @@ def test_deployments_that_are_no_episodes_are_named(tmp_path):
     (picture, *_) = sorted((tmp_path / "blind" / "depth").iterdir())
     cv2.imwrite(str(picture), np.zeros_like(depth_mm[0]))
     write_deployment(tmp_path / "thin", frames=1)
+    write_deployment(tmp_path / "dry", dry_run=True)
     write_deployment(tmp_path / "torn")
     steps = tmp_path / "torn" / "steps.jsonl"
     steps.write_text(steps.read_text()[:-20])
     source = open_source(tmp_path)
     assert [read().name for read in source.episodes] == ["judged"]
-    assert sorted(line.split(":")[0] for line in source.left_out) == ["blind", "open", "thin", "torn"]
+    assert sorted(line.split(":")[0] for line in source.left_out) == ["blind", "dry", "open", "thin", "torn"]
+    assert "dry: a dry run: the arm did not do what its steps say" in source.left_out
     assert "left out 1 of 4 frames" in " ".join(source.left_out)
     assert "1 pictures for 4 steps" in " ".join(source.left_out)
     assert open_source(tmp_path / "judged").episodes[0]().task == "grasp the object and lift it"
@@ -193,6 +196,42 @@ def test_who_acted_is_in_every_step_and_counted_on_the_card(tmp_path):
     contents = card.Contents()
     contents.count(open_source(tmp_path / "alone").episodes[0](), 0)
     assert (contents.retried, contents.unnoted) == (0, 0)
+
+
+def set_json(path: Path, **values) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+
+def test_colour_of_another_lens_is_called_so_on_the_card(tmp_path):
+    for name in ("real", "rig"):
+        write_deployment(tmp_path / name)
+    set_json(tmp_path / "real" / "meta.json", color_aligned_to_depth=False)  # as a RealSense's
+    source = open_source(tmp_path)
+    episodes = [read() for read in source.episodes]
+    assert [episode.color_aligned for episode in episodes] == [False, True]
+    how = {"name": "set", "storage": "video", "licence": "cc-by-4.0", "command": "ddgrasp demos export x"}
+    for chosen, said in ((episodes, True), (episodes[1:], False)):
+        contents = card.Contents(keys=tuple(dataset._described(chosen[0], "video")))
+        for episode in chosen:
+            contents.count(episode, 0)
+        text = card.render(source, contents, **how)
+        assert ("**Colour**: in 1 of 2 episodes it is the colour camera's own picture" in text) == said
+
+
+@pytest.mark.parametrize("told", [{"q_rad": [0.0] * 6 + [None]}, {"q_rad": [0.0] * 6}, {"width_m": None}])
+def test_a_step_without_the_robot_s_state_is_no_step_of_a_dataset(tmp_path, told):
+    """The loop holds the arm there and notes null; LeRobot would average it to no number at all."""
+    for name in ("blind", "whole"):
+        write_deployment(tmp_path / name, held=(2,))
+    steps_file = tmp_path / "blind" / "steps.jsonl"
+    rows = [json.loads(line) for line in steps_file.read_text().splitlines()]
+    rows[2] |= told
+    steps_file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    source = open_source(tmp_path)
+    assert [read().name for read in source.episodes] == ["whole"]
+    assert source.left_out == [
+        "blind: in step 2 the robot told no whole state (seven joints and the opening)"
+    ]
 
 
 def test_what_stands_there_is_not_touched(tmp_path, monkeypatch):

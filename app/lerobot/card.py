@@ -30,7 +30,7 @@ _ROWS = {
     ACTION_KEY: f"seven joint steps in [-1, 1], each times {contract.ACTION_SCALE_RAD:g} rad and added to "
     "its joint; then the gripper: above 0 it closes, else it opens",
     DEPTH: "planar depth (along the camera's axis) in millimetres; 0 where the camera has none",
-    COLOUR: "colour of the same moment and view",
+    COLOUR: "colour of the same moment, and of the same view unless it says otherwise above",
     POSE: "the camera's pose: position in metres, axes as in OpenCV, in the frame of the robot's base",
     BY_POLICY: "true in a step whose `action` is the policy's: not where the loop's rules acted or the loop "
     "held the arm, and not where nobody noted who acted",
@@ -72,6 +72,8 @@ class Contents:
     """Control periods without a step."""
     farther: int = 0
     """Pixels that were too far for a depth video."""
+    unaligned: int = 0
+    """Episodes whose colour is not seen from where depth is."""
     objects: dict[str, int] = field(default_factory=dict)
     """Episodes by object, "" where nobody noted it."""
 
@@ -91,6 +93,7 @@ class Contents:
             self.retried += sum(by == "retry" for by in episode.by)
         self.missed += episode.missed
         self.farther += farther
+        self.unaligned += not episode.color_aligned
         self.objects[episode.object_name] = self.objects.get(episode.object_name, 0) + 1
 
 
@@ -135,6 +138,11 @@ def render(
         about += [
             f"* **Time**: {contents.missed} control periods passed without a step; timestamps count steps, "
             "so around them more time lies between two steps than they say."
+        ]
+    if contents.unaligned:
+        about += [
+            f"* **Colour**: in {contents.unaligned} of {contents.episodes} episodes it is the colour "
+            "camera's own picture, of another lens and view than depth's: its pixels are not those of depth."
         ]
     rows = [f"| `{key}` | {_ROWS[key]} |" for key in contents.keys]
     stored = _STORAGE[storage].format(farther=contents.farther)

@@ -65,6 +65,8 @@ def _each(deployments: Sequence[Deployment], key: str) -> str:
 def _pictures(deployment: Deployment) -> Recording:
     """One for every step. UserError with the reason where it is no episode."""
     report = deployment.report
+    if not deployment.is_driven:
+        raise UserError("a dry run: the arm did not do what its steps say")
     if report["success"] is None:
         raise UserError('nobody judged it: set "success" in its report.json')
     if not report["steps"] or report["frames"] != report["steps"]:
@@ -94,12 +96,13 @@ def _read(deployment: Deployment, recording: Recording) -> Episode:
         name=folder.name,
         object_name=str(deployment.report.get(OBJECT, "")),
         success=bool(deployment.report["success"]),
-        state=np.array([[*row["q_rad"], row["width_m"]] for row in rows], np.float32).reshape(-1, STATE.size),
+        state=states(rows),
         action=actions(rows),
         pictures=pictures,
         held=np.array([row["action"] is None for row in rows]),
         by=[row.get("by") or "" for row in rows],  # steps of before 2026-11-28 have none
         missed=int(deployment.report.get("missed_deadlines", 0)),
+        color_aligned=recording.color_aligned,
     )
 
 
@@ -112,6 +115,16 @@ def _steps(path: Path) -> list[dict[str, Any]]:
     except (ValueError, OSError, TypeError) as error:
         raise UserError(f"{path} is damaged ({error}): move its folder elsewhere.") from None
     return rows
+
+
+def states(rows: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """(T, 8) float32 joints (rad) and opening (m). Raises UserError for a step of which the robot told no
+    whole state: the loop held the arm there, and a dataset has no room for what is not known."""
+    told = [[*(row["q_rad"] or ()), row["width_m"]] for row in rows]
+    for step, state in enumerate(told):
+        if len(state) != STATE.size or None in state:
+            raise UserError(f"in step {step} the robot told no whole state (seven joints and the opening)")
+    return np.array(told, np.float32).reshape(-1, STATE.size)
 
 
 def actions(rows: Sequence[Mapping[str, Any]]) -> np.ndarray:

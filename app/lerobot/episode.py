@@ -34,6 +34,8 @@ class Episode:
     """Control periods without a step, since the loop came late."""
     T_world_cam: Float32[np.ndarray, "4 4"] | None = None
     """The camera's pose, metres, OpenCV axes; None where it is unknown."""
+    color_aligned: bool = True
+    """Whether colour is seen from where depth is; else it is the colour camera's own picture."""
 
     @property
     def task(self) -> str:
