@@ -194,6 +194,25 @@ def test_an_open_surface_is_refused():
         body_of(box("tin", shape=lambda: (part,)))
 
 
+def test_a_surface_whose_vertices_are_there_twice_is_told_how_to_join_them():
+    whole = trimesh.creation.box((60, 40, 20))
+    corners, faces = whole.vertices[whole.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
+    apart = trimesh.Trimesh(corners, faces, process=False)
+    apart.visual = trimesh.visual.TextureVisuals(uv=np.random.default_rng(0).random((36, 2)))
+    with pytest.raises(UserError, match=r"'side' of 'tin' has vertices twice, .*merge_vertices\(merge_tex"):
+        body_of(box("tin", shape=lambda: (Part("side", apart, (0.5, 0.5, 0.5)),)))
+    apart.merge_vertices(merge_tex=True, merge_norm=True)
+    body = body_of(box("tin", shape=lambda: (Part("side", apart, (0.5, 0.5, 0.5)),)))
+    assert body.rest_height_m == pytest.approx(0.010)
+
+
+def test_what_a_file_with_several_meshes_is_read_as_is_refused():
+    part = Part("side", trimesh.creation.box((60, 40, 20)), (0.5, 0.5, 0.5))
+    object.__setattr__(part, "mesh", trimesh.Scene([part.mesh]))  # tests check what Part is given
+    with pytest.raises(UserError, match=r"'side' of 'tin' is a Scene, not one mesh: .*trimesh\.load_mesh"):
+        body_of(box("tin", shape=lambda: (part,)))
+
+
 def test_a_surface_that_is_inside_out_is_called_that():
     turned = trimesh.creation.box((60, 40, 20))
     turned.invert()

@@ -73,6 +73,13 @@ def test_wall_is_measured_where_it_stands(range_m):
     assert abs(np.median(inner[inner > 0]) / 1000 - range_m) < 0.1 * range_m**2 / FB_PX_M
 
 
+def test_the_projector_lights_what_a_principal_point_off_the_middle_shows():
+    """One that is 20 px higher looks as much further down, where no dots were: half of it was lost."""
+    camera = ActiveStereo(StereoConfig(), replace(PROFILE, cy_px=PROFILE.cy_px - 20))
+    lost = camera.sense(wall(0.8), T_WORLD_CAM, np.random.default_rng(0), {0: Material(0.5)}) == 0
+    assert np.mean(lost[-20:, 60:]) < 0.15
+
+
 def test_disparity_is_quantised_in_32nds():
     depth_mm = sense(wall(0.6))
     values = np.unique(depth_mm[depth_mm > 0])

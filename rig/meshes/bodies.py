@@ -81,9 +81,9 @@ def make_body(name: str) -> MeshBody:
 def body_of(described: MeshObject) -> MeshBody:
     """What MuJoCo takes of `described`.
 
-    Raises UserError for parts that cannot be told apart, a surface that is not closed, a shape in metres, one
-    that no two opposite sides of fit between the fingers, one that does not rest as described, and for a
-    concave one where CoACD is not installed.
+    Raises UserError for parts that cannot be told apart, a surface that is no single mesh or not closed, a
+    shape in metres, one that no two opposite sides of fit between the fingers, one that does not rest as
+    described, and for a concave one where CoACD is not installed.
     """
     _check_libraries()
     parts = described.shape()
@@ -199,8 +199,20 @@ def _check_names(name: str, parts: Sequence[Part]) -> None:
 
 
 def _check_closed(name: str, part: Part) -> None:
+    if not isinstance(part.mesh, trimesh.Trimesh):  # what trimesh.load gives of a file with several
+        raise UserError(
+            f"The surface {part.name!r} of {name!r} is a {type(part.mesh).__name__}, not one mesh: read its "
+            "file with trimesh.load_mesh."
+        )
     if part.mesh.is_volume:
         return
+    joined = part.mesh.copy()
+    joined.merge_vertices(merge_tex=True, merge_norm=True)
+    if joined.is_volume:
+        raise UserError(
+            f"The surface {part.name!r} of {name!r} has vertices twice, as at the seams of a texture, and so "
+            "open edges: mend it with mesh.merge_vertices(merge_tex=True, merge_norm=True)."
+        )
     if part.mesh.is_watertight:
         raise UserError(
             f"The surface {part.name!r} of {name!r} is closed, but inside out, or its faces disagree on what "

@@ -28,7 +28,7 @@ MAX_VERTICES = 200
 _SIMPLIFY_MM = 0.3
 """CoACD's time goes with the number of faces."""
 _STORED_MM = 0.01
-"""What a unit of the stored 16-bit integers is."""
+"""What a unit of the stored integers is."""
 
 Hull = Float64[np.ndarray, "_ 3"]
 

@@ -282,10 +282,12 @@ def _camera(profile: CameraProfile, T_world_cam: np.ndarray, x_m: float) -> Came
 
 
 def _projector_profile(profile: CameraProfile) -> CameraProfile:
-    """A pinhole with the imager's focal length and a wider picture."""
+    """A pinhole with the imager's focal length and a picture that is wider by as much on either side."""
     width = 2 * round(profile.width_px * PROJECTOR_MARGIN / 2)
     height = 2 * round(profile.height_px * PROJECTOR_MARGIN / 2)
-    return replace(profile, width_px=width, height_px=height, cx_px=width / 2, cy_px=height / 2)
+    cx_px = profile.cx_px + (width - profile.width_px) / 2
+    cy_px = profile.cy_px + (height - profile.height_px) / 2
+    return replace(profile, width_px=width, height_px=height, cx_px=cx_px, cy_px=cy_px)
 
 
 def _dot_pattern(config: StereoConfig, profile: CameraProfile, projector: CameraProfile) -> np.ndarray:
