@@ -51,7 +51,8 @@ class Generator:
         """The generator in a finished `ddg` stage directory; UserError if there is none.
 
         Args:
-          sampler: instead of the one it was made with.
+          sampler: instead of the one it was made with; dpm_solver takes quadratic steps then, since those of
+            another one make it leave specks (docs/generator.md).
           steps: the same for network evaluations per map; for sampler progressive a number to which the stage
             distilled on its way.
         """
@@ -65,12 +66,13 @@ class Generator:
         if sampler == PROGRESSIVE and not file.exists():
             raise UserError(
                 f"{directory} holds no {file.name}: distil one with `ddgrasp ddg distil --model {directory} "
-                f"--evaluations {steps}`."
+                f"--evaluations {steps} --data RECORDINGS --out RUN` on the recordings that it was fitted on."
             )
-        config = replace(
-            config,
-            sampling=replace(config.sampling, sampler=sampler, steps=steps),
-        )
+        spacing = config.sampling.spacing
+        if sampler == DPM_SOLVER != config.sampling.sampler:
+            spacing = "quadratic"
+        sampling = replace(config.sampling, sampler=sampler, steps=steps, spacing=spacing)
+        config = replace(config, sampling=sampling)
         params = load_params(file, jax.eval_shape(partial(_init_shapes, config)))
         return cls(config, params, make_prior(config))
 

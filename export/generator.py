@@ -25,7 +25,7 @@ from export.parity import open_session
 from export.sampler_tables import MOST_STEPS, is_stochastic
 from learning import diffusion
 from mjx_envs.precision import exact
-from sensors.recordings.recording import find_recordings
+from sensors.recordings.recording import Recording, find_recordings, recording_folders
 
 PARITY_SCENES = 4
 MOST_SHARE = 2e-3
@@ -145,7 +145,7 @@ def _recorded(data: Path, size: tuple[int, int]) -> tuple[dict[str, Any], str, s
     """What the recordings' meta.json say of the centred window that a generator of `size` (H, W) is fitted
     to, and the range of its depth; no focal length where the recordings are of several.
     """
-    recordings = find_recordings(data)
+    recordings = _readable(data)
     metas = [recording.meta for recording in recordings]
     seen = (crop_nearest(r.depth_m(i), size) for r in recordings for i in range(len(r)))
     depth = np.concatenate([frame[::4, ::4].ravel() for frame in seen])
@@ -161,6 +161,22 @@ def _recorded(data: Path, size: tuple[int, int]) -> tuple[dict[str, Any], str, s
         "far_m": round(float(far), 3),
     }
     return camera, _joined(metas, "licence"), _joined(metas, "source")
+
+
+def _readable(data: Path) -> list[Recording]:
+    """Recordings at or directly below `data` but for refused ones, which a fit leaves out as well; UserError
+    if none is left.
+    """
+    recordings: list[Recording] = []
+    refused: list[UserError] = []
+    for folder in (recording_folders(data) if data.is_dir() else []) or [data]:
+        try:
+            recordings += find_recordings(folder)
+        except UserError as error:
+            refused.append(error)
+    if not recordings:
+        raise refused[0]
+    return recordings
 
 
 def _joined(metas: list[dict[str, Any]], key: str) -> str:

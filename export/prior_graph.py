@@ -22,12 +22,22 @@ HEIGHT, WIDTH = 2, 3
 
 
 def check_prior(config: DDGConfig) -> None:
-    """UserError for a prior that a graph cannot hold: a network on colour pictures."""
+    """UserError for a prior that a graph cannot hold: a network on colour pictures, a Gaussian that reaches
+    across the whole map, which ONNX does not reflect more than once.
+    """
     if config.prior.source in NETWORKS and config.prior.in_sim == "rgb":
         raise UserError(
             f"ddg.prior.source is {config.prior.source} on rgb, which the ONNX file cannot hold: export a "
             "generator fitted with --ddg.prior.in-sim depth or a built-in prior."
         )
+    blur_px = 0.0 if config.prior.source in NETWORKS else config.prior.blur_px
+    least = min(config.depth.height_px, config.depth.width_px)
+    for name, sigma_px in (("prior.blur_px", blur_px), ("graft.window_px", config.graft.window_px)):
+        if _blur_length(sigma_px) // 2 >= least:
+            raise UserError(
+                f"ddg.{name} is {sigma_px:g}: the ONNX file cannot hold a Gaussian that reaches across "
+                f"all of the map's {least} pixels: export a generator with {(least - 1) / 4:g} or less."
+            )
 
 
 def write_prior(g: GraphBuilder, depth: str, config: DDGConfig) -> str:
@@ -84,13 +94,17 @@ def write_window(g: GraphBuilder, depth: str, window_px: float) -> str:
 
 def write_blur(g: GraphBuilder, x: str, sigma_px: float) -> str:
     """cv2.GaussianBlur of float pictures, whose kernel reaches four standard deviations."""
-    length = round(8 * sigma_px + 1) | 1
+    length = _blur_length(sigma_px)
     kernel = cv2.getGaussianKernel(length, sigma_px, cv2.CV_32F).ravel()
     x = _write_padded(g, x, length // 2, "reflect")
     for shape in ((length, 1), (1, length)):
         weights = g.constant(kernel.reshape(1, 1, *shape))
         x = g.op("Conv", x, weights, kernel_shape=shape)
     return x
+
+
+def _blur_length(sigma_px: float) -> int:
+    return round(8 * sigma_px + 1) | 1
 
 
 def write_bilateral(g: GraphBuilder, x: str, size: tuple[int, int]) -> str:

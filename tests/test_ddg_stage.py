@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import re
+from pathlib import Path
 
 import cv2
 import jax
@@ -208,8 +210,10 @@ def test_the_stage_distils_and_its_folder_holds_every_sampler(fitted, recordings
     assert not any(np.array_equal(weights[a][0], weights[b][0]) for a, b in ((0, 1), (1, 2), (0, 2)))
     depth = np.full((2, 16, 24), 0.9, np.float32)
     assert generate(jax.random.key(0), one, depth).depth_m.shape == depth.shape
-    with pytest.raises(UserError, match="distilled_4.msgpack.*ddg distil --model"):
+    with pytest.raises(UserError, match="distilled_4.msgpack.*ddg distil --model") as refused:
         Generator.load(directory, steps=4)
+    remedy = re.findall("`ddgrasp ddg distil ([^`]*)`", str(refused.value))[0]
+    assert parse("ddg distil", remedy.split()).evaluations == 4  # a command that can be given
     with pytest.raises(UserError, match="Did you mean 'progressive'"):
         Generator.load(directory, "progresive")
     # the fitted network, not the distilled one, is where another stage starts
@@ -236,6 +240,15 @@ def test_a_model_whose_steps_cannot_be_halved_is_distilled_to_quadratic_ones(
     made = Generator.load(tmp_path / "ddg").config.sampling
     assert (made.sampler, made.steps, made.spacing) == ("progressive", 8, "quadratic")
     assert "steps are linspace, which cannot be halved" in capsys.readouterr().err
+
+
+def test_the_page_s_fit_of_log_odds_is_the_one_that_its_table_scores():
+    """That preset `laptop` has planes, positions and linspace steps since then does not change it."""
+    page = (Path(__file__).parents[1] / "docs" / "generator.md").read_text()
+    command = re.findall("`ddgrasp ddg fit ([^`]*--ddg.training.hole-loss[^`]*)`", page)[0]
+    scored = DDGConfig(training=DDGTrainingConfig(steps=1200, hole_loss="cross_entropy"))
+    assert parse("ddg fit", command.split()).config.ddg == scored
+    assert (scored.sampling.sampler, scored.sampling.steps) == ("dpm_solver", 4)  # the table's first row
 
 
 def test_flicker_is_counted_within_recordings_only():

@@ -313,7 +313,8 @@ def test_samplers_are_scored_on_the_same_episodes(run_dir, tmp_path, capsys):
     assert cli.main(command) == 0
     result = json.loads((tmp_path / "samplers" / "samplers.json").read_text())
     rows = result["samplers"]
-    assert list(rows) == ["ddim 50", "ddim 10", "ddim 4", "dpm_solver 8", "dpm_solver 4"]
+    others = ["ddim 50", "ddim 10", "ddim 4", "dpm_solver 8", "dpm_solver 4"]
+    assert list(rows) == [*others, "dpm_solver 2"]  # its own is the last one
     assert rows["ddim 50"]["over_reference"] == 1.0 and rows["ddim 4"]["over_reference"] != 1.0
     assert all(row["frames_per_s"] > 0 and 0 < row["holes"]["invalid_share"] < 1 for row in rows.values())
     assert 0 <= result["floor"]["fid"]["value"] < rows["ddim 50"]["fid"]["value"]

@@ -14,12 +14,14 @@ from ddgrasp.config import Config, DDGConfig, ScoreConfig
 from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
+from ddgrasp.shipped import PRETRAINED
 from ddgrasp.stages import get_stage
 from evaluation.depth_score import curve, samplers, stage
 from evaluation.depth_score import data as score_data
 from evaluation.depth_score import episodes as score_episodes
 from evaluation.depth_score import table as score_table
-from evaluation.depth_score.domains import FLOOR, RAW, Methods
+from evaluation.depth_score.domains import COLUMNS, FLOOR, RAW, Column, Methods
+from evaluation.depth_score.figures import draw_embedding
 from evaluation.depth_score.resampling import Sample
 from foundation import store
 from sensors.recordings.writer import RecordingWriter
@@ -93,3 +95,20 @@ def test_every_column_is_resampled_alike():
     table = score_table.make_table(samples, config, 0, QUIET)
     assert table["ddg"]["fid"]["low"] < table["ddg"]["fid"]["high"]
     assert table["ddg"]["fid_ratio"] == {"value": 1, "low": 1, "high": 1}
+
+
+def test_samplers_have_the_generators_own_and_steps_that_do_not_spoil_them():
+    """Second order at linspace steps leaves specks, and the shipped generator has those for its DDIM."""
+    sampling = {name: made.config.sampling for name, made in samplers._generators(PRETRAINED / "ddg")}
+    steps = {name: f"{s.sampler} {s.steps} {s.spacing}" for name, s in sampling.items()}
+    assert steps["ddim 6"] == "ddim 6 linspace" and steps["ddim 50"] == "ddim 50 linspace"
+    assert steps["dpm_solver 4"] == "dpm_solver 4 quadratic"
+    assert steps["dpm_solver 8"] == "dpm_solver 8 quadratic"
+
+
+def test_a_column_more_than_the_paper_has_is_drawn(monkeypatch):
+    for name in ("mine", "another"):
+        monkeypatch.setitem(COLUMNS, name, Column(name, RAW, "sim_gt"))
+    flat = {RAW: np.zeros((3, 2)), "sim_gt": np.ones((3, 2))}
+    column = {"title": "mine", "real": RAW, "sim": "sim_gt", "fid": {"value": 1.0}, "mixing": {"value": 0.5}}
+    assert draw_embedding(flat, {"sim_gt": column, "mine": column}, 1.0).startswith(b"\x89PNG")

@@ -161,6 +161,26 @@ def test_a_prior_by_colour_is_refused():
         prior_graph.check_prior(by_colour)
 
 
+@pytest.mark.parametrize("name", ["prior.blur_px", "graft.window_px"])
+def test_a_gaussian_that_reaches_across_the_map_is_refused(name, tmp_path):
+    """27 rows: 6.5 px reach 26 beyond the border, all that one reflection has."""
+    section, field = name.split(".")
+    wide, held = (
+        replace(SMALL, **{section: replace(getattr(SMALL, section), **{field: sigma_px})})
+        for sigma_px in (7.0, 6.5)
+    )
+    prior_graph.check_prior(held)
+    finished(made(wide), tmp_path)
+    with pytest.raises(UserError, match=f"ddg.{name} is 7: .* 27 pixels: .* 6.5 or less"):
+        exported.export_generator(tmp_path, tmp_path / "generator.onnx")
+
+
+def test_the_widest_gaussian_that_is_held_is_opencvs():
+    picture = np.random.default_rng(0).random((27, 48)).astype(np.float32)
+    blurred = filtered(lambda g, x: prior_graph.write_blur(g, x, 6.5), picture)
+    np.testing.assert_allclose(blurred, cv2.GaussianBlur(picture, (0, 0), 6.5), atol=1e-5)
+
+
 def test_a_file_that_differs_is_not_written(tmp_path, monkeypatch):
     finished(made(CAMERA), tmp_path)
     monkeypatch.setattr(exported, "MOST_SHARE", -1.0)
@@ -219,6 +239,20 @@ def test_optics_in_the_file_are_those_of_what_the_generator_sees(tmp_path, sizes
     camera = exported.describe(artifacts.read_artifact(tmp_path / "ddg"), config, tmp_path / "all").camera
     assert (camera["height_px"], camera["width_px"], camera["fx_px"]) == window
     assert camera["near_m"] == camera["far_m"] == 1.0
+
+
+def test_recordings_that_a_fit_leaves_out_do_not_keep_a_generator_from_its_file(tmp_path):
+    finished(made(CAMERA), tmp_path / "ddg")
+    artifact, room = artifacts.read_artifact(tmp_path / "ddg"), tmp_path / "room"
+    for name in ("good", "torn"):
+        with RecordingWriter(room / name, {"sensor": name}) as writer:
+            writer.add(np.zeros((36, 64, 3), np.uint8), np.full((36, 64), 1000, np.uint16))
+    next((room / "torn" / "depth").iterdir()).write_bytes(b"no picture")
+    camera = exported.describe(artifact, CAMERA, room).camera
+    assert (camera["name"], camera["near_m"]) == ("good", 1.0)
+    for nothing, said in (("torn", "none of its 1 frames is readable"), ("none", "no such folder")):
+        with pytest.raises(UserError, match=said):
+            exported.describe(artifact, CAMERA, room / nothing)
 
 
 def test_the_file_names_the_recordings_camera(tmp_path):

@@ -1,6 +1,7 @@
 """Pictures of a score: the table, hole-rate curves, the t-SNE's pairings, the data-efficiency curve."""
 
 from collections.abc import Mapping, Sequence
+from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,7 @@ def draw_embedding(
         for domain, color in ((table[name]["real"], REAL_COLOR), (table[name]["sim"], SIM_COLOR)):
             axes.scatter(*flat[domain].T, s=3, c=color, label=DOMAINS[domain].title, alpha=0.5, linewidths=0)
         mixing = table[name]["mixing"]["value"]
-        letter = "abcdef"[list(COLUMNS).index(name)]
+        letter = ascii_lowercase[list(COLUMNS).index(name)]
         axes.set_title(f"({letter}) {table[name]['title']}: mixing {mixing:.2f}", fontsize=9)
         axes.set_xticks([])
         axes.set_yticks([])

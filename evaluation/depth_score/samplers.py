@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE
 from ddgrasp.depth import to_metres
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 JSON = "samplers.json"
 REFERENCE = ("ddim", 50)
 PLAIN = (REFERENCE, ("ddim", 10), ("ddim", 4), ("dpm_solver", 8), ("dpm_solver", 4))
-"""DDIM with the generator's own `ddg.sampling.eta`."""
+"""Beside the generator's own; DDIM with its `ddg.sampling.eta`."""
 TARGET = 1.1
 """FID of a sampler of at most 4 evaluations over that of REFERENCE."""
 TIMED_FRAMES = 64
@@ -71,11 +72,14 @@ def run(job: Job) -> Artifact:
 
 
 def _generators(directory: Path) -> Iterator[tuple[str, "ddg_jax.sample.Generator"]]:
-    """Name -> the fitted generator with that sampler; distilled ones as far as they were made."""
+    """Name -> the fitted generator with that sampler, also with its own; distilled ones as far as they were
+    made."""
     from ddg_jax.sample import Generator
 
-    for sampler, steps in PLAIN:
-        yield _name(sampler, steps), Generator.load(directory, sampler, steps)
+    own = artifacts.config_from_json(artifacts.read_manifest(directory).config).ddg.sampling
+    for sampler, steps in dict.fromkeys((*PLAIN, (own.sampler, own.steps))):
+        if sampler != PROGRESSIVE:
+            yield _name(sampler, steps), Generator.load(directory, sampler, steps)
     for file in sorted(directory.glob("distilled_*.msgpack"), reverse=True):
         steps = int(file.stem.split("_")[1])
         yield _name(PROGRESSIVE, steps), Generator.load(directory, PROGRESSIVE, steps)
