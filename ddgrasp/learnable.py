@@ -13,6 +13,7 @@ def check_learnable(config: Config) -> None:
         _check_actor(config.teacher)
     _check_losses(config.student)
     _check_head(config.student)
+    _check_sight(config.student)
 
 
 def _check_actor(teacher: TeacherConfig) -> None:
@@ -22,12 +23,17 @@ def _check_actor(teacher: TeacherConfig) -> None:
             f"{teacher.total_steps} makes {teacher.iterations} iteration(s), in all of which the critic "
             "alone would learn: take fewer of those, or more steps."
         )
+    if teacher.total_steps and teacher.num_envs * teacher.unroll_steps == teacher.minibatches:
+        raise UserError(
+            f"teacher.minibatches {teacher.minibatches} of {teacher.num_envs} environments' unroll_steps "
+            f"{teacher.unroll_steps} are one control step each, whose advantage less the mean is 0: the "
+            "policy would learn nothing; take fewer minibatches, or more steps."
+        )
 
 
 def _check_losses(student: StudentConfig) -> None:
     training, rounds = student.training, student.poses.rounds
-    on_pictures = training.steps > 0 or student.dagger.rounds * student.dagger.steps > 0
-    if on_pictures and not (training.aux_weight or training.action_weight):
+    if _on_pictures(student) and not (training.aux_weight or training.action_weight):
         raise UserError(
             "student.training.aux_weight and action_weight are both 0: training on pictures would change "
             "nothing; give one of them a weight."
@@ -36,6 +42,26 @@ def _check_losses(student: StudentConfig) -> None:
         raise UserError(
             f"student.poses.rounds is {rounds}, and student.head.aux_to_head off: on poses without pictures "
             "the head would see nothing; take 0 rounds."
+        )
+
+
+def _on_pictures(student: StudentConfig) -> bool:
+    """Whether anything is trained on pictures."""
+    return student.training.steps > 0 or student.dagger.rounds * student.dagger.steps > 0
+
+
+def _check_sight(student: StudentConfig) -> None:
+    """What acts must see, and what sees must have been trained."""
+    if student.head.conditioning == "film" and not student.head.blocks:
+        raise UserError(
+            "student.head.blocks is 0 with student.head.conditioning film, which acts in blocks alone: the "
+            "head would see neither an observation nor the diffusion step; take 1 or more, or concat."
+        )
+    if not (_on_pictures(student) or student.init_from):
+        raise UserError(
+            f"student.training.steps is 0, dagger.rounds {student.dagger.rounds} and dagger.steps "
+            f"{student.dagger.steps}, no student.init_from: nothing would have trained perception; give "
+            "steps, or a student to begin from."
         )
 
 

@@ -1,8 +1,13 @@
 """Several processes that train as one, through JAX's own runtime. One process is the case of one."""
 
+import os
+import signal
 import socket
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -14,10 +19,15 @@ from ddgrasp.errors import UserError
 
 CONNECT_TIMEOUT_S = 120
 _RETRY_S = 0.2
+_BEFORE_JAX_S = 60
+"""JAX, whose way of giving up is to abort the process, is let wait so much longer than we do."""
 
 
 def connect(hosts: HostsConfig) -> None:
-    """Joins the other processes, before anything asks JAX for its devices; UserError if they do not come."""
+    """Joins the other processes, before anything asks JAX for its devices.
+
+    UserError if it cannot; if not all of them come the process ends here, with one line and code 2.
+    """
     if hosts.coordinator == "auto":
         _initialize("no cluster answers for it: give host:port, hosts.processes and hosts.process")
     elif hosts.coordinator:
@@ -55,12 +65,42 @@ def from_leader(tree: Any) -> Any:
 
 def _initialize(trouble: str, **arguments: Any) -> None:
     """`jax.distributed.initialize`; `trouble` explains a failure."""
+    address = arguments.get("coordinator_address", "auto")
     try:
-        jax.distributed.initialize(**arguments, initialization_timeout=CONNECT_TIMEOUT_S)
+        with _endable(address, arguments.get("num_processes", "all")):
+            jax.distributed.initialize(**arguments, initialization_timeout=CONNECT_TIMEOUT_S + _BEFORE_JAX_S)
     except (RuntimeError, ValueError) as error:
-        address = arguments.get("coordinator_address", "auto")
         reason = str(error).splitlines()[0]
         raise UserError(f"hosts.coordinator is {address!r}, and {trouble} ({reason}).") from None
+
+
+@contextmanager
+def _endable(address: str, processes: int | str) -> Iterator[None]:
+    """Lets CONNECT_TIMEOUT_S, and Ctrl-C, end the process: inside of JAX, where the others are waited for,
+    nothing can be raised."""
+
+    def end() -> None:
+        print(
+            f"ddgrasp: hosts.coordinator is {address!r}, and not all processes ({processes}) came there in "
+            f"{CONNECT_TIMEOUT_S} s: start each of them, with a hosts.process of its own.",
+            file=sys.stderr,
+            flush=True,
+        )
+        os._exit(2)
+
+    late = threading.Timer(CONNECT_TIMEOUT_S, end)
+    late.daemon = True
+    late.start()
+    handler = signal.getsignal(signal.SIGINT)
+    ours = threading.current_thread() is threading.main_thread() and callable(handler)  # not one ignored
+    if ours:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        late.cancel()
+        if ours:
+            signal.signal(signal.SIGINT, handler)
 
 
 def _wait_until_it_listens(address: str) -> None:

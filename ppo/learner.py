@@ -49,6 +49,9 @@ with the object in the hand and did not learn to lift it."""
 COUNTED = ("contacts_dropped", "blown_up")
 """Metrics of the environment that an iteration's scalars hold the sum of."""
 
+OF_EPISODES = ("success", "lost", "episode/return", "episode/length")
+"""Scalars that are means over the episodes that an iteration ended, all 0 where it ended none."""
+
 
 @struct.dataclass
 class LearnerState:

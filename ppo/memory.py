@@ -6,25 +6,41 @@ from collections.abc import Iterator
 import jax
 import mujoco
 
-from ddgrasp.config import Config
+from ddgrasp import contract
+from ddgrasp.config import GUIDE, Config, TeacherConfig
 from ddgrasp.errors import UserError
 from learning.memory import compiled_bytes, device_limit, host_bytes, nbytes
 from mjx_envs.grasp_env import AutoReset
-from ppo import learner
+from ppo import learner, warmup
 
 EXPERIENCE_COPIES = 5
 """Copies of an iteration's experience at its peak: 41 kB an environment, where 20 steps are 8 kB (XLA's own
 analysis on a CPU, 512 and 4096 environments)."""
+CLONE_COPIES = 2
+"""Copies of a round's batches: as they are drawn, and as the program's arguments."""
 _SIGNS = ("RESOURCE_EXHAUSTED", "Out of memory", "MemoryError", "out of memory")
 
 
 def check(config: Config, env: AutoReset) -> None:
-    """UserError if the environments and their experience cannot fit. Allocates and compiles nothing."""
+    """UserError if the environments and their experience, or what the guide is cloned on, cannot fit.
+    Allocates and compiles nothing."""
     teacher = config.teacher
+    _check_clone(teacher)
     state = jax.eval_shape(lambda key: learner.init(teacher, env, key), jax.random.PRNGKey(0)).env_state
     step = 2 * state.obs.size + teacher.num_envs * (2 * env.env.action_size + 4)  # floats in a transition
     per_batch = 3 * nbytes(state) + EXPERIENCE_COPIES * teacher.unroll_steps * step * 4
     _compare(config, env, per_batch // env.mesh.size)
+
+
+def _check_clone(teacher: TeacherConfig) -> None:
+    """UserError if the batches of a round, all drawn before its first step, cannot fit: `ppo.warmup`."""
+    numbers = contract.OBSERVATION_SIZE + contract.ACTION_SIZE
+    needed = CLONE_COPIES * teacher.clone_steps * warmup.BATCH * numbers * 4
+    if teacher.start == GUIDE and needed > (free := host_bytes()):
+        raise UserError(
+            f"teacher.clone_steps {teacher.clone_steps} needs about {needed / 1e9:.1f} GB of memory on the "
+            f"host, which has {free / 1e9:.1f} GB for it: lower it, or take more teacher.clone_rounds."
+        )
 
 
 def check_compiled(config: Config, env: AutoReset, compiled: jax.stages.Compiled) -> None:

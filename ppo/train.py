@@ -241,8 +241,10 @@ def _start(config: Config, env: AutoReset, saved: Checkpoints, progress: Progres
 
 def _log(i: int, metrics, progress: Progress, task) -> None:
     values = {name: float(value) for name, value in metrics.items()}
+    if values.get("episode/length") == 0.0:  # no episode ended: nothing to have a mean of
+        values = {name: value for name, value in values.items() if name not in learner.OF_EPISODES}
     progress.scalars(i, **values)
-    task.advance(0, success=values["success"])
+    task.advance(0, **{name: values[name] for name in ("success",) if name in values})
 
 
 def _evaluate(env: GraspEnv, state, config: Config, i: int, progress: Progress) -> float:

@@ -232,6 +232,9 @@ def test_stages_that_do_not_fit_each_other_are_refused():
             "training.steps 0: the head would act before it has learnt",
         ),
         ("head.batch_size=1", "student.head.batch_size is 1; expected at least 2"),
+        ("head.blocks=0", "the head would see neither an observation nor the diffusion step"),
+        ("training.steps=0 dagger.rounds=0", "nothing would have trained perception; give steps, or"),
+        ("training.steps=0 dagger.steps=0", "dagger.rounds 2 and dagger.steps 0, no student.init_from"),
     ],
 )
 def test_a_student_that_nothing_would_train_is_refused(values, expected):

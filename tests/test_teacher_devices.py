@@ -161,6 +161,44 @@ def test_a_coordinator_that_is_not_there_is_named(monkeypatch):
             hosts.connect(HostsConfig(address, processes=2, process=1))
 
 
+def _waits_for_another(seconds: int) -> tuple[str, subprocess.Popen]:
+    """(address, process 0 of 2, which waits there so long and has said so)."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    script = f"""
+import signal
+from ddgrasp.config import HostsConfig
+from ppo import hosts
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
+hosts.CONNECT_TIMEOUT_S = {seconds}
+hosts.connect(HostsConfig({address!r}, processes=2, process=0))
+"""
+    process = _start("-c", script)
+    assert process.stderr is not None
+    told = process.stderr.readline()
+    assert told == f"process 0 of 2: waiting for the others at {address}, {seconds} s at most\n"
+    return address, process
+
+
+def test_processes_that_do_not_come_end_the_one_that_waits_with_a_line():
+    """JAX aborts it, with a stack trace of C++."""
+    address, process = _waits_for_another(3)
+    _, errors = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 2 and errors.count("\n") == 1
+    assert errors.startswith(
+        f"ddgrasp: hosts.coordinator is {address!r}, and not all processes (2) came there in 3 s: start"
+    )
+
+
+def test_ctrl_c_ends_the_one_that_waits_at_once():
+    _, process = _waits_for_another(600)
+    time.sleep(1.0)  # until it does
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=30.0)
+    assert process.returncode == -signal.SIGINT
+
+
 def test_a_coordinator_by_its_ipv6_address_is_found():
     with socket.socket(socket.AF_INET6) as listening:
         try:

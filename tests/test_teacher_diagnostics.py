@@ -8,7 +8,9 @@ from brax.training import types
 from brax.training.agents.ppo import networks as ppo_networks
 
 from ddgrasp.config import TeacherConfig
+from ddgrasp.progress import Progress, read_curves
 from ppo import diagnostics, learner
+from ppo import train as ppo_train
 from teacher_support import learner_without_envs
 
 TEACHER = TeacherConfig(hidden=(16,), action_std=0.2, gripper_std=0.4, clip=0.2, discount=0.9)
@@ -93,3 +95,23 @@ def test_a_critic_that_foresees_every_return_explains_all_and_one_number_nothing
     assert of(foreseen)["value/explained_variance"] == pytest.approx(1.0, abs=1e-4)
     constant = jax.tree.map(jnp.zeros_like, VALUE)
     assert of(foreseen, value=constant)["value/explained_variance"] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_where_no_episode_ended_the_curves_of_episodes_have_no_point(tmp_path):
+    """A 0 there would say that none succeeded, of a few environments or short unrolls most of the time."""
+    progress = Progress(tmp_path, quiet=True)
+    none = dict.fromkeys(("success", "lost", "episode/return", "episode/length"), 0.0) | {"policy/kl": 0.1}
+    with progress.task("PPO", 15) as task:
+        ppo_train._log(5, none | {"success": 0.5, "episode/length": 6.0}, progress, task)
+        ppo_train._log(10, none, progress, task)
+        assert task.shown == "success 0.5"
+        ppo_train._log(15, none | {"episode/length": 6.0}, progress, task)
+    progress.close()
+    curves = read_curves(tmp_path)
+    assert curves.pop("policy/kl") == [(5, 0.1), (10, 0.1), (15, 0.1)]
+    assert curves == {
+        "success": [(5, 0.5), (15, 0.0)],
+        "lost": [(5, 0.0), (15, 0.0)],
+        "episode/return": [(5, 0.0), (15, 0.0)],
+        "episode/length": [(5, 6.0), (15, 6.0)],
+    }

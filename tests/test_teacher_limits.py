@@ -11,6 +11,7 @@ import pytest
 from config_support import unchecked
 from ddgrasp.config import Config, EvalConfig, RewardConfig, TeacherConfig, WorldConfig
 from ddgrasp.errors import UserError
+from ddgrasp.learnable import check_learnable
 from ddgrasp.progress import Progress
 from learning.checkpoints import Checkpoints
 from mjx_envs.grasp_env import AutoReset, GraspEnv
@@ -87,6 +88,35 @@ def test_more_environments_than_memory_are_refused_with_the_size():
         UserError, match=r"num_envs 1073741824 needs about \d+\.\d GB .* lower teacher.num_envs"
     ):
         stage.check(dataclasses.replace(CONFIG, teacher=teacher))
+
+
+def test_more_gradient_steps_than_can_be_counted_are_refused():
+    """Or --teacher.total-steps 1000000000000, to stop it by hand, ends in JAX's OverflowError."""
+    with pytest.raises(
+        UserError, match=r"000 makes 97656250 iterations, .* 3125000000 gradient steps; expected at most 2147"
+    ):
+        TeacherConfig(total_steps=10**12)
+    assert TeacherConfig(total_steps=10**12, num_envs=4096).iterations == 12_207_031
+
+
+def test_more_batches_of_cloning_than_memory_are_refused_by_their_own_name():
+    """They are drawn at once; what MemoryError was told of them was to lower teacher.num_envs."""
+    many = dataclasses.replace(TEACHER, start="guide", clone_steps=10**7)
+    with pytest.raises(
+        UserError, match=r"clone_steps 10000000 needs about 3932\.2 GB .* teacher.clone_rounds"
+    ):
+        stage.check(dataclasses.replace(CONFIG, teacher=many))
+    for teacher in (dataclasses.replace(many, start="nothing"), dataclasses.replace(many, clone_steps=500)):
+        memory._check_clone(teacher)
+
+
+def test_minibatches_of_one_step_are_refused():
+    """PPO divides advantages by their deviation, less their mean: of one nothing is left."""
+    teacher = dataclasses.replace(TEACHER, num_envs=2, unroll_steps=1)
+    with pytest.raises(UserError, match="2 of 2 environments' unroll_steps 1 are one control step each"):
+        check_learnable(dataclasses.replace(CONFIG, teacher=teacher))
+    for values in ({"unroll_steps": 2}, {"minibatches": 1}, {"start": "pretrained", "total_steps": 0}):
+        check_learnable(dataclasses.replace(CONFIG, teacher=dataclasses.replace(teacher, **values)))
 
 
 def test_a_program_larger_than_memory_is_refused_before_it_runs():

@@ -1,5 +1,7 @@
 """Every backend passes the conformance experiments; the drawn parameters stay in their ranges."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ from mjx_envs.object_spec import DEFAULT_SLOTS
 from mjx_envs.objects import OBJECTS
 from mjx_envs.physics import backends, conformance
 from mjx_envs.physics import mjx_warp as physics_warp
+from mjx_envs.physics.c_engine import CpuPhysics
 
 NAMES = ("cube", "apple", "banana")
 DT_S = 0.005
@@ -110,6 +113,53 @@ def test_a_backend_that_forgets_part_of_its_state_is_found(forgotten, seen_by, c
         return without(c_step(params, without(state), ctrl))
 
     assert beyond(step) == seen_by
+
+
+def test_two_threads_at_the_c_engine_do_not_get_each_others_environments():
+    """An evaluation beside a training, say, of one environment: two programs call with as many at a time."""
+    engine, scenario = CpuPhysics(DT_S, 20, DEFAULT_SLOTS), conformance.moving_arm()
+    params, start = jax.device_get((scenario.params, scenario.start))
+    rolled = jax.tree.map(lambda x: np.roll(x, 1, axis=0), params)
+
+    def stepped(swings: bool) -> np.ndarray:
+        controls = scenario.controls[0] if swings else conformance._hold(1)[0]
+        new = engine._host_step(np.int32(-1), params if swings else rolled, start, controls)
+        return np.asarray(new.qpos)
+
+    alone = [stepped(False), stepped(True)]
+    assert np.abs(alone[1] - alone[0]).max() > 0.01
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(stepped, [False, True] * 40))
+    for i, qpos in enumerate(together):
+        np.testing.assert_array_equal(qpos, alone[i % 2])
+
+
+def test_an_interrupt_while_parameters_are_written_leaves_no_mixture(monkeypatch):
+    """Ctrl-C in a notebook, whose environment is then used further."""
+    engine, scenario = CpuPhysics(DT_S, 20, DEFAULT_SLOTS), conformance.moving_arm()
+    params, start = jax.device_get((scenario.params, scenario.start))
+    given = np.int32(-1), params, start, scenario.controls[0]
+    before = engine._host_step(*given).qpos
+    stiff = params.replace(joint_damping=4 * params.joint_damping)
+    with monkeypatch.context() as patch:
+        (batch,) = engine._batches.values()
+        patch.setattr(batch, "_batch", _Interrupted(batch._batch))
+        with pytest.raises(KeyboardInterrupt):
+            engine._host_step(given[0], stiff, *given[2:])
+    np.testing.assert_array_equal(engine._host_step(*given).qpos, before)
+
+
+class _Interrupted:
+    """A batch in which Ctrl-C arrives once its fields are written."""
+
+    def __init__(self, batch):
+        self._batch = batch
+
+    def __getattr__(self, name: str):
+        return getattr(self._batch, name)
+
+    def set_const(self, **_):
+        raise KeyboardInterrupt
 
 
 def test_the_angle_between_orientations_is_exact_for_small_ones_too():

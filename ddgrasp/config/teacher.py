@@ -18,6 +18,8 @@ from ddgrasp.errors import UserError
 
 NOTHING, GUIDE = "nothing", "guide"
 """Values of `TeacherConfig.start` that are no folder."""
+MOST_GRADIENT_STEPS = 2**31 - 1
+"""PPO counts them in 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,9 @@ class TeacherConfig(Section, name="teacher"):
     discount: Share = 0.97
     """How much a reward one control step later counts (gamma)."""
     gae_lambda: Share = 0.95
-    """Generalised advantage estimation: 0 trusts the value network, 1 the rewards that were seen."""
+    """Generalised advantage estimation: 0 trusts the value network, 1 the rewards that were seen.
+    Brax's, whose advantage is a step's own error plus discount, not discount times lambda, times the next
+    step's."""
     action_std: Annotated[float, Range(0, 10, above=True)] = 0.15
     """Standard deviation of the exploration noise of the arm's joints at the start, before the tanh."""
     gripper_std: Annotated[float, Range(0, 10, above=True)] = 0.15
@@ -115,6 +119,12 @@ class TeacherConfig(Section, name="teacher"):
         if self.total_steps == 0 and not self.starts_from_file:
             raise self.error(
                 "total_steps", f"at least 1: a teacher that starts from {self.start} has to learn"
+            )
+        if (steps := self.iterations * self.epochs * self.minibatches) > MOST_GRADIENT_STEPS:
+            raise UserError(
+                f"teacher.total_steps {self.total_steps} makes {self.iterations} iterations, with "
+                f"teacher.epochs {self.epochs} and teacher.minibatches {self.minibatches} {steps} gradient "
+                f"steps; expected at most {MOST_GRADIENT_STEPS}: take fewer of one, or more teacher.num_envs."
             )
 
 

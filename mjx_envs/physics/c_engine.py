@@ -1,5 +1,6 @@
 """MuJoCo's C engine on all cores, called from jitted JAX code."""
 
+from threading import Lock
 from typing import Any
 
 import jax
@@ -50,10 +51,10 @@ def _threads(shard: int) -> int:
 
 
 class _HostBatch:
-    """A `mujoco.batch.Batch` of a fixed number of environments."""
+    """A `mujoco.batch.Batch` of a fixed number of environments; one caller at a time has its buffers."""
 
     def __init__(self, model: mujoco.MjModel, index: ModelIndex, n: int, threads: int):
-        self._model, self._index = model, index
+        self._model, self._index, self._lock = model, index, Lock()
         self._batch = Batch(model, nsim=n, nthread=threads)
         self._params: ModelParams | None = None
         self._expanded: dict[str, np.ndarray] = {}
@@ -67,6 +68,10 @@ class _HostBatch:
         self, params: ModelParams, state: PhysicsState, ctrl: Float[np.ndarray, "n 9"], substeps: int
     ) -> PhysicsState:
         """One control step of all n environments: everything has n rows."""
+        with self._lock:  # programs that several threads run call at the same time
+            return self._stepped(params, state, ctrl, substeps)
+
+    def _stepped(self, params: ModelParams, state: PhysicsState, ctrl, substeps: int) -> PhysicsState:
         self._write_params(params)
         self._qpos[:], self._qvel[:] = state.qpos, state.qvel
         self._warmstart[:], self._ctrl[:] = state.warmstart, ctrl
@@ -91,6 +96,7 @@ class _HostBatch:
                 changed |= (old != new).reshape(len(new), -1).any(axis=1)
             if not changed.any():
                 return
+        self._params = None  # until all of them are written: Ctrl-C leaves a mixture of old and new
         fields = self._index.fields(self._model, jax.tree.map(lambda x: x[changed], params))
         for name, value in fields.items():
             if name not in self._expanded:
