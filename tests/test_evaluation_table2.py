@@ -3,6 +3,7 @@
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from evaluation.failure_modes import MODES
 from evaluation.rig_trials import Series
 from evaluation.table2 import page, results, rows
 from evaluation.table2.rows import ROWS, TABLES
+from evaluation.treatments import TreatmentName
 from foundation import store
 
 LAPTOP = get_preset("laptop")
@@ -151,6 +153,11 @@ def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
         shared(student("holes", unseen_share=0.25))
     with pytest.raises(UserError, match="trained with student.init_from 'pretrained/student'"):
         shared(student("later", init_from="pretrained/student"))
+
+
+def test_pages_have_words_for_what_every_row_is_trained_on_and_sees():
+    assert {row.source for row in ROWS.values()} <= rows.TRAINING.keys()
+    assert set(get_args(TreatmentName)) == rows.DEPLOYED.keys()
 
 
 def test_help_names_every_row_and_table(capsys):
