@@ -137,8 +137,8 @@ LAPTOP = Config(
     ),
     evaluation=EvalConfig(student_trials=60),
 )
-"""Everything trained here on two cores, the teacher from the guide, in about an hour and a half on two Intel
-Xeon cores (docs/results.md). Six plain shapes besides the paper's objects teach a student more than those.
+"""Everything trained here on two cores, the teacher from the guide. 81 minutes on two Intel Xeon cores on
+2026-11-28 (docs/results.md). Six plain shapes besides the paper's objects teach a student more than those.
 Demos have no colour, which takes most of their time and which row Monocular of Table II alone needs."""
 
 _FROM_NOTHING = TeacherConfig(
