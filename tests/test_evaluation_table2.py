@@ -463,7 +463,7 @@ def test_trials_that_were_begun_otherwise_are_said_before_anything_is_made(tmp_p
     policy = write_policy(exported / "policy.onnx")
     series, folder = table2._trials(study, "ddg")
     config = study.row_config(ROWS["ddg"])
-    header = rig_trials._header(series.configured(config, policy), policy, series)
+    header = rig_trials._header(config, policy, series)
     folder.mkdir(parents=True)
     log = folder / rig_trials.TRIALS_FILE
     TrialLog(log, header | {"rules": 1}).append(outcome(0, "apple", True))
