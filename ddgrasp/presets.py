@@ -119,7 +119,7 @@ DEMO = Config(
     evaluation=EvalConfig(student_trials=30),
     score=ScoreConfig(trajectories=24, kid_subset_size=150, tsne_maps=3000),
 )
-"""For two cores; the student starts from the pretrained one. 32 minutes on two Intel Xeon cores on 2026-11-28
+"""For two cores; the student starts from the pretrained one. 28 minutes on two Intel Xeon cores on 2026-11-28
 (docs/results.md)."""
 
 LAPTOP = Config(

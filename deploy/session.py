@@ -39,7 +39,8 @@ def deploy(
 
     SIGTERM and a terminal that is closed end it as Ctrl-C does, and none cuts the stopping short when it
     comes again: the robot holds, both devices are stopped, the report comes back. So it does when the robot
-    fails; its `fault` says with what. One that is ended before its first step leaves no folder.
+    fails; its `fault` says with what. One that is ended before its first step leaves no folder, nor does one
+    whose device fails in its start.
 
     Raises UserError for an unknown name, a combination that cannot work, or a device that is absent.
     """

@@ -212,7 +212,7 @@ def _described(name: str) -> str:
 
 
 _PRESET_HELP = (
-    "Presets (--preset): debug (tests), demo (32 minutes on two cores), laptop (random first weights, the",
+    "Presets (--preset): debug (tests), demo (28 minutes on two cores), laptop (random first weights, the",
     "teacher from a scripted guide, twelve training objects; 81 minutes on two cores), ppo and ppo_paper",
     "(laptop with PPO from nothing, six), camera (laptop, the generator for short recordings of a real",
     "camera), student_paper (laptop with the paper's own student, six), paper (one GPU). Any value can be",

@@ -186,7 +186,8 @@ class DDGExport:
     licence: Text = ""
     """Licence of the generator, for the file; empty takes the recordings'."""
     sampler: Sampler | None = None
-    """Another sampler than the model's; progressive, for one that was distilled."""
+    """Another sampler than the model's: progressive, for one that was distilled; dpm_solver, which then takes
+    quadratic steps."""
     steps: Steps | None = None
     """Network evaluations per map unless the file's input says otherwise; none takes the model's."""
 
