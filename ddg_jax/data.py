@@ -19,7 +19,7 @@ from ddgrasp.depth import crop_nearest, window
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import memory
-from sensors.recordings.recording import Recording, find_recordings, is_recording
+from sensors.recordings.recording import Recording, depth_picture_count, find_recordings, is_recording
 from sensors.statistics.holes import fill_from_background, smooth_surface
 from sensors.statistics.planes import on_planes
 
@@ -91,8 +91,7 @@ def load_frames(
     (sensors/recordings/recording.py), or memory is too small for them, before any is read.
     """
     folders = _folders(root)
-    files = (file for folder in folders for file in (folder / "depth").glob("*"))
-    pictures = sum(file.suffix.lower() == ".png" for file in files)
+    pictures = depth_picture_count(folders)
     host = frames_bytes(config, pictures if max_frames is None else min(pictures, max_frames))
     memory.check(memory.Need("ddg", 0, host, remedy="the number of recordings"), root)
     most = sys.maxsize if max_frames is None else max_frames

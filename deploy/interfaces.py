@@ -49,7 +49,7 @@ class RobotState:
 
 
 class CameraError(Exception):
-    """A camera gave no frame (unplugged, timed out). Once started, the loop holds position and
+    """A camera gave no frame (unplugged, timed out). A loop that has begun holds position and
     tries again."""
 
 

@@ -244,7 +244,8 @@ def _log(i: int, metrics, progress: Progress, task) -> None:
     if values.get("episode/length") == 0.0:  # no episode ended: nothing to have a mean of
         values = {name: value for name, value in values.items() if name not in learner.OF_EPISODES}
     progress.scalars(i, **values)
-    task.advance(0, **{name: values[name] for name in ("success",) if name in values})
+    if "success" in values:
+        task.advance(0, success=values["success"])
 
 
 def _evaluate(env: GraspEnv, state, config: Config, i: int, progress: Progress) -> float:

@@ -15,7 +15,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import TEMPORARY
 from ddgrasp.presets import PRESETS
 from sensors.recordings import writer as writer_module
-from sensors.recordings.recording import Recording, contents, find_recordings
+from sensors.recordings.recording import Recording, contents, depth_picture_count, find_recordings
 from sensors.recordings.writer import RecordingWriter
 
 REAL = Path(__file__).parents[2] / "shared" / "real_depth"
@@ -53,6 +53,14 @@ def test_round_trip_is_exact_in_depth(tmp_path):
         assert depth_mm.dtype == np.uint16 and np.abs(rgb.astype(int) - 40 * seed).max() <= 2
     assert recording.meta["invalid_fraction_mean"] == 0.125
     np.testing.assert_allclose(recording.depth_m(0), _frame(0)[1] / 1000.0, atol=1e-6)
+
+
+def test_depth_pictures_in_capital_letters_are_counted_as_they_are_read(tmp_path):
+    one, other = _write(tmp_path / "a", frames=3), _write(tmp_path / "b", frames=2)
+    file = one / "depth" / "000001.png"
+    file.rename(file.with_suffix(".PNG"))
+    (other / "depth" / "notes.txt").write_text("")
+    assert depth_picture_count([one, other]) == len(Recording.open(one)) + len(Recording.open(other)) == 5
 
 
 def test_contents_change_with_what_is_there_and_not_with_where_it_is(tmp_path):

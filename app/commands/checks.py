@@ -234,12 +234,11 @@ def tell_fit(config: Config, data: Path, directory: Path, most: int | None = Non
     from ddg_jax import distil
     from ddg_jax import memory as ddg_memory
     from learning import memory
-    from sensors.recordings.recording import recording_folders
+    from sensors.recordings.recording import depth_picture_count, recording_folders
 
     if config.ddg.sampling.sampler == PROGRESSIVE:
         distil.check(config.ddg)
-    files = (file for folder in recording_folders(data) for file in (folder / "depth").glob("*"))
-    frames = sum(file.suffix.lower() == ".png" for file in files)
+    frames = depth_picture_count(recording_folders(data))
     need = ddg_memory.need(config, frames if most is None else min(most, frames))
     memory.check(need, directory)
     print(need, file=sys.stderr, flush=True)
