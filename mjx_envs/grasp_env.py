@@ -60,7 +60,9 @@ class Episode:
     """(8,) last action."""
     steps: jax.Array
     hold_count: jax.Array
-    """() consecutive steps with the object at the target."""
+    """() consecutive steps with the object in the hand at the target: what success needs."""
+    bonus_count: jax.Array
+    """() the same as the reward counts them: `rewards.succeeds`."""
     grasped: jax.Array
     """() bool."""
     total_reward: jax.Array
@@ -114,6 +116,7 @@ class GraspEnv(MjxEnv):
             action=jnp.zeros(contract.ACTION_SIZE).at[ACTION.gripper].set(-1.0),
             steps=jnp.zeros((), jnp.int32),
             hold_count=jnp.zeros((), jnp.int32),
+            bonus_count=jnp.zeros((), jnp.int32),
             grasped=jnp.zeros((), bool),
             total_reward=jnp.zeros(()),
             latency=self._latency(k_late, qpos, rest),
@@ -153,13 +156,15 @@ class GraspEnv(MjxEnv):
         rewarded = rewards.grasped(self.config.reward, touching, closing, distances.grip_to_object)
         held = jnp.linalg.norm(object_pos - jnp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
         hold_count = jnp.where(held & grasped, episode.hold_count + 1, 0)
+        succeeds = rewards.succeeds(self.config.reward, held, grasped)
+        bonus_count = jnp.where(succeeds, episode.bonus_count + 1, 0)
         terms = rewards.terms(
             self.config.reward,
             rewards.Transition(
                 before=episode.distances, after=distances, action=action, last_action=episode.action,
                 acceleration=(new.qvel[QVEL.arm] - old.qvel[QVEL.arm]) / contract.CONTROL_DT_S,
                 grasped=rewarded, lifted=rewarded & (object_pos[2] > episode.rest_height + LIFTED_M),
-                hold_count=hold_count,
+                bonus_count=bonus_count,
             ),
         )  # fmt: skip
         reward = jnp.sum(jnp.stack(list(terms.values())))
@@ -169,8 +174,9 @@ class GraspEnv(MjxEnv):
         lost = (lost & ~grasped) | ~finite
         over = steps >= self.config.episode_steps
         episode = replace(
-            episode, distances=distances, action=action, steps=steps, hold_count=hold_count, grasped=grasped,
-            total_reward=episode.total_reward + reward, latency=latency,
+            episode, distances=distances, action=action, steps=steps, hold_count=hold_count,
+            bonus_count=bonus_count, grasped=grasped, total_reward=episode.total_reward + reward,
+            latency=latency,
         )  # fmt: skip
         metrics = {f"reward/{name}": value for name, value in terms.items()}
         metrics["success"] = (over & ~lost & (hold_count >= contract.HOLD_STEPS)).astype(jnp.float32)

@@ -54,7 +54,8 @@ class Transition:
     grasped: jax.Array
     """() bool, by `grasped`."""
     lifted: jax.Array
-    hold_count: jax.Array
+    bonus_count: jax.Array
+    """() consecutive steps of success up to this one, by `succeeds`."""
 
 
 def distances(
@@ -108,17 +109,24 @@ def grasped(
     return closing & (touching if weights.grasp_switch == "touch" else grip_to_object < NEAR_M)
 
 
+def succeeds(weights: RewardConfig, held: Bool[Array, ""], grasped: Bool[Array, ""]) -> Bool[Array, ""]:
+    """() whether the bonus is paid: for the object at the lift target (`held`), and where
+    `RewardConfig.grasp_switch` is touch for a grasp by touch besides, which success needs."""
+    return held & grasped if weights.grasp_switch == "touch" else held
+
+
 def terms(weights: RewardConfig, t: Transition) -> dict[str, Float[Array, ""]]:
     """Weighted reward terms, by name; their sum is the reward (paper Eq. 2)."""
     grasped, lifted = t.grasped.astype(jnp.float32), t.lifted.astype(jnp.float32)
-    count = jnp.minimum(t.hold_count, weights.bonus_max_count)
+    approaching = 1 - grasped if weights.grasp_switch == "touch" else 1.0
+    count = jnp.minimum(t.bonus_count, weights.bonus_max_count)
     excess = jnp.maximum(jnp.abs(t.action[ACTION.arm]) - 0.8, 0.0)
     toggled = closes(t.action) != closes(t.last_action)
     return {
-        "reach": weights.reach * (t.before.hand - t.after.hand) * (1 - grasped),
+        "reach": weights.reach * (t.before.hand - t.after.hand) * approaching,
         "lift": weights.lift * grasped * (t.before.object - t.after.object),
         "orient": weights.orient * lifted * (t.before.upright_angle - t.after.upright_angle),
-        "bonus": (t.hold_count > 0) * weights.bonus_base * weights.bonus_growth**count,
+        "bonus": (t.bonus_count > 0) * weights.bonus_base * weights.bonus_growth**count,
         "accel": -weights.accel * jnp.sum(t.acceleration**2),
         "align": weights.align * (t.before.grasp_angle - t.after.grasp_angle) * (1 - lifted),
         "grasp": weights.grasp * grasped,

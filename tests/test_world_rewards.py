@@ -25,7 +25,7 @@ def transition(**changes):
         "acceleration": jnp.array([1.0, 2.0, 0, 0, 0, 0, 0]),
         "grasped": jnp.array(False),
         "lifted": jnp.array(False),
-        "hold_count": jnp.array(0),
+        "bonus_count": jnp.array(0),
     }
     return rewards.Transition(**(values | changes))
 
@@ -51,7 +51,7 @@ def test_lifting():
 
 @pytest.mark.parametrize(("count", "bonus"), [(0, 0.0), (1, 3.0), (2, 6.0), (3, 12.0), (9, 12.0)])
 def test_bonus_grows_and_stays_bounded(count, bonus):
-    terms = rewards.terms(W, transition(hold_count=jnp.array(count)))
+    terms = rewards.terms(W, transition(bonus_count=jnp.array(count)))
     assert float(terms["bonus"]) == pytest.approx(bonus)
 
 
@@ -76,6 +76,12 @@ def test_every_sideways_step_towards_the_object_shortens_the_way():
     assert float(rewards.approach_distance(grasp, grasp)) < 1e-4
 
 
+NEAR, FAR = (
+    distances(hand=metres, grip_to_object=metres, object=0.3, grasp_angle=0.0, upright_angle=0.0)
+    for metres in (0.001, 0.029)
+)
+
+
 def nonzero_terms(t):
     return {name for name, value in rewards.terms(PAPER_REWARD, t).items() if float(value) != 0.0}
 
@@ -83,9 +89,26 @@ def nonzero_terms(t):
 def test_the_papers_reward_has_five_terms_and_no_more():
     action = jnp.ones(8).at[7].set(-1.0)  # saturated, and the gripper's command changes
     yes = jnp.array(True)
-    held = transition(action=action, grasped=yes, lifted=yes, hold_count=jnp.array(2))
-    assert nonzero_terms(held) == {"lift", "orient", "bonus", "accel"}
+    held = transition(action=action, grasped=yes, lifted=yes, bonus_count=jnp.array(2))
+    assert nonzero_terms(held) == {"reach", "lift", "orient", "bonus", "accel"}
     assert nonzero_terms(transition(action=action)) == {"reach", "accel"}
+
+
+def test_a_way_back_and_forth_pays_nothing_by_the_papers_reward():
+    """Its r_reach has no indicator: to close, go away, open and come back is a loop without a gain."""
+    away, back = (
+        rewards.terms(PAPER_REWARD, transition(before=a, after=b, grasped=jnp.array(closed)))["reach"]
+        for a, b, closed in ((NEAR, FAR, True), (FAR, NEAR, False))
+    )
+    assert float(away) == pytest.approx(-float(back)) and float(back) > 0.2
+
+
+@pytest.mark.parametrize("grasped", [False, True])
+@pytest.mark.parametrize("held", [False, True])
+def test_what_the_bonus_is_paid_for(held, grasped):
+    state = jnp.array(held), jnp.array(grasped)
+    assert bool(rewards.succeeds(RewardConfig(), *state)) == (held and grasped)
+    assert bool(rewards.succeeds(PAPER_REWARD, *state)) == held
 
 
 def test_the_papers_distance_is_from_gripper_to_object_and_ours_goes_by_way_of_a_point_above():

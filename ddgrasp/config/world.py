@@ -52,14 +52,16 @@ class RewardConfig(Section, name="world.reward"):
     """What w1 counts: funnel (ours: by way of a point above the grasp, so that the hand comes from above) or
     plain (the paper's: gripper centre to object centre)."""
     grasp_switch: GraspSwitch = "touch"
-    """What counts as grasped: touch (ours: both pads press on the object, gripper closing) or near (the
-    paper's: gripper closing, its centre within 3 cm of the object's)."""
+    """What counts as grasped: touch (ours: both pads press on the object, gripper closing; w1 ends with it,
+    and the bonus needs it) or near (the paper's: gripper closing, its centre within 3 cm of the object's; w1
+    goes on, and the bonus is for the object's place alone)."""
 
 
 PAPER_REWARD = RewardConfig(
     align=0.0, saturation=0.0, grasp=0.0, toggle=0.0, distance="plain", grasp_switch="near"
 )
-"""The paper's reward: its five terms, its distance, its grasp. It prints no weights: these are ours."""
+"""The paper's reward: its five terms, its distance, its grasp. It prints no weights: these are ours, and so
+are the bounds that keep it finite, 0.5 m on distances and `bonus_max_count`."""
 
 
 @dataclass(frozen=True)
