@@ -6,9 +6,18 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
+_late: list[int] = []
+"""Signals that came while a session ended."""
+
+
+def ended_late() -> bool:
+    """Whether a signal came while the last session was ending anyway: it has changed nothing yet."""
+    return bool(_late)
+
 
 def terminable() -> AbstractContextManager[None]:
     """The first SIGTERM, Ctrl-C or hang-up is KeyboardInterrupt; a second one does not cut stopping short."""
+    _late.clear()
 
     def interrupt(signum: int, frame: Any) -> None:
         for number in _ending():
@@ -19,8 +28,9 @@ def terminable() -> AbstractContextManager[None]:
 
 
 def unbroken() -> AbstractContextManager[None]:
-    """Ctrl-C, SIGTERM and hang-ups change nothing: what ends anyway, as stopping an arm, comes to its end."""
-    return _handled_by(signal.SIG_IGN)
+    """Ctrl-C, SIGTERM and hang-ups change `ended_late` alone: what ends anyway, as stopping an arm, comes to
+    its end."""
+    return _handled_by(lambda signum, frame: _late.append(signum))
 
 
 def _ending() -> list[signal.Signals]:

@@ -90,6 +90,11 @@ class LoopReport:
     events: list[Event] = field(default_factory=list)
     events_dropped: int = 0
 
+    @property
+    def periods(self) -> int:
+        """Control periods so far: steps, and those that a slow step took besides its own."""
+        return self.steps + self.timings.missed_deadlines
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {

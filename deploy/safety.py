@@ -179,6 +179,10 @@ class SafetyFilter:
         root = np.sqrt(np.maximum((c + a * dt) ** 2 - c**2 + 2.0 * a * room_rad, 0.0))
         return np.minimum(room_rad, np.maximum(root - (c + a * dt), 0.0) * dt)
 
+    def outside_m(self, q_rad: Float[np.ndarray, "7"]) -> dict[str, float]:
+        """How far the point between the pads, and the arm, are outside of their boxes; 0 inside."""
+        return {"workspace": self._outside_m(q_rad), "arm": self._arm_outside_m(q_rad)}
+
     def _limit_workspace(self, q_rad: np.ndarray, step: np.ndarray, causes: list[str]) -> np.ndarray:
         """(7,) `step`, changed so that the grip point ends in the box, or no further outside than it is."""
         allowed = self._outside_m(q_rad)

@@ -23,10 +23,10 @@ from deploy.devices.registry import check_devices, make_devices
 from deploy.dry_run import DryRun
 from deploy.interfaces import Camera, Clock, KnowsObject, Robot, TimedRobot
 from deploy.interrupts import terminable, unbroken
-from deploy.loop import ControlLoop, LoopReport
+from deploy.loop import ControlLoop, LoopReport, Step
 from deploy.policy import OnnxPolicy
 from deploy.record import ENDED, REPORT_FILE, DeploymentRecord, verdict
-from deploy.setup import loop_settings, safety_filter, speed_notice
+from deploy.setup import check_start, loop_settings, safety_filter, space_notice, speed_notice
 
 _LONGEST_S = 1e9
 _TOO_SLOW = "the loop did not keep its rate: this machine is too busy or too slow for the policy and devices"
@@ -71,8 +71,11 @@ def _run(
     robot, camera = make_devices(Setup(config, options, policy.info, clock, confirm, say))
     keep_time_of(robot, clock, options)
     safety = safety_filter(config.deploy, policy.info, options.robot)
-    if options.real and (notice := speed_notice(config.deploy, policy.info)):
-        say(notice)
+    if options.real:
+        check_start(safety)
+        say(space_notice(config.deploy))
+        if notice := speed_notice(config.deploy, policy.info):
+            say(notice)
     driven = DryRun(robot, say) if options.dry_run else robot
     settings = loop_settings(config.deploy, policy.info, moves=not options.dry_run)
     loop = ControlLoop(camera, driven, policy, safety, clock, settings, say)
@@ -81,12 +84,17 @@ def _run(
     profile = contract.D455.scaled(policy.info.depth_width / contract.D455.width_px)
     kept = DeploymentRecord(camera, profile, f"{options.camera}, D455 profile", config.deploy.film_every)
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
-    name = options.object_name or ("" if options.real else config.world.objects[0])
+    name = options.object_name or (config.world.objects[0] if options.camera == "stereo" else "")
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
     ending = contextlib.ExitStack()
+
+    def look(step: Step) -> bool:
+        kept.look(step)
+        return steps is not None and loop.report.periods >= steps  # a slow step takes time all the same
+
     try:
         with kept.into(folder):
-            report = loop.run(steps, kept.look)
+            report = loop.run(steps, look)
             # Before the last frames are on the disk: the simulated arm's world goes on meanwhile.
             unattended = options.yes or report.interrupted or bool(report.fault)
             finished = not (options.dry_run or report.interrupted)

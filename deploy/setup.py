@@ -1,7 +1,12 @@
 """From the configuration and the policy's own metadata to the loop's parts."""
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from ddgrasp import contract
 from ddgrasp.config import DeployConfig
+from ddgrasp.errors import UserError
 from ddgrasp.policy_metadata import PolicyMetadata
 from deploy.devices.options import SIMULATION
 from deploy.loop import LoopSettings
@@ -49,6 +54,17 @@ def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = SIMUL
     return SafetyFilter(limits, info.action_scale_rad)
 
 
+def check_start(safety: SafetyFilter) -> None:
+    """UserError if a real arm's start pose is outside of the boxes that it is to keep to: the filter does not
+    see the way there, and lets stay outside what begins there."""
+    for box, metres in safety.outside_m(np.array(contract.HOME_RAD)).items():
+        if metres > 0:
+            raise UserError(
+                f"at its start pose the arm is {1e3 * metres:.0f} mm outside of deploy.{box}_lower_m to "
+                f"{box}_upper_m: nothing has moved; take away what stands there, or widen the box."
+            )
+
+
 def speed_notice(config: DeployConfig, info: PolicyMetadata) -> str:
     """One line where the policy may ask for more speed than `deploy.franka.dynamics` gives; else ""."""
     asked, given = info.action_scale_rad * info.control_hz, min(config.franka.speed_rad_s)
@@ -59,3 +75,18 @@ def speed_notice(config: DeployConfig, info: PolicyMetadata) -> str:
         f"speed: the policy may ask for {asked:.2f} rad/s, deploy.franka.dynamics {config.franka.dynamics:g} "
         f"gives {given:.2f}; steps are cut to that ({enough:.2f} gives all of it)"
     )
+
+
+def space_notice(config: DeployConfig) -> str:
+    """One line with the boxes that a real arm keeps to: whoever left them out of a command sees it."""
+    pads = _box(config.workspace_lower_m, config.workspace_upper_m)
+    arm = _box(config.arm_lower_m, config.arm_upper_m)
+    return (
+        f"space, metres from the base: between the pads {pads} (deploy.workspace_lower_m, ..._upper_m); "
+        f"arm and hand {arm} (deploy.arm_lower_m, ..._upper_m)"
+    )
+
+
+def _box(lower: Sequence[float], upper: Sequence[float]) -> str:
+    sides = zip("xyz", lower, upper, strict=True)
+    return ", ".join(f"{axis} {low:g} to {high:g}" for axis, low, high in sides)

@@ -238,18 +238,17 @@ def run_trials(
         initializer=_start_worker,
         initargs=(config, policy_path, make, os.getpid()),
     )
-    futures = [executor.submit(_run_in_worker, trial) for trial in trials]
-    waiting = set(futures)
+    waiting = {executor.submit(_run_in_worker, trial) for trial in trials}
     try:
-        for future in as_completed(futures):
-            waiting.discard(future)
+        for future in as_completed(waiting):
+            waiting.discard(future)  # its film is megabytes
             yield future.result()
     except BrokenProcessPool:
         raise UserError(
             "a worker was killed, often for want of memory: finished trials are kept, the same command (with "
             "--resume where it has one) goes on; fewer workers need less."
         ) from None
-    except UserError:  # of one trial: those that run come to their end, and are kept
+    except (UserError, KeyboardInterrupt):  # those that run come to their end, and are kept
         executor.shutdown(wait=True, cancel_futures=True)
         yield from (future.result() for future in waiting if _has_ended_well(future))
         raise

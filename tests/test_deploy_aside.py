@@ -234,7 +234,7 @@ def test_a_hand_that_creeps_down_is_not_stuck():
     assert aside.ended and grip_position(LOW)[2] - grip_position(q_rad)[2] > DEEP_M - 2 * NEAR_M
 
 
-def test_a_hold_leaves_what_the_arm_feels_in_free_air_and_how_often_it_stepped():
+def test_a_reset_leaves_what_the_arm_feels_in_free_air():
     retry, wrong_nm = Retry(), pressed(LOW, (0.0, RIM_M, 0.0), 8.0)
     retry(np.append(HIGH, OPEN), False, wrong_nm)
     retry.reset()
@@ -327,9 +327,11 @@ def test_what_a_hand_carries_is_not_what_an_empty_one_feels():
 
 def test_an_arm_whose_finger_is_always_on_something_steps_aside_so_often_and_no_more():
     retry, begun = Retry(), []
-    for _ in range(1000):
+    for step in range(1000):
         retry(np.append(LOW, OPEN), False, pressed(LOW, (0.0, RIM_M, 0.0)))
         begun.append(retry.begun)
+        if step % 50 == 49:  # a camera that is late now and then gives no new steps
+            retry.held()
     assert begun.count(STEPS_ASIDE) == ASIDES
 
 

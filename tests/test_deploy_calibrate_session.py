@@ -321,6 +321,7 @@ def test_a_dry_run_moves_nothing(tmp_path, bench):
     said: list[str] = []
     assert session.run(fast(), options(tmp_path, dry_run=True), said.append) is None
     assert bench.arm.commands == 0 and np.array_equal(bench.arm.q_rad, HOME_RAD)
+    assert any("arm and hand x -0.55 to 0.95, y -0.8 to 0.8, z 0 to 1.3 (" in line for line in said)
     assert said[-1].startswith("nothing moved; ") and (tmp_path / "dry-run.png").exists()
     assert sum(line.startswith("pose ") for line in said) == 7
 
@@ -330,6 +331,19 @@ def test_nobody_to_ask_moves_nothing(tmp_path, bench, monkeypatch):
     with pytest.raises(UserError, match=r"Ready\? Nobody can be asked here: give --yes"):
         session.run(fast(), options(tmp_path, yes=False), lambda text: None)
     assert bench.arm.commands == 0
+
+
+def test_a_board_is_asked_for_whatever_may_move_unasked(tmp_path, bench, monkeypatch):
+    monkeypatch.setitem(registry.IMAGERS, "realsense", lambda setup: bench.imager)
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: False))
+    with pytest.raises(UserError, match="is given a board when it is open, and nobody can be asked for it"):
+        session.run(fast(), options(tmp_path, camera="realsense"), lambda text: None)
+    assert bench.arm.commands == 0
+    asked: list[str] = []
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(session, "ask_person", asked.append)
+    session.run(fast(), options(tmp_path, camera="realsense"), lambda text: None)
+    assert [question.split()[0] for question in asked] == ["Hold"]
 
 
 def test_a_person_who_is_not_ready_is_not_told_that_nothing_has_moved(tmp_path, bench, monkeypatch):

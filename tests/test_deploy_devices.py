@@ -457,7 +457,7 @@ def test_an_arm_that_is_held_up_on_its_way_to_the_start_is_given_up(monkeypatch)
 
     robot = _connected(state=State(), poll_motion=lambda: None)
     with pytest.raises(UserError, match="is not at its start pose after .* s: see what holds it"):
-        robot._wait_at_start()
+        robot._wait_at_start(franka_robot.START_S)
     assert next(seconds) < franka_robot.START_S + 4
 
 

@@ -454,7 +454,7 @@ def test_ctrl_c_on_the_way_to_the_start_pose_stops_the_arm(monkeypatch):
                 time.sleep(0.01)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(robot, "_wait_at_start", lambda: on_the_way(robot._arm))
+        monkeypatch.setattr(robot, "_wait_at_start", lambda longest_s: on_the_way(robot._arm))
         with pytest.raises(KeyboardInterrupt):
             robot.start()
         kept = robot._arm  # whoever still has it does not keep it moving

@@ -13,7 +13,7 @@ import pytest
 from app.commands import parse
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
-from deploy import session
+from deploy import interrupts, session
 from deploy.devices.options import SessionOptions
 from deploy.interfaces import CameraError, Frame, RobotError
 from deploy_support import KinematicRobot, constant_bias, describe, write_policy
@@ -334,6 +334,29 @@ def test_nor_does_the_first_where_the_time_is_over(run, number, signals_count):
     assert stopped and report.steps == len(Recording.open(folder)) == 5
     assert not report.interrupted and not report.fault
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_whoever_ends_a_deployment_that_ends_anyway_wants_no_next_one(run, signals_count):
+    class Stopping(ColourCamera):
+        def stop(self):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    run()
+    assert not interrupts.ended_late()
+    run(Stopping)
+    assert interrupts.ended_late()
+    run()
+    assert not interrupts.ended_late()
+
+
+def test_slow_steps_take_time_from_what_was_given(run):
+    class Slow(ColourCamera):
+        def read(self):
+            time.sleep(0.25)
+            return super().read()
+
+    report, _ = run(Slow)
+    assert report.steps <= 3 and report.periods >= 5  # half a second at 10 Hz
 
 
 def test_nor_is_the_report_cut_short_while_frames_go_to_the_disk(run, monkeypatch, signals_count):

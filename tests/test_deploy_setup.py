@@ -12,7 +12,7 @@ from deploy.clock import RealClock, RobotClock, SimClock
 from deploy.devices.options import SessionOptions
 from deploy.loop import LoopSettings
 from deploy.session import keep_time_of
-from deploy.setup import loop_settings, safety_filter
+from deploy.setup import check_start, loop_settings, safety_filter, space_notice
 from deploy_support import KinematicRobot, describe
 
 DEPLOY, FR3 = DeployConfig(), contract.ARMS["fr3"]
@@ -44,6 +44,21 @@ def test_the_filter_goes_no_faster_than_the_driver_lets_the_arm():
     limits = safety_filter(slow, describe(), "franka").limits
     assert limits.velocity_rad_s == slow.franka.speed_rad_s
     assert max(limits.velocity_rad_s) < min(safety_filter(slow, describe(), "sim").limits.velocity_rad_s)
+
+
+@pytest.mark.parametrize(
+    ("box", "there"),
+    [("arm", {"arm_upper_m": (0.95, 0.8, 0.6)}), ("workspace", {"workspace_upper_m": (0.8, 0.45, 0.2)})],
+)
+def test_a_start_pose_outside_of_the_boxes_is_refused(box, there):
+    check_start(safety_filter(DEPLOY, describe(), "franka"))
+    with pytest.raises(UserError, match=rf"mm outside of deploy\.{box}_lower_m to {box}_upper_m: "):
+        check_start(safety_filter(replace(DEPLOY, **there), describe(), "franka"))
+
+
+def test_the_boxes_are_said_with_their_options():
+    said = space_notice(replace(DEPLOY, arm_lower_m=(-0.3, -0.8, 0.0)))
+    assert "arm and hand x -0.3 to 0.95, y -0.8 to 0.8, z 0 to 1.3 (deploy.arm_lower_m, ..._upper_m)" in said
 
 
 def test_of_arm_and_policy_the_narrower_limit_counts():

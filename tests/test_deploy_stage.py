@@ -1,8 +1,13 @@
 """Trials in the pseudo-real rig, their log on disk, and the deploy stage that resumes from it."""
 
 import dataclasses
+import gc
 import json
+import os
+import signal
+import threading
 import time
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -267,6 +272,45 @@ def test_a_trial_that_cannot_be_tried_costs_none_that_ran_beside_it(tmp_path):
         for tried_one, _ in run_trials(CONFIG, tmp_path, trials, 2, LosesFirst):
             made.append(tried_one.index)
     assert 1 in made and 0 not in made
+
+
+class SaysWhenItRuns:
+    """A bench whose trials take a second and leave a file as they begin."""
+
+    def __init__(self, config: Config, folder: Path):
+        self._folder = folder
+
+    def run(self, trial: Trial) -> tuple[TrialResult, np.ndarray]:
+        (self._folder / f"begun-{trial.index}").touch()
+        time.sleep(1.0)
+        return result(trial.index), np.zeros(1000)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_ctrl_c_costs_no_trial_that_runs(tmp_path, ctrl_c):
+    def interrupt() -> None:
+        while len(list(tmp_path.glob("begun-*"))) < 2:
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    trials, made = [Trial(i, "apple") for i in range(6)], []
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        for tried_one, _ in run_trials(CONFIG, tmp_path, trials, 2, SaysWhenItRuns):
+            made.append(tried_one.index)
+    assert {0, 1} <= {*made} and len(made) < 6  # one more may wait in the workers' queue
+
+
+def test_a_film_lives_no_longer_than_who_takes_it_wants(tmp_path):
+    films = []
+    for _, film in run_trials(CONFIG, tmp_path, [Trial(i, "apple") for i in range(3)], 1, SaysWhenItRuns):
+        films.append(weakref.ref(film))
+        del film
+        gc.collect()
+        assert all(kept() is None for kept in films[:-1])
+    assert len(films) == 3
 
 
 def test_stage_resumes_without_redoing_trials(run_dir, monkeypatch):

@@ -62,7 +62,7 @@ class Calibrate:
     dry_run: bool = False
     """Connect and look, print the poses, move nothing."""
     yes: bool = False
-    """Move without asking first."""
+    """Move without asking first; for the board it asks all the same, but on the rig, whose hand holds one."""
     out: Path | None = None
     """What deploy reads; a picture lies beside it. By default runs/calibration/calibration.json, unless that
     is of another camera or robot."""

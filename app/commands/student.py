@@ -135,6 +135,7 @@ class Deploy:
         Raises SystemExit(1) after a fault, and KeyboardInterrupt where it was interrupted, unless that is
         how it was to end: what called it is not to go on to the next trial.
         """
+        from deploy.interrupts import ended_late
         from deploy.session import SessionOptions, deploy, describe
 
         options = SessionOptions(
@@ -150,6 +151,8 @@ class Deploy:
         if report.fault:
             sys.exit(1)
         if report.interrupted and (math.isfinite(self.seconds) or not report.steps):
+            raise KeyboardInterrupt
+        if ended_late() and not report.interrupted:  # whoever wanted an end wants no next trial
             raise KeyboardInterrupt
 
 

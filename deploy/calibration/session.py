@@ -25,7 +25,7 @@ from deploy.devices.registry import IMAGERS, ROBOTS
 from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, Robot, RobotError
 from deploy.interrupts import terminable, unbroken
 from deploy.session import ask_person, for_devices, keep_time_of, survived
-from deploy.setup import safety_filter
+from deploy.setup import check_start, safety_filter, space_notice
 from sensors.charuco_board import CharucoBoard, Corners
 
 HOPELESS = 4
@@ -94,6 +94,9 @@ def run(
     info = policy_metadata.describe(config.student, config.export, config.world.profile)
     clock: Clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
     confirm = (lambda question: None) if options.yes else ask_person
+    give = confirm if options.camera == "rig" else ask_person  # whose hand has a board
+    if give is not confirm and not (options.dry_run or sys.stdin.isatty()):
+        raise UserError("the hand is given a board when it is open, and nobody can be asked for it here.")
     setup = Setup(config, session, info, clock, confirm, say)
     robot, imager = ROBOTS["franka"](setup), IMAGERS[options.camera](setup)
     keep_time_of(robot, clock, session)
@@ -101,13 +104,15 @@ def run(
     driver = Driver(robot, safety, clock, min(options.speed_rad_s, *config.deploy.franka.speed_rad_s))
     with terminable(), _started(imager, robot, say) as start_robot:
         bench = poses.Bench(safety.limits, imager.lens(), standing.nominal_pose(), options.board)
+        check_start(safety)
+        say(space_notice(config.deploy))
         say(f"looking for: {options.board.describe()}")
         ways = poses.plan(bench, options.poses, np.array(HOME_RAD), np.random.default_rng(config.seed))
         start_robot()
         if options.dry_run:
             _look_once(ways, imager, options, say)
             return None
-        taken = _take(driver, imager, bench, ways, options, confirm, say)
+        taken = _take(driver, imager, bench, ways, options, give, say)
         try:  # before a person touches the arm, which may fail: it costs none of the views
             found = _solved(taken, bench.lens, options, config, _truth(imager), say)
         except UserError:

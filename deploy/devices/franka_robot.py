@@ -30,6 +30,7 @@ from deploy.interfaces import Clock, RobotError, RobotState
 AT_START_RAD = 0.01
 """No joint further than this from the start pose: the arm is there."""
 START_S = 120.0
+"""Longest wait for the start pose, of the arm's time, beside twice what the way takes."""
 HOMING_S = 60.0
 """Longest wait, on this machine's clock; a hand takes some five seconds, a slow rig more."""
 RISE_M = 0.002
@@ -203,19 +204,20 @@ class FrankaRobot:
         """Gripper homed and open, the arm at the start pose; a person is asked before either moves."""
         assert self._confirm is not None
         away_rad = float(np.max(np.abs(np.asarray(self._arm.state.q) - HOME_RAD)))
+        speed = min(self._config.start_dynamics, self._config.dynamics)
         self._confirm(
             f"The {self._limits.name} at {self._config.host} will home its gripper, which drops what it "
             f"holds, and move to the start pose ({away_rad:.2f} rad away) at "
-            f"{self._config.start_dynamics:.0%} of its speed. Is the way clear?"
+            f"{100 * speed:.2g} % of its speed. Is the way clear?"
         )
         self._moved = True
         self._say("homing the gripper")
         self._home(gripper)
         if away_rad > AT_START_RAD:
             self._say("moving to the start pose")
-            slower = min(1.0, self._config.start_dynamics / self._config.dynamics)
+            slower = speed / self._config.dynamics
             self._arm.move(self._to(np.array(HOME_RAD), relative_dynamics_factor=slower), asynchronous=True)
-            self._wait_at_start()
+            self._wait_at_start(START_S + 2.0 * away_rad / (speed * min(self._limits.joint_velocity_rad_s)))
 
     def _home(self, gripper: Any) -> None:
         """Homed and open: where homing leaves the fingers is the hand's affair. Raises HandError."""
@@ -239,8 +241,8 @@ class FrankaRobot:
         if not succeeded:
             raise HandError(f"{what} failed: take away what is between its fingers, try again")
 
-    def _wait_at_start(self) -> None:
-        """Until the joints are there. Raises UserError if they are not in `START_S` of the arm's time."""
+    def _wait_at_start(self, longest_s: float) -> None:
+        """Until the joints are there. Raises UserError if they are not in so much of the arm's time."""
         begun_s = self._arm.state.time.to_sec()
         while True:
             self._arm.poll_motion()
@@ -248,8 +250,9 @@ class FrankaRobot:
             if np.max(np.abs(np.asarray(state.q) - HOME_RAD)) <= AT_START_RAD:
                 self._arm.join_motion()  # what follows is of another kind, and must not cut it short
                 return
-            if state.time.to_sec() - begun_s > START_S:
-                raise UserError(f"the arm is not at its start pose after {START_S:g} s: see what holds it.")
+            if state.time.to_sec() - begun_s > longest_s:
+                waited = f"the arm is not at its start pose after {longest_s:.0f} s"
+                raise UserError(f"{waited}: see what holds it.")
             time.sleep(_POLL_S)
 
     def _to(self, q_target_rad: Float[np.ndarray, "7"], **options: Any) -> Any:
