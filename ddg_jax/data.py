@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -114,7 +115,7 @@ def _read_all(
 ) -> tuple[dict[int, np.ndarray], list[np.ndarray], int, list[UserError]]:
     """Depth of each recording that can be used, by its number, among the first `left` frames; their priors;
     number of frames left out of them; why the other recordings were."""
-    depth, priors, skipped, refused, sizes = {}, [], 0, [], set()
+    depth, priors, skipped, refused, sizes, sensors = {}, [], 0, [], set(), Counter()
     for number, folder in enumerate(progress.track(folders, "reading recordings")):
         if not left:
             break
@@ -134,8 +135,14 @@ def _read_all(
             continue
         skipped += left_out
         rng = np.random.default_rng((seed, number))
-        priors.append(prior.from_recording(frames, rgb, rng).astype(np.float16))
+        priors.append(prior.from_recording(frames, rgb, rng, recording.consecutive).astype(np.float16))
         depth[number] = frames
+        sensors[str(recording.meta.get("sensor", "unnamed"))] += 1
+    if len(sensors) > 1:
+        progress.note(
+            "recordings of several sensors, which one generator will mix: "
+            + ", ".join(f"{name} ({count})" for name, count in sorted(sensors.items()))
+        )
     return depth, priors, skipped, refused
 
 

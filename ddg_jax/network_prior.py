@@ -52,9 +52,10 @@ class DepthNetworkPrior:
         depth_m: Float[np.ndarray, "T H W"],
         rgb: UInt8[np.ndarray, "T h w 3"] | None,
         rng: np.random.Generator,
+        consecutive: bool = True,
     ) -> Float32[np.ndarray, "T H W"]:
         """See `Prior`; depth gives the size only."""
-        del rng
+        del rng, consecutive
         return self._from_rgb(rgb, depth_m.shape[1:])
 
     def from_sim(

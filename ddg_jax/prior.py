@@ -50,8 +50,10 @@ class Prior(Protocol):
         depth_m: Float[np.ndarray, "T H W"],
         rgb: UInt8[np.ndarray, "T h w 3"] | None,
         rng: np.random.Generator,
+        consecutive: bool = True,
     ) -> Float32[np.ndarray, "T H W"]:
-        """depth_m (T, H, W) with holes (0), rgb (T, h, w, 3) uint8 -> c (T, H, W) float32."""
+        """depth_m (T, H, W) with holes (0), rgb (T, h, w, 3) uint8 -> c (T, H, W) float32; `consecutive`:
+        whether the frames follow each other in time."""
         ...
 
     def from_sim(
@@ -82,6 +84,7 @@ class InverseDepthPrior:
         depth_m: Float[np.ndarray, "T H W"],
         rgb: UInt8[np.ndarray, "T h w 3"] | None,
         rng: np.random.Generator,
+        consecutive: bool = True,
     ) -> Float32[np.ndarray, "T H W"]:
         """See `Prior`; `rng` chooses the frames filled under decoy holes and their shapes.
 
@@ -90,7 +93,8 @@ class InverseDepthPrior:
         inverse = self._with_decoys(depth_m, rng)
         if self.surface == PIECEWISE:
             return self._scaled(self._blurred(map(piecewise_smooth, inverse), depth_m.shape))
-        smooth = map(smooth_surface, smooth_in_time(map(fill_from_background, inverse)))
+        filled = map(fill_from_background, inverse)
+        smooth = map(smooth_surface, smooth_in_time(filled) if consecutive else filled)
         if self.surface == PLANES:
             smooth = map(on_planes, smooth)
         return self._scaled(self._blurred(smooth, depth_m.shape))

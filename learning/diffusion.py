@@ -22,10 +22,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Float32, Float64, Int, Int32
 
 from ddgrasp.config import SPACINGS
-from ddgrasp.config.ddg import COSINE_OFFSET, FIRST_LINEAR_BETA
+from ddgrasp.config.ddg import COSINE_OFFSET, FIRST_LINEAR_BETA, LAST_LINEAR_BETA, MAX_BETA
 from ddgrasp.errors import UserError, unknown_name
 
-MAX_BETA = 0.999
 VARIANCE_FLOOR = 1e-20
 PREDICTED, CONSISTENT = "predicted", "consistent"
 """Which eps a DDIM step goes on with after x_0 was clipped: see `ddim_step`."""
@@ -44,7 +43,7 @@ class Schedule(NamedTuple):
 
 
 def linear_betas(
-    steps: int, first: float = FIRST_LINEAR_BETA, last: float = 0.02
+    steps: int, first: float = FIRST_LINEAR_BETA, last: float = LAST_LINEAR_BETA
 ) -> Float64[np.ndarray, " {steps}"]:
     """beta_k from `first` to `last` in equal steps, (K,) float64 (Ho et al. 2020, section 4)."""
     return np.linspace(first, last, steps)

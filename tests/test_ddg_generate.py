@@ -21,9 +21,11 @@ from ddgrasp.config import (
     DDGConfig,
     DDGDepthConfig,
     DDGDiffusionConfig,
+    DemosConfig,
     GraftConfig,
     SamplingConfig,
     UNetConfig,
+    WorldConfig,
 )
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
@@ -40,6 +42,7 @@ CONFIG = Config(
         graft=GraftConfig(noise_threshold=-0.02),
     ),
 )
+DEMOS_CONFIG = Config(preset="test", world=WorldConfig(objects=("cube",)), demos=DemosConfig(episodes=32))
 LENGTHS = 4 * (5, 3, 9, 1, 7, 6, 2, 8)
 """Frames per episode: none fills the batch of four."""
 
@@ -64,7 +67,7 @@ def run(tmp_path_factory):
     for length in LENGTHS:
         depth = rng.integers(700, 1500, (length, 32, 48)).astype(np.uint16)
         store.append({"depth_mm": depth}, {"object": np.int64(0)})
-    artifacts.finish(directory / "demos", "demos", CONFIG, seconds=1, metrics={})
+    artifacts.finish(directory / "demos", "demos", DEMOS_CONFIG, seconds=1, metrics={})
     return directory
 
 
@@ -122,7 +125,11 @@ def test_the_stream_equals_one_episode_at_a_time(run, straight):
     everything = store.steps("depth_mm")
     assert 0.1 < np.mean(everything == 0) < 0.9
     assert differing < 1e-3 * everything.size
-    metrics = artifacts.read_manifest(out / "noisy").metrics
+    manifest = artifacts.read_manifest(out / "noisy")
+    assert artifacts.config_from_json(manifest.config) == dataclasses.replace(
+        DEMOS_CONFIG, ddg=CONFIG.ddg, seed=3
+    )
+    metrics = manifest.metrics
     assert (metrics["episodes"], metrics["frames"]) == (32, 164)
     assert metrics["invalid_fraction"] == pytest.approx(np.mean(everything == 0))
     assert printed.startswith("32 episodes, 164 frames, ")
@@ -210,7 +217,7 @@ class Colours:
 
     name, needs_rgb, needs_sim_rgb, source = "colours", True, True, "test"
 
-    def from_recording(self, depth_m, rgb, rng):
+    def from_recording(self, depth_m, rgb, rng, consecutive=True):
         raise AssertionError("not a recording")
 
     def from_sim(self, depth_m, rgb):

@@ -71,6 +71,17 @@ def test_recording_and_simulation_of_one_scene_give_the_same_prior():
     np.testing.assert_allclose(made.from_recording(noisy, None, rng), made.from_sim(clean), atol=1e-5)
 
 
+def test_frames_that_do_not_follow_each_other_leave_each_other_alone():
+    table, box = np.full((1, 24, 32), 1.30, np.float32), np.full((1, 24, 32), 1.30, np.float32)
+    box[:, 8:16, 12:22] = 1 / (1 / 1.30 + 0.03)  # within what counts as one surface
+    made = prior.make_prior(DDGConfig(prior=PriorConfig(source="metric_inverse_depth", decoy_holes=0.0)))
+    photos, rng = np.concatenate([table, box, table]), np.random.default_rng(0)
+    apart = made.from_recording(photos, None, rng, consecutive=False)
+    for c, photo in zip(apart, (table, box, table), strict=True):
+        np.testing.assert_array_equal(c, made.from_recording(photo, None, rng)[0])
+    assert np.abs(apart - made.from_recording(photos, None, rng)).max() > 0.01
+
+
 def test_temporal_smoothing_averages_one_surface_and_keeps_moving_edges():
     inverse = np.ones((3, 1, 2), np.float32)
     inverse[:, 0, 0] = (1.0, 1.03, 1.0)

@@ -55,6 +55,18 @@ def test_folder_becomes_a_recording(tmp_path, capsys):
     )
 
 
+@pytest.mark.parametrize("unit_m", [0.001, 0.0005])
+def test_the_largest_number_is_no_reading(tmp_path, capsys, unit_m):
+    root = make_folder(tmp_path / "desk", frames=2)
+    depth = depth_mm(1)
+    depth[5:8, 10:20] = 65535
+    assert cv2.imwrite(str(root / "depth" / "0001_depth.png"), depth)
+    run(root, "--out", tmp_path / "out", "--depth-unit-m", unit_m)
+    kept = Recording.open(tmp_path / "out" / "desk").depth_mm(1)
+    assert not kept[5:8, 10:20].any() and kept[9].all() and kept.max() <= 1500
+    assert "30 pixels of 65535, the largest number, have no reading now" in capsys.readouterr().out
+
+
 def test_colour_of_a_lens_of_its_own_is_called_so(tmp_path):
     make_folder(tmp_path / "desk")
     run(tmp_path / "desk", "--out", tmp_path / "out", "--no-aligned")

@@ -135,8 +135,10 @@ class DDGGenerate:
             "ddg": artifacts.read_artifact(_fitted(self.model)),
             "demos": artifacts.read_artifact(demos),
         }
-        config = artifacts.config_from_json(parents["ddg"].manifest.config)
-        config = replace(config, seed=self.seed)
+        fitted, config = (
+            artifacts.config_from_json(parents[name].manifest.config) for name in ("ddg", "demos")
+        )
+        config = replace(config, ddg=fitted.ddg, seed=self.seed)
         stage = get_stage("noisy")
         made = pipeline.make(stage, config, self.out, resume=self.resume, parents=parents).manifest
         print(

@@ -151,17 +151,35 @@ class UNetConfig(Section, name="ddg.unet"):
 
 _LINEAR_STEPS = (500, 5000)
 """Steps of a linear schedule after which alpha_bar is below 0.01 and far above float32's least number."""
-FIRST_LINEAR_BETA, COSINE_OFFSET = 1e-4, 0.008
-"""Ho et al. 2020, section 4; s of Nichol & Dhariwal 2021, eq. 17 (learning/diffusion.py)."""
+FIRST_LINEAR_BETA, LAST_LINEAR_BETA = 1e-4, 0.02
+"""Ho et al. 2020, section 4 (learning/diffusion.py)."""
+COSINE_OFFSET, MAX_BETA = 0.008, 0.999
+"""s of Nichol & Dhariwal 2021, eq. 17, and the bound on beta below it (learning/diffusion.py)."""
 _LEAST_NOISE = 4 * 2.0**-24
 """Least 1 - alpha_bar: four times what float32 can tell from 0 beside 1."""
+_MOST_SIGNAL = 0.01
+"""Largest alpha_bar of the last step: a sampler takes that one for pure noise."""
 
 
-def _first_cosine_beta(steps: int) -> float:
-    start, end = (
-        math.cos((u + COSINE_OFFSET) / (1 + COSINE_OFFSET) * math.pi / 2) ** 2 for u in (0, 1 / steps)
+def _linear_ends(steps: int) -> tuple[float, float]:
+    slope = (LAST_LINEAR_BETA - FIRST_LINEAR_BETA) / (steps - 1)
+    return FIRST_LINEAR_BETA, math.prod(1 - FIRST_LINEAR_BETA - slope * k for k in range(steps))
+
+
+def _cosine_ends(steps: int) -> tuple[float, float]:
+    start, first, last = (
+        math.cos((u + COSINE_OFFSET) / (1 + COSINE_OFFSET) * math.pi / 2) ** 2
+        for u in (0, 1 / steps, 1 - 1 / steps)
     )
-    return 1 - end / start
+    return 1 - first / start, (1 - MAX_BETA) * last / start
+
+
+def _log_snr(alpha_bar: float) -> float:
+    return math.log(alpha_bar) - math.log1p(-alpha_bar)
+
+
+_ENDS = {"linear": _linear_ends, "cosine": _cosine_ends}
+"""The first 1 - alpha_bar and the last alpha_bar of a schedule with so many steps."""
 
 
 @dataclass(frozen=True)
@@ -183,12 +201,14 @@ class DDGDiffusionConfig(Section, name="ddg.diffusion"):
                 "steps",
                 f"{least} to {most} with schedule linear: fewer do not end in noise",
             )
-        first = FIRST_LINEAR_BETA if self.schedule == "linear" else _first_cosine_beta(self.steps)
-        if (highest := math.log(first / _LEAST_NOISE)) < self.log_snr_shift:
-            limit = f"at most {highest:.1f} with {self.steps} steps"
-            raise self.error(
-                "log_snr_shift", f"{limit}: the first one would add less noise than float32 tells"
-            )
+        noise, signal = _ENDS[self.schedule](self.steps)
+        kept = f"the last one would keep more than {_MOST_SIGNAL:.0%} of the signal's variance"
+        limits = {
+            math.log(noise / _LEAST_NOISE): "the first one would add less noise than float32 tells",
+            _log_snr(_MOST_SIGNAL) - _log_snr(signal): kept,
+        }
+        if self.log_snr_shift > (most := min(limits)):
+            raise self.error("log_snr_shift", f"at most {most:.1f} with {self.steps} steps: {limits[most]}")
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,8 @@ def _record(
 
     score = config.score
     rng = np.random.default_rng([config.seed, SEED_OFFSET + number])
-    name = config.world.objects[number % len(config.world.objects)]
+    of_side = number % score.trajectories  # both sides show the same objects
+    name = config.world.objects[of_side % len(config.world.objects)]
     world.reset(int(rng.integers(2**31)), name)
     T_world_cam = jittered_pose(config.record, rng)
     for _ in range(rng.integers(max(1, config.record.frames - score.frames + 1))):
@@ -253,6 +254,15 @@ def _size(recording: Recording, width_px: int) -> tuple[int, int]:
     return round(recording.height_px * width_px / recording.width_px), width_px
 
 
+def check_colour(frames: RealFrames, with_rgb: bool) -> None:
+    """UserError if colour is wanted that is not aligned to depth."""
+    if with_rgb and frames.unaligned:
+        raise UserError(
+            f"{frames.unaligned[0]}: colour is not aligned to depth, as column monocular needs it: align it "
+            "when recording, or leave monocular out of --columns."
+        )
+
+
 def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
     """The frames as episodes: even ones are the real side, odd ones give the geometry.
 
@@ -262,11 +272,7 @@ def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
     """
     from ddg_jax.data import PIECEWISE, surfaces
 
-    if with_rgb and frames.unaligned:
-        raise UserError(
-            f"{frames.unaligned[0]}: colour is not aligned to depth, as column monocular needs it: align it "
-            "when recording, or leave monocular out of --columns."
-        )
+    check_colour(frames, with_rgb)
     depth_mm, rgb = frames.depth_mm, frames.rgb
     clean = depth.to_millimetres(surfaces(depth.to_metres(depth_mm), PIECEWISE))
     episodes = []

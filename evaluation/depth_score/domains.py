@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt16
 
 from ddgrasp import contract
-from ddgrasp.config import DextrahConfig, ScoreConfig
+from ddgrasp.config import DDGConfig, DextrahConfig, ScoreConfig
 from ddgrasp.depth import to_metres, to_millimetres
 from evaluation.depth_score.data import REAL, SIM, Episode
 from sensors.inpainting import inpainted
@@ -35,6 +35,17 @@ _REPEATS = 100_000
 """Added to an episode's number where its world stands still: other noise than the moving episode's."""
 
 
+def monocular_network(score: ScoreConfig, ddg: DDGConfig) -> "ddg_jax.network_prior.DepthNetworkPrior | None":
+    """The network of column monocular; None without that column, or if no folder was named and the usual one
+    is not there. Raises UserError for weights of another network."""
+    from ddg_jax.network_prior import DepthNetworkPrior, weights_folder
+
+    prior = replace(ddg.prior, source=score.monocular, weights=score.monocular_weights, in_sim="rgb")
+    settings = replace(ddg, prior=prior)
+    absent = not score.monocular_weights and not weights_folder(settings).exists()
+    return None if absent or "monocular" not in score.columns else DepthNetworkPrior(settings)
+
+
 @dataclass(frozen=True)
 class Methods:
     """What makes depth from an episode."""
@@ -45,27 +56,13 @@ class Methods:
 
     @cached_property
     def monocular(self) -> "ddg_jax.network_prior.DepthNetworkPrior | None":
-        """The monocular network; None if no folder was named and the usual one is not there."""
-        from ddg_jax.network_prior import DepthNetworkPrior, weights_folder
-
-        settings = replace(
-            self.generator.config,
-            prior=replace(
-                self.generator.config.prior,
-                source=self.config.monocular,
-                weights=self.config.monocular_weights,
-                in_sim="rgb",
-            ),
-        )
-        if not self.config.monocular_weights and not weights_folder(settings).exists():
-            return None
-        return DepthNetworkPrior(settings)
+        """See `monocular_network`."""
+        return monocular_network(self.config, self.generator.config)
 
     @property
     def needs_rgb(self) -> bool:
         """Whether episodes must bring colour."""
-        wanted = "monocular" in self.config.columns and self.monocular is not None
-        return wanted or self.generator.prior.needs_sim_rgb
+        return self.monocular is not None or self.generator.prior.needs_sim_rgb
 
 
 def sense(methods: Methods, episode: Episode, names: Sequence[str]) -> Maps:

@@ -14,7 +14,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from evaluation.depth_score import data as score_data
 from evaluation.depth_score import features as score_features
-from evaluation.depth_score.domains import Methods
+from evaluation.depth_score.domains import Methods, monocular_network
 from evaluation.depth_score.episodes import Load
 from evaluation.depth_score.scoring import score_setting
 
@@ -65,7 +65,9 @@ def run(job: Job) -> Artifact:
             f"{2 * score_data.BLOCK_FRAMES} frames of one recording; expected {_FEWEST_BLOCKS} or more: give "
             "more frames."
         )
-    extractors = [score_features.load(name) for name in config.score.features]  # before hours of fitting
+    # Before hours of fitting:
+    score_data.check_colour(frames, monocular_network(config.score, config.ddg) is not None)
+    extractors = [score_features.load(name) for name in config.score.features]
     if frames.apart:
         job.progress.note(_apart(frames))
     fitted = _fit(job, root, fit_frames)

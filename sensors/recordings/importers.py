@@ -29,6 +29,7 @@ from sensors.recordings.recording import (
 from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, in_time, paired
 from sensors.recordings.writer import RecordingWriter
 
+MARKER = 2**16 - 1
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 _COLOR_NAMES = ", ".join(f"{name}/" for name in COLOR_FOLDERS)
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
@@ -52,11 +53,15 @@ class Imported:
     """What of its depth did not fit into the format, if anything."""
     note: str = ""
     """See `Source`."""
+    marked: int = 0
+    """Pixels with a mark for "no reading" of the source's own."""
 
     @property
     def lines(self) -> list[str]:
-        """For people: what was left out, a line each, `loss` and `note`."""
+        """For people: what was left out, a line each, `loss`, `note` and `marked`."""
         said = [f"left out {what}" for what in self.skipped] + [self.loss] + [self.note]
+        if self.marked:
+            said.append(f"{self.marked} pixels of {MARKER}, the largest number, have no reading now")
         return [f"{self.path}: {text}" for text in said if text]
 
 
@@ -73,9 +78,9 @@ def import_recording(source: Source, path: Path) -> Imported:
     if path.exists():
         raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
     skipped, medians_m, size, frames, gaps, last = [], [], None, 0, False, False
-    loss = ""
+    loss, marked = "", 0
     with RecordingWriter(path, source.meta) as writer:
-        for frame in source.frames():
+        for frame in map(_without_markers, source.frames()):
             medians_m += _median_m(frame, source.depth_unit_m)
             depth_mm, reason = _usable(frame, source.depth_unit_m, size)
             if depth_mm is None or frame.rgb is None:
@@ -85,6 +90,7 @@ def import_recording(source: Source, path: Path) -> Imported:
             gaps, last = gaps or not (last or not frames), True
             size = depth_mm.shape
             loss = loss or _loss(frame, source.depth_unit_m)
+            marked += frame.marked
             try:
                 writer.add(frame.rgb, depth_mm)
             except OSError as error:
@@ -105,7 +111,7 @@ def import_recording(source: Source, path: Path) -> Imported:
                 f"{source.path}: none of its {len(skipped)} frames can be used "
                 f"({skipped[0] if skipped else 'it is empty'})."
             )
-    return Imported(path, frames, tuple(skipped), loss, source.note)
+    return Imported(path, frames, tuple(skipped), loss, source.note, marked)
 
 
 def _loss(frame: RawFrame, unit_m: float) -> str:
@@ -156,6 +162,16 @@ def summary(done: list[Imported], refused: list[str]) -> str:
             f"left out: {skipped} frames, {len(refused)} recordings",
         ]
     )
+
+
+def _without_markers(frame: RawFrame) -> RawFrame:
+    """`frame` with 0 in the place of 16 bits' largest number: in many a dataset "no reading", and no depth
+    that a camera sees."""
+    if frame.depth is None or frame.depth.dtype != np.uint16:
+        return frame
+    marked = frame.depth == MARKER
+    depth = np.where(marked, np.uint16(0), frame.depth)
+    return replace(frame, depth=depth, marked=int(marked.sum())) if marked.any() else frame
 
 
 def _usable(frame: RawFrame, unit_m: float, size: tuple[int, ...] | None) -> tuple[np.ndarray | None, str]:

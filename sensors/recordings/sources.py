@@ -27,6 +27,8 @@ class RawFrame:
     """(H, W) counts or floating-point lengths (what is neither is left out); None if it cannot be read."""
     rgb: UInt8[np.ndarray, "h w 3"] | None
     """(h, w, 3) uint8; None if there is none."""
+    marked: int = 0
+    """Pixels of `depth` that had a mark for "no reading" of their source's own, and are 0."""
 
 
 @dataclass(frozen=True)
