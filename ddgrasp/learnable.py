@@ -3,6 +3,7 @@
 What was made by such a one is read as ever, so that these are no checks of the configuration's own.
 """
 
+from ddgrasp import contract
 from ddgrasp.config import Config, StudentConfig, TeacherConfig
 from ddgrasp.errors import UserError
 
@@ -11,6 +12,7 @@ def check_learnable(config: Config) -> None:
     """UserError for settings with which teacher or student would learn nothing, or act before they have."""
     if config.scale == 1:  # a trial run has too few iterations for anything
         _check_actor(config.teacher)
+        _check_time(config)
     _check_losses(config.student)
     _check_head(config.student)
     _check_sight(config.student)
@@ -28,6 +30,14 @@ def _check_actor(teacher: TeacherConfig) -> None:
             f"teacher.minibatches {teacher.minibatches} of {teacher.num_envs} environments' unroll_steps "
             f"{teacher.unroll_steps} are one control step each, whose advantage less the mean is 0: the "
             "policy would learn nothing; take fewer minibatches, or more steps."
+        )
+
+
+def _check_time(config: Config) -> None:
+    if config.teacher.total_steps and config.world.episode_steps < contract.HOLD_STEPS:
+        raise UserError(
+            f"world.episode_steps is {config.world.episode_steps}; success is an object held for the last "
+            f"{contract.HOLD_STEPS}, and would never be seen: take more."
         )
 
 

@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json, read_json, replaced_folder
+from ddgrasp.versions import library_versions
 from foundation import catalog
 
 MANIFEST = "manifest.json"
@@ -79,7 +79,7 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float
         published=entry.published,
         parameters=_count(variables["params"]),
         max_depth_m=max_depth_m,
-        versions=artifacts.library_versions(),
+        versions=library_versions(),
         created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     )
     with replaced_folder(weights_dir / name) as folder:
@@ -103,6 +103,14 @@ def read_manifest(directory: Path) -> WeightsManifest:
     return WeightsManifest(**value)
 
 
+def manifest_of(directory: Path, families: tuple[str, ...]) -> WeightsManifest:
+    """`read_manifest` of weights that `load` takes; UserError if they are of another network."""
+    manifest = read_manifest(directory)
+    if families and not any(manifest.network.startswith(family) for family in families):
+        raise UserError(f"{directory} holds weights of {manifest.network}; expected {' or '.join(families)}.")
+    return manifest
+
+
 def load(directory: Path, families: tuple[str, ...] = ()) -> tuple[WeightsManifest, dict[str, Any]]:
     """Manifest and Flax variables (NumPy float32) of converted weights.
 
@@ -113,9 +121,7 @@ def load(directory: Path, families: tuple[str, ...] = ()) -> tuple[WeightsManife
     """
     from foundation.convert import variable_shapes
 
-    manifest = read_manifest(directory)
-    if families and not any(manifest.network.startswith(family) for family in families):
-        raise UserError(f"{directory} holds weights of {manifest.network}; expected {' or '.join(families)}.")
+    manifest = manifest_of(directory, families)
     return manifest, _restore(directory / CHECKPOINT, variable_shapes(manifest.network))
 
 

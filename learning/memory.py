@@ -38,24 +38,27 @@ class Need:
 
 
 def check(need: Need, directory: Path) -> None:
-    """UserError if devices, host or the disk of `directory` have less than `need`."""
-    for place, wanted, free in _places(need, directory):
+    """UserError if devices, host or the disk of the run `directory` have less than `need`; of disk, than is
+    still to be written where the stage has begun."""
+    for place, wanted, free, remedy in _places(need, directory):
         if wanted > free:
             raise UserError(
                 f"Stage {need.stage} needs about {wanted / 1e9:.1f} GB {place}, which has "
-                f"{free / 1e9:.1f} GB for it: lower {need.remedy}."
+                f"{free / 1e9:.1f} GB for it: {remedy}."
             )
 
 
-def _places(need: Need, directory: Path) -> Iterator[tuple[str, int, int]]:
-    limit = device_limit(jax.local_devices()[0])
+def _places(need: Need, directory: Path) -> Iterator[tuple[str, int, int, str]]:
+    limit, lower = device_limit(jax.local_devices()[0]), f"lower {need.remedy}"
     if limit is None:
-        yield "of memory on the host", need.host + need.device * jax.local_device_count(), host_bytes()
+        yield "of memory on the host", need.host + need.device * jax.local_device_count(), host_bytes(), lower
     else:
-        yield "of memory on the device", need.device, limit
-        yield "of memory on the host", need.host, host_bytes()
+        yield "of memory on the device", need.device, limit, lower
+        yield "of memory on the host", need.host, host_bytes(), lower
     there = next(path for path in (directory.absolute(), *directory.absolute().parents) if path.exists())
-    yield f"of disk in {directory}", need.disk, shutil.disk_usage(there).free
+    written = sum(path.stat().st_size for path in (directory / need.stage).rglob("*")) if need.disk else 0
+    free = shutil.disk_usage(there).free
+    yield f"of disk in {directory}", need.disk - written, free, "free some, or work on another disk (--out)"
 
 
 def device_limit(device: Any) -> int | None:

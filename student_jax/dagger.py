@@ -158,12 +158,14 @@ class Trainer:
             roller = Roller(self._config, self._teacher, wanted - first, self._source.needs_rgb)
             with self._progress.task(f"acting, round {number}", roller.steps) as task:
                 key = jax.random.fold_in(jax.random.PRNGKey(_DAGGER_SEED + self._config.seed), number)
-                if there := first - (wanted - student.dagger.episodes):  # resumed: other scenes than those
+                there = first - (wanted - student.dagger.episodes)
+                if there:  # resumed: other scenes than those
                     key = jax.random.fold_in(key, there)
                 episodes = roller.run(key, actor, lambda _: task.advance())
             frames_io.add_rollouts(self._store, episodes, actor.seen, self._window)
             rate = float(episodes.success.mean())
-            atomic_write_json(self._directory / ACTED, {"round": number, "rollout_success": rate})
+            if not there:  # a rest says little of the round
+                atomic_write_json(self._directory / ACTED, {"round": number, "rollout_success": rate})
             self._progress.note(f"round {number}: {rate:.0%} success with the teacher taking {share:.0%}")
         return self._acted(number) | self._fit(f"dagger-{number}", student.dagger.steps)
 
@@ -201,7 +203,7 @@ class Trainer:
                 progress=self._progress,
                 first_point=_steps_before(student, number),
                 log_every=LOG_EVERY,
-                shown=("position_error_mm", "yaw", "held"),
+                shown=train.told(student.training),
             )
         self.params = frozen | jax.tree.map(np.asarray, state.ema)
         return terms

@@ -9,11 +9,20 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt16
 
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
+from ddgrasp.config import StudentConfig
 from ddgrasp.layout import ACTION, OBSERVATION, STATE, closes
 from student_jax.policy import Aux, position_from_world
 
+LEAD_IN = contract.DEPTH_FRAMES - 1
+"""Steps before a sample that its stack of pictures shows."""
 YAW_MULTIPLE = 2
 """The gripper looks the same after half a turn: the auxiliary target is the angle's double."""
+
+
+def kept_of_a_demo(student: StudentConfig, length: int) -> int:
+    """Steps that are kept at most of a demo of `length` steps."""
+    steps = student.training.demo_stretch_steps
+    return min(length, steps + LEAD_IN + student.head.chunk - 1) if steps else length
 
 
 @runtime_checkable

@@ -9,22 +9,19 @@ import numpy as np
 from jaxtyping import Bool
 
 from ddg_jax.generate import Clip
-from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
 from demos.rollout import Episodes
 from demos.spool import Spool
 from demos.store import EpisodeStore
 from mjx_envs.views import Views, observed
-from student_jax.data import DepthInWindow, Frames, Window, make_frames
+from student_jax.data import LEAD_IN, DepthInWindow, Frames, Window, make_frames
 from student_jax.depth_source import VIEWED, DepthSource
 from student_jax.device_frames import DepthOnDevice
 
 CACHE = "frames.zarr"
 _COLUMNS = ("state", "action", "observation", "held")
 _DRAWN = "drawn"
-LEAD_IN = contract.DEPTH_FRAMES - 1
-"""Steps before a sample that its stack of pictures shows."""
 _STRETCH_SEED = 47_000
 
 

@@ -11,7 +11,7 @@ from ddgrasp.config import Config
 from learning.memory import Need, traced_bytes
 from learning.prefetch import AHEAD
 from student_jax import train
-from student_jax.data import Window
+from student_jax.data import Window, kept_of_a_demo
 from student_jax.policy import Aux, param_shapes
 
 _ROW_BYTES = 4 * (9 + 8 + 40 + 1) + 17
@@ -23,8 +23,9 @@ def need(config: Config) -> Need:
     accelerator if it has room for it besides."""
     student, profile = config.student, config.world.profile
     picture = 2 * profile.height_px * profile.width_px
-    episodes = config.demos.episodes + student.dagger.rounds * student.dagger.episodes
-    frames = episodes * config.world.episode_steps
+    length = config.world.episode_steps
+    frames = config.demos.episodes * kept_of_a_demo(student, length)
+    frames += student.dagger.rounds * student.dagger.episodes * length
     acting = max(student.dagger.episodes, config.evaluation.student_trials)
     host = (
         (AHEAD + 2) * batch_bytes(config)
@@ -32,7 +33,7 @@ def need(config: Config) -> Need:
         + acting * (contract.DEPTH_FRAMES + 3) * picture
     )
     height, width = Window.seen(profile, student.training.crop_shift_px).shape
-    disk = frames * 2 * height * width + acting * config.world.episode_steps * picture
+    disk = frames * 2 * height * width + acting * length * picture
     remedy = "student.training.batch_size, student.dagger.episodes or world.camera_scale"
     return Need("student", training_bytes(config), host, disk, remedy)
 

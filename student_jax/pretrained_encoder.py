@@ -32,18 +32,18 @@ _RESNET18 = {
 def source(config: StudentConfig) -> str | dict[str, str]:
     """For reports: "built-in", or the weights that the encoder starts from.
 
-    Raises UserError if `config.encoder.weights` holds none, or the student's encoder is no ResNet-18.
+    Raises UserError if `config.encoder.weights` holds none of ResNet-18, or the student's encoder is none.
     """
     if not config.encoder.weights:
         return store.BUILT_IN
     _check(config)
-    return store.read_manifest(Path(config.encoder.weights)).summary()
+    return store.manifest_of(Path(config.encoder.weights), (catalog.RESNET18,)).summary()
 
 
 def load_into(encoder: Mapping[str, Any], config: StudentConfig) -> dict[str, Any]:
     """The encoder's parameters with those of `config.encoder.weights` in place; unchanged without weights.
 
-    Raises UserError as `source`, and for weights of another network.
+    Raises UserError as `source`.
     """
     if not config.encoder.weights:
         return dict(encoder)

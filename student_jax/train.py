@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, Key, UInt16
 
 from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
+from ddgrasp.config.student import StudentTrainingConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.depth import to_metres
 from learning.convolutions import compiler_options
@@ -123,6 +124,12 @@ def diffusion_loss(
     return jnp.mean((eps - predicted) ** 2)
 
 
+def told(training: StudentTrainingConfig) -> tuple[str, ...]:
+    """Terms of `train_step` that people want to watch: those that are trained."""
+    perception = ("position_error_mm", "yaw", "held") if training.aux_weight else ()
+    return (*perception, "action") if training.action_weight else perception
+
+
 def _ripples(config: StudentConfig) -> bool:
     return bool(config.training.disparity_noise_px or config.training.edge_noise_px)
 
@@ -156,13 +163,15 @@ def train_step(
         seen = cast(
             Seen, policy.apply({"params": params}, depth_m, batch.state, batch.crop_rc, method="encode")
         )
-        terms = aux_losses(seen.aux, batch.aux)
-        total = config.training.aux_weight * (terms["position"] + terms["yaw"] + 0.3 * terms["held"])
+        terms, total = {}, jnp.zeros(())
+        if config.training.aux_weight:  # else nothing trains what it would say
+            terms = aux_losses(seen.aux, batch.aux)
+            total = config.training.aux_weight * (terms["position"] + terms["yaw"] + 0.3 * terms["held"])
+            error = jnp.linalg.norm(seen.aux.position - batch.aux.position, axis=-1)
+            terms["position_error_mm"] = 1000.0 * POSITION_SCALE_M * jnp.median(error)
         if config.training.action_weight:
             terms["action"] = diffusion_loss(config, policy, params, seen, batch.state, batch.action, key)
             total += config.training.action_weight * terms["action"]
-        error = jnp.linalg.norm(seen.aux.position - batch.aux.position, axis=-1)
-        terms["position_error_mm"] = 1000.0 * POSITION_SCALE_M * jnp.median(error)
         return total, terms
 
     (_, terms), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.params)

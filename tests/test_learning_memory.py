@@ -1,6 +1,7 @@
 """Memory told beforehand: against XLA's own analysis, and refused in one line."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from learning import memory
 from learning.memory import Need, check, compiled_bytes, traced_bytes
 from sensors.recordings.writer import RecordingWriter
 from student_jax import memory as student_memory
+from student_jax.data import kept_of_a_demo
 
 MB = 2**20
 
@@ -85,11 +87,31 @@ def test_more_than_there_is_is_refused_with_the_remedy(tmp_path):
     fits = Need("student", 10**6, 10**6, 10**6, "student.training.batch_size")
     check(fits, tmp_path / "not" / "there")
     with pytest.raises(
-        UserError, match=r"^Stage student needs about 1000000\.0 GB of disk in .* lower student"
+        UserError, match=r"^Stage student needs about 1000000\.0 GB of disk in .* free some, or work on"
     ):
         check(replace(fits, disk=10**15), tmp_path)
-    with pytest.raises(UserError, match=r"needs about 1000000\.0 GB of memory on the"):
+    with pytest.raises(UserError, match=r"needs about 1000000\.0 GB of memory on the .* lower student"):
         check(replace(fits, host=10**15), tmp_path)
+
+
+def test_what_is_on_the_disk_already_is_not_asked_for_again(tmp_path, monkeypatch):
+    free = SimpleNamespace(free=300)
+    monkeypatch.setattr("learning.memory.shutil.disk_usage", lambda path: free)
+    need = Need("student", 0, 0, 1000)
+    with pytest.raises(UserError, match="GB of disk"):
+        check(need, tmp_path)
+    (tmp_path / "student" / "frames.zarr").mkdir(parents=True)
+    (tmp_path / "student" / "frames.zarr" / "chunk").write_bytes(bytes(700))
+    check(need, tmp_path)
+
+
+def test_of_a_demo_no_more_is_asked_for_than_is_kept():
+    whole, laptop = PRESETS["demo"], PRESETS["laptop"]
+    assert (laptop.student.training.demo_stretch_steps, laptop.student.head.chunk) == (12, 2)
+    assert kept_of_a_demo(laptop.student, 60) == 12 + 2 + 1
+    assert kept_of_a_demo(laptop.student, 10) == 10
+    training = replace(whole.student.training, demo_stretch_steps=0)
+    assert kept_of_a_demo(replace(whole.student, training=training), 60) == 60
 
 
 def test_a_batch_that_cannot_fit_is_refused_before_any_work(tmp_path):

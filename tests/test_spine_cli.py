@@ -334,6 +334,18 @@ def test_names_and_files_are_checked_before_any_stage(section, values, expected,
         check_config_values(_with(section, **values))
 
 
+@pytest.mark.parametrize(
+    ("stage", "name"), [("student", "init_from"), ("ddg", "init_from"), ("teacher", "start")]
+)
+def test_a_start_that_is_gone_is_missed_by_an_unfinished_stage_alone(tmp_path, monkeypatch, stage, name):
+    monkeypatch.chdir(ROOT)
+    config = _with(stage, **{name: "runs/no"})
+    with pytest.raises(UserError, match="which does not exist"):
+        check_config_values(config, tmp_path)
+    artifacts.finish(tmp_path / stage, stage, config, seconds=1.0, metrics={})
+    assert check_config_values(config, tmp_path) is config
+
+
 def test_two_starts_for_the_student_are_refused():
     student = PRESETS["demo"].student
     with pytest.raises(UserError, match="both say where to start"):

@@ -255,11 +255,13 @@ def test_a_teacher_whose_actor_would_never_learn_is_refused():
     with pytest.raises(UserError, match=r"critic_warmup is 10, .*100000 makes 10 iteration\(s\)"):
         check_config_values(parse("run", ["--preset", "demo", "--teacher.total-steps", "100000"]).config)
     check_config_values(parse("run", ["--preset", "demo", "--scale", "0.001"]).config)
+    with pytest.raises(UserError, match="episode_steps is 4; success is an object held for the last 5"):
+        check_config_values(parse("run", ["--preset", "demo", "--world.episode-steps", "4"]).config)
     for preset in PRESETS.values():
         check_learnable(preset)
 
 
-@pytest.mark.parametrize(("name", "accepted"), [("linear", 15), ("cosine", 36)])
+@pytest.mark.parametrize(("name", "accepted"), [("linear", 12), ("cosine", 34)])
 def test_schedules_that_configurations_take_have_noise_at_both_ends(name, accepted):
     taken = 0
     for steps in (2, 50, 499, 500, 1000, 5000, 5001, 100_000):
@@ -270,7 +272,7 @@ def test_schedules_that_configurations_take_have_noise_at_both_ends(name, accept
                 continue
             alpha_bars = diffusion.make_schedule(name, config.steps, config.log_snr_shift).alpha_bars
             assert np.all(alpha_bars > 0) and np.all(1 - alpha_bars > 0)
-            assert alpha_bars[-1] < 0.01 * np.exp(max(0, shift)), (steps, shift)
+            assert alpha_bars[-1] < 0.01, (steps, shift)
             taken += 1
     assert taken == accepted  # of 48
 

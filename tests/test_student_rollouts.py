@@ -228,7 +228,7 @@ def test_a_round_that_is_partly_there_gets_what_is_missing_in_other_scenes(train
     for _ in range(2):  # the second time nothing is missing
         trainer._dagger(1, DEMOS)
         assert len(trainer._store) == DEMOS + there + COUNT and len(roller.made) == 1
-    assert shares == [0.4]
+    assert shares == [0.4] and trainer._acted(1) == {}  # a rest says little of the round
     assert trainer._source.asked[0][0] == list(range(DEMOS + there, DEMOS + there + COUNT))
     (key,) = roller.keys
     whole = jax.random.fold_in(jax.random.PRNGKey(dagger._DAGGER_SEED + CONFIG.seed), 1)

@@ -50,8 +50,8 @@ class Run(FromPreset):
 
     def run(self) -> None:
         """Says what memory the stages will take, makes those that are not finished, prints the table."""
-        check_config_values(self.config)
         pipeline.check_place(self.config, self.out, resume=self.resume)
+        check_config_values(self.config, self.out)
         check_devices(self.config, self.out)
         tell_needs(self.config, self.out)
         report = pipeline.run(self.config, self.out, resume=self.resume)

@@ -60,8 +60,9 @@ class OneStage(FromPreset):
 
     def run(self) -> None:
         """Says what memory the stage will take and makes it from its finished parents in the run."""
-        stage, config = get_stage(self.stage), check_config_values(self.config)
-        pipeline.check_place(config, self.out, resume=self.resume, stages=[stage])
+        stage = get_stage(self.stage)
+        pipeline.check_place(self.config, self.out, resume=self.resume, stages=[stage])
+        config = check_config_values(self.config, self.out)
         for name in stage.parents:
             artifacts.require(self.out, name, config)
         tell_needs(config, self.out, (stage.name,))

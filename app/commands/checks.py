@@ -44,21 +44,26 @@ def _is_stated(kind: Any) -> bool:
     return origin is Literal or (origin is Annotated and any(isinstance(x, Range) for x in arguments[1:]))
 
 
-def check_config_values(config: Config) -> Config:
-    """`config` if the names and files in it exist; UserError with the remedy otherwise."""
+def check_config_values(config: Config, run_dir: Path | None = None) -> Config:
+    """`config` if the names and files in it exist; UserError with the remedy otherwise.
+
+    What a stage starts from is asked for no more where `run_dir` has it finished.
+    """
     from ddg_jax import start
     from student_jax.source_check import check_source
 
     check_objects(config.world)
     check_learnable(config)
-    for stage in ("ddg", "student"):
-        check_start(stage, f"{stage}.init_from", getattr(config, stage).init_from)
-    if config.ddg.init_from:
+    ahead = [stage for stage in CHECKPOINTS if not (run_dir and artifacts.is_finished(run_dir / stage))]
+    for stage in ahead:
+        if stage != "teacher":
+            check_start(stage, f"{stage}.init_from", getattr(config, stage).init_from)
+    if config.ddg.init_from and "ddg" in ahead:
         start.check(config.ddg)
-    if config.teacher.starts_from_file:
+    if config.teacher.starts_from_file and "teacher" in ahead:
         check_start("teacher", "teacher.start", config.teacher.start, "nothing, guide, or ")
     check_source(config)
-    if config.student.encoder.weights:
+    if config.student.encoder.weights and "student" in ahead:
         from student_jax import pretrained_encoder
 
         pretrained_encoder.source(config.student)
