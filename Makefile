@@ -92,6 +92,7 @@ $(DOCS)/.installed: requirements-docs.lock
 	@touch $@
 
 wheel: setup  ## build dist/ddgrasp-VERSION.whl, which installs without this clone
+	rm -f dist/ddgrasp-*.whl
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir dist .
 
 docs: $(DOCS)/.installed  ## build the pages and the API reference into site/; a warning is an error

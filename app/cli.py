@@ -95,7 +95,7 @@ def _dispatch(argv: list[str]) -> int:
         argv = [*argv[1:], "--help"]
     words = argv[: next((i for i, word in enumerate(argv) if word.startswith("-")), len(argv))]
     if argv and argv[0] == "--version":
-        from ddgrasp.artifacts import library_versions
+        from ddgrasp.versions import library_versions
 
         print("  ".join(f"{name} {version}" for name, version in library_versions().items()))
         return 0

@@ -17,6 +17,7 @@ from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text, read_json, to_json
 from ddgrasp.progress import Progress
 from ddgrasp.stages import get_stage
+from ddgrasp.versions import library_versions
 from deploy.policy import POLICY_FILE
 from evaluation import rig_trials
 from evaluation.rig_trials import Series
@@ -141,7 +142,7 @@ def write(study: Study) -> dict[str, Any]:
         "scale": study.config.scale,
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "machine": machine.describe(),
-        "versions": artifacts.library_versions(),
+        "versions": library_versions(),
         "left_out": {name: why for name, why in left_out.items() if name not in collected["rows"]},
         **collected,
         "config": config,

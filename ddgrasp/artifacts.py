@@ -4,13 +4,10 @@ A stage's directory is finished once it holds `manifest.json`, which is written 
 This module imports no JAX.
 """
 
-import contextlib
 import copy
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
-import platform
 import shutil
 import time
 import typing
@@ -24,6 +21,7 @@ from ddgrasp.config.checks import has_sections
 from ddgrasp.errors import UserError
 from ddgrasp.files import TEMPORARY, atomic_write_json, read_json, to_json
 from ddgrasp.stages import config_fields, get_stage
+from ddgrasp.versions import library_versions
 
 MANIFEST = "manifest.json"
 STARTED = "started.json"
@@ -37,7 +35,6 @@ _INDIFFERENT = {
 """Fields that decide whether or how a result comes about, not what it is. They count as these values when
 configurations are compared, so that a stage that missed its bound, or took too much memory, goes on."""
 _ORIGINS = ("trained", "loaded")
-_LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -358,15 +355,6 @@ def _dataclass_from_json(cls: type, value: Mapping[str, Any], name: str) -> Any:
 
 def _to_tuple(value: Any) -> Any:
     return tuple(_to_tuple(item) for item in value) if isinstance(value, list) else value
-
-
-def library_versions() -> dict[str, str]:
-    """Versions of Python, this project and the libraries that matter, without importing them."""
-    versions = {"python": platform.python_version()}
-    for name in ("ddgrasp", *_LIBRARIES):
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    return versions
 
 
 def _relevant(config: Mapping[str, Any], stage: str) -> dict[str, Any]:

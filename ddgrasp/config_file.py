@@ -101,8 +101,16 @@ def _of_this_release(values: Mapping[str, Any]) -> dict[str, Any]:
         return given
 
 
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
+"""3e-4, which YAML 1.1 takes for a text."""
+
+
+def _reads_numbers(yaml_class: Any) -> None:
+    yaml_class.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
+
+
 def _dumper() -> Any:
-    """YAML's safe dumper, which writes a list in one line."""
+    """YAML's safe dumper; lists are one line, and a text that `_loader` would read as a number is quoted."""
     import yaml
 
     class Dumper(yaml.SafeDumper):
@@ -110,6 +118,7 @@ def _dumper() -> Any:
 
     tag = "tag:yaml.org,2002:seq"
     Dumper.add_representer(list, lambda made, values: made.represent_sequence(tag, values, flow_style=True))
+    _reads_numbers(Dumper)
     return Dumper
 
 
@@ -125,8 +134,7 @@ def _loader() -> Any:
                 raise yaml.constructor.ConstructorError(None, None, why, node.start_mark)
             return super().construct_mapping(node, deep)
 
-    number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+.0123456789"))
+    _reads_numbers(Loader)
     return Loader
 
 

@@ -64,7 +64,7 @@ DEBUG = Config(
         total_steps=160,
         num_envs=8,
         unroll_steps=10,
-        minibatches=2,
+        minibatches=1,  # eight devices share it
         epochs=1,
         learning_rate=1e-5,
         critic_warmup=0,
@@ -245,7 +245,8 @@ camera: 640 x 360, half of its 1280 x 720 per side, in which the crop window of 
     have a quarter of the bytes. The encoder needs multiples of 4: 224 x 288 trims a row and two columns and
     resamples nothing.
 generator: at 320 x 180 (the paper does not say), drawing holes and deviations from the surface instead of
-    depth itself (--ddg.depth.representation depth is the paper's; docs/generator.md compares them).
+    depth itself (the paper's: --ddg.depth.representation depth --ddg.graft.noise-threshold -0.2
+    --ddg.training.loss-weight uniform; docs/generator.md compares them).
 prior: inverse depth, holes filled, where the paper has Video Depth Anything: its weights are not part of this
     repository (--ddg.prior.source video_depth_anything, once they are converted).
 sampler: DDIM with 10 evaluations, where the paper goes through all K steps: 100 times the time.

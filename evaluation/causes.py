@@ -11,12 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_json, atomic_write_text, read_json
 from ddgrasp.install import FR3, check_fr3
 from ddgrasp.progress import Progress
+from ddgrasp.versions import library_versions
 from deploy.changes import Change
 from deploy.fr3_trials import Fr3Bench
 from deploy.trial_log import read_log
@@ -143,7 +143,7 @@ def write(out: Path, about: Mapping[str, Any]) -> dict[str, Any]:
     """Writes causes.json and causes.md from what `out` has; returns what causes.json holds."""
     made = {
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "versions": artifacts.library_versions(),
+        "versions": library_versions(),
         **about,
         "rows": table(out),
     }

@@ -75,9 +75,15 @@ def load(directory: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     saved, teacher = read_json(path), artifacts.read_artifact(directory)
-    here, there = teacher.manifest.config["world"], saved["world"]
-    alike = all(here[name] == there[name] for name in here.keys() & there.keys() - {"objects"})
-    return saved["objects"] if alike and saved["teacher"] == teacher.hash else []
+    here, there = ({**world, "objects": None} for world in (teacher.manifest.config["world"], saved["world"]))
+    return saved["objects"] if _alike(here, there) and saved["teacher"] == teacher.hash else []
+
+
+def _alike(here: Any, there: Any) -> bool:
+    """Whether two configurations agree in all settings that both have: one may be older."""
+    if isinstance(here, Mapping) and isinstance(there, Mapping):
+        return all(_alike(here[name], there[name]) for name in here.keys() & there.keys())
+    return here == there
 
 
 def print_summary(summary: Mapping[str, Any]) -> None:

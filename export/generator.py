@@ -20,6 +20,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.generator_metadata import GeneratorMetadata
 from ddgrasp.onnx_runtime import ort
+from ddgrasp.versions import project_version
 from export.generator_graph import build_model
 from export.parity import open_session
 from export.sampler_tables import MOST_STEPS, is_stochastic
@@ -102,7 +103,7 @@ def describe(
     fixed = config.sampling.sampler == PROGRESSIVE
     return GeneratorMetadata(
         format=generator_metadata.FORMAT,
-        project_version=artifacts.library_versions().get("ddgrasp", ""),
+        project_version=project_version(),
         height_px=config.depth.height_px,
         width_px=config.depth.width_px,
         channels=channels(config),

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from ddgrasp import artifacts, contract
+from ddgrasp import contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
@@ -14,6 +14,7 @@ from ddgrasp.files import atomic_write_bytes
 from ddgrasp.job import Job
 from ddgrasp.policy_metadata import describe_run
 from ddgrasp.progress import Progress
+from ddgrasp.versions import project_version
 from export import graph, parity
 
 POLICY_FILE = "policy.onnx"
@@ -48,8 +49,9 @@ def load_student(directory: Path) -> dict:
 
 def export_policy(config: Config, params: dict, student_manifest_hash: str = "") -> bytes:
     """The ONNX file's bytes."""
-    version = artifacts.library_versions().get("ddgrasp", "")
-    metadata = describe_run(config, project_version=version, student_manifest_hash=student_manifest_hash)
+    metadata = describe_run(
+        config, project_version=project_version(), student_manifest_hash=student_manifest_hash
+    )
     model = graph.build_model(params, config.student, config.export, config.world.profile, metadata)
     return model.SerializeToString()
 

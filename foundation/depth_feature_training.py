@@ -23,6 +23,7 @@ from ddgrasp.config import DepthFeatureConfig
 from ddgrasp.errors import UserError
 from ddgrasp.files import DAMAGED_NPZ, atomic_path, atomic_write_json, read_json, to_json
 from ddgrasp.progress import Progress
+from ddgrasp.versions import library_versions
 from foundation import depth_features
 from foundation.depth_feature_data import MEASURED, TREATMENTS, Batch, Pool, make_batch
 from learning.loop import Metrics, run_steps
@@ -84,7 +85,7 @@ def _train(config: DepthFeatureConfig, out: Path, quiet: bool) -> dict[str, Any]
         "config": config,
         "trained_on": {"pictures": len(training), "treatments": list(TREATMENTS)},
         "tested_on_new_cameras": tested,
-        "versions": artifacts.library_versions(),
+        "versions": library_versions(),
         "seconds": round(progress.seconds),
     }
     progress.close()

@@ -103,7 +103,8 @@ def moments(
     touched: Bool[np.ndarray, " steps"],
     running: Bool[np.ndarray, " steps"],
 ) -> Int[np.ndarray, "5"]:
-    """(5,) the steps of one episode that show MOMENTS; where one never came, the one before it.
+    """(5,) the steps of one episode that show MOMENTS; where one never came, the one before it. Of an object
+    that is never touched the last step with the hand above it counts.
 
     Args:
       qpos: (T, 16).
@@ -112,10 +113,11 @@ def moments(
     """
     last = int(np.flatnonzero(running)[-1])
     grip_pos, _ = kinematics.grip_pose(qpos[:, QPOS.arm], np)
-    contact = _first(touched & running, 0)
+    met = touched & running
     height = qpos[:, QPOS.object_pos][:, 2]
-    high = np.flatnonzero((grip_pos[:, 2] - height)[:contact] > ABOVE_M)
+    high = np.flatnonzero((grip_pos[:, 2] - height)[: _first(met, 0) if met.any() else last + 1] > ABOVE_M)
     above = int(high[-1]) if len(high) else 0
+    contact = _first(met, above)
     lifted = _first((height > height[0] + LIFTED_M) & running, contact)
     return np.array([0, above, contact, lifted, last])
 

@@ -23,7 +23,8 @@ ITERATIONS = 12
 TINY = (
     "--preset", "debug", "--teacher.start", "nothing",
     "--teacher.total-steps", str(16 * 4 * ITERATIONS), "--teacher.num-envs", "16",
-    "--teacher.unroll-steps", "4", "--teacher.hidden", "16", "--teacher.learning-rate", "1e-3",
+    "--teacher.minibatches", "2", "--teacher.unroll-steps", "4",
+    "--teacher.hidden", "16", "--teacher.learning-rate", "1e-3",
     "--teacher.pregrasp-share", "0", "--teacher.eval-every", "100", "--world.episode-steps", "6",
     "--evaluation.teacher-trials", "12",
 )  # fmt: skip

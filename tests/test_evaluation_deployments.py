@@ -51,6 +51,15 @@ def test_who_was_not_judged_is_named_and_dry_runs_stand_beside():
     assert deployments.verdict(made[2:4]).startswith("Success none was judged. Ended by a fault: 0.")
 
 
+def test_practice_on_the_rig_is_no_trial_of_the_arm():
+    on_arm, on_rig = ({"robot": "franka", "camera": camera} for camera in ("realsense", "rig"))
+    made = [deployment(False, **on_arm), deployment(True, **on_rig), deployment(True, **on_rig)]
+    said = deployments.verdict(made)
+    assert said.startswith("Success franka with realsense: 0.0 % of 1 (")
+    assert "; franka with rig: 100.0 % of 2 (" in said and ". Ended by a fault: 0. " in said
+    assert deployments.verdict(made[1:]).startswith("Success 100.0 % of 2 (")
+
+
 def test_the_page_says_what_counts(tmp_path):
     folder = tmp_path / "20261128-120000"
     folder.mkdir()

@@ -20,7 +20,7 @@ from ddgrasp.stages import get_stage
 from evaluation import wilson
 from evaluation.report import figures
 from evaluation.report.comparison import differences
-from evaluation.report.html import flatten
+from evaluation.report.html import flatten, numbers
 from evaluation.report.meanings import explain
 from evaluation.report.run_page import render_html
 from evaluation.report.stage import write_report
@@ -259,6 +259,9 @@ def test_targets_are_judged_by_what_was_measured():
     judged = [target["met"] for target in targets(report)]
     assert judged == ["met", "not met", "met", "not met", "not measured", "met", "not measured"]
     assert "91.0 % of 100" in targets(report)[1]["measured"]
+    report["score_real"] = {"targets": [{"target": "FID", "measured": "0.3", "met": "not met"}]}
+    named = {target["target"]: target["measured"] for target in targets(report)}
+    assert (named["FID"], named["real depth: FID"]) == ("0.1", "0.3") and len(named) == 8
 
 
 def test_every_number_of_a_whole_run_has_a_meaning_and_a_unit_where_it_needs_one():
@@ -269,6 +272,16 @@ def test_every_number_of_a_whole_run_has_a_meaning_and_a_unit_where_it_needs_one
     assert explain("deploy.sense_ms.p50") == ("ms", "reading camera and joints: half take no longer")
     assert explain("loss/v_loss") == ("", "training loss: the value network's")
     assert explain("nonsense.of.ours") == ("", "")
+
+
+def test_a_number_means_what_its_stage_measures():
+    network, loop = "one evaluation of the network", "from a frame to the command"
+    metrics = {"latency_ms": {"p50": 2.0}}
+    assert network in numbers(metrics, "export") and loop in numbers(metrics, "deploy")
+    assert explain("export.latency_ms.p50") == ("ms", f"{network}, on one thread: half take no longer")
+    assert explain("deploy.latency_ms.p50")[1].startswith(loop)
+    assert explain("deploy.safety.action")[1].endswith(": beyond the action's range")
+    assert explain("student.tried.action")[1].endswith("loss of the actions, through perception")
 
 
 def test_invalid_depth_has_a_colour_that_no_depth_has():

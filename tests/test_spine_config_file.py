@@ -101,6 +101,14 @@ def test_a_scale_written_by_hand_is_applied(tmp_path):
     assert config_file.read(tmp_path / "again.yaml") == read
 
 
+def test_a_folder_named_as_a_number_stays_a_text(tmp_path):
+    preset, path = PRESETS["debug"], tmp_path / "config.yaml"
+    for name in ("3e-4", "1e5", "-.5E+3", "runs/3e-4"):
+        config = replace(preset, student=replace(preset.student, init_from=name))
+        config_file.write(config, path)
+        assert config_file.read(path) == config
+
+
 def test_a_number_may_be_written_as_on_the_command_line(tmp_path):
     (tmp_path / "mine.yaml").write_text("preset: debug\nteacher: {learning_rate: 3e-4}\n")
     assert config_file.read(tmp_path / "mine.yaml").teacher.learning_rate == 3e-4

@@ -15,6 +15,7 @@ import pytest
 import teacher_worker as worker
 from ddgrasp.config import HostsConfig
 from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
 from ppo import hosts, learner
 
 ROOT = Path(__file__).parents[1]
@@ -126,6 +127,11 @@ def test_a_batch_that_devices_cannot_share_is_refused_in_one_line(tmp_path):
         in errors
     )
     assert not (tmp_path / "run").exists()
+
+
+def test_eight_devices_can_share_every_preset():
+    for preset in PRESETS.values():
+        learner.check_divisible(preset.teacher, 8)
 
 
 def test_minibatches_must_be_whole_on_every_device():

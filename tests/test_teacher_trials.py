@@ -133,7 +133,8 @@ def test_moments_by_hand():
     qpos[4:7, 11] = 0.02
     assert moments(qpos, touched, running).tolist() == [0, 2, 4, 7, 7]
     nothing = np.zeros(9, bool)
-    assert moments(qpos, nothing, running)[:3].tolist() == [0, 0, 0]
+    assert moments(qpos, nothing, running).tolist() == [0, 6, 6, 7, 7]  # stands above it, and never closes
+    assert moments(qpos[:2], nothing[:2], running[:2]).tolist() == [0, 0, 0, 1, 1]
 
 
 def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
@@ -157,6 +158,12 @@ def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     for change in ({"teacher": "another"}, {"world": elsewhere}):
         teacher_trials.save(directory, summary | change, pictures, MOMENTS)
         assert "trials" not in build_report(tmp_path)["teacher"]
+
+
+def test_trials_of_an_older_world_are_shown():
+    """pretrained/: `teacher eval` measured it before the world had all of today's settings."""
+    rows = teacher_trials.load(PRETRAINED)
+    assert [row["object"] for row in rows][-1] == "all" and len(rows) == 13
 
 
 def test_what_a_teacher_was_trained_on_is_seen_whatever_the_paper_trains_on(tmp_path):

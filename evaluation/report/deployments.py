@@ -96,19 +96,34 @@ def render(deployments: Sequence[Deployment]) -> str:
 
 
 def verdict(deployments: Sequence[Deployment]) -> str:
-    """How many succeeded of those that count, how many nobody judged, what ended by a fault, deadlines
-    missed; without dry runs."""
+    """How many succeeded of those that count, for each robot and camera apart, how many nobody judged, what
+    ended by a fault, deadlines missed; without dry runs."""
     driven = [deployment for deployment in deployments if deployment.is_driven]
-    outcomes = [deployment.success for deployment in driven if deployment.success is not None]
-    rate = wilson.describe(wilson.success(sum(outcomes), len(outcomes))) if outcomes else "none was judged"
-    unjudged = len(driven) - len(outcomes)
-    rate += f", {unjudged} not judged" if outcomes and unjudged else ""
+    setups = sorted({_setup(deployment) for deployment in driven})
+    rates = [_rate([one for one in driven if _setup(one) == setup]) for setup in setups]
+    if len(setups) > 1:  # a rig's trials say nothing of an arm's
+        rates = [f"{setup}: {rate}" for setup, rate in zip(setups, rates, strict=True)]
+    rate = "; ".join(rates) or _rate([])
     faults = sum(bool(deployment.report["fault"]) for deployment in driven)
     missed = sum(deployment.report["missed_deadlines"] for deployment in driven)
     steps = sum(deployment.report["steps"] for deployment in driven)
     dry = len(deployments) - len(driven)
     beside = f" Beside them {dry} dry run{'s' * (dry > 1)}." if dry else ""
     return f"Success {rate}. Ended by a fault: {faults}. Missed deadlines: {missed} in {steps} steps.{beside}"
+
+
+def _setup(deployment: Deployment) -> str:
+    return f"{deployment.report.get('robot', '')} with {deployment.report.get('camera', '')}"
+
+
+def _rate(driven: Sequence[Deployment]) -> str:
+    """Success of those that count, and how many do not."""
+    outcomes = [deployment.success for deployment in driven if deployment.success is not None]
+    if not outcomes:
+        return "none was judged"
+    unjudged = len(driven) - len(outcomes)
+    rate = wilson.describe(wilson.success(sum(outcomes), len(outcomes)))
+    return f"{rate}, {unjudged} not judged" if unjudged else rate
 
 
 def _row(deployment: Deployment) -> list[str]:

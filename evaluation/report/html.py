@@ -85,9 +85,9 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], last_bold: bool 
     return f"<div class=wide><table>{head}{''.join(lines)}</table></div>"
 
 
-def numbers(values: Mapping[str, Any]) -> str:
-    """A table of nested numbers: name, value with its unit, what it means."""
-    rows = [(name, text, explain(name)[1]) for name, text in flatten(values)]
+def numbers(values: Mapping[str, Any], stage: str = "") -> str:
+    """A table of nested numbers: name, value with its unit, what it means in `stage`."""
+    rows = [(name, text, explain(f"{stage}.{name}")[1]) for name, text in flatten(values)]
     return table(("Number", "Value", "Meaning"), rows) if rows else ""
 
 

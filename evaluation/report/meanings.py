@@ -68,6 +68,7 @@ MEANINGS: dict[str, Meaning] = {
     "position_error_mm": Meaning("median distance of the perceived grasp from the true one", MM),
     "yaw": Meaning("perception's loss on the object's angle"),
     "held": Meaning("perception's loss on whether the object is in the hand"),
+    "action": Meaning("loss of the actions, through perception"),
     "horizontal_mm": Meaning("median error in the plane", MM),
     "height_mm": Meaning("median error in height", MM),
     "mean_x_mm": Meaning("mean error away from the base", MM),
@@ -82,6 +83,7 @@ MEANINGS: dict[str, Meaning] = {
     "sense_ms": Meaning("reading camera and joints", MS),
     "infer_ms": Meaning("policy network", MS),
     "act_ms": Meaning("safety filter and command", MS),
+    "export.latency_ms": Meaning("one evaluation of the network, on one thread", MS),
     "latency_ms": Meaning("from a frame to the command that it led to", MS),
     "period_ms": Meaning("from one control step to the next", MS),
     "jitter_ms": Meaning("how far a period is off 100 ms", MS),
@@ -92,7 +94,7 @@ MEANINGS: dict[str, Meaning] = {
     "holds": Meaning("control steps in which the arm stood still for want of a frame or a state"),
     "safety": Meaning("commands that the safety filter changed"),
     "commands": Meaning("commands in all"),
-    "action": Meaning("beyond the action's range"),
+    "safety.action": Meaning("beyond the action's range"),
     "joint_position": Meaning("beyond a joint's range"),
     "joint_velocity": Meaning("faster than a joint may turn"),
     "joint_acceleration": Meaning("more sudden than a joint may turn"),
@@ -141,8 +143,12 @@ MEANINGS: dict[str, Meaning] = {
 
 def explain(name: str) -> tuple[str, str]:
     """(unit, meaning) of a number of that name, "deploy.sense_ms.p50" or "loss/v_loss": what its parts say,
-    from left to right, and the unit of the last part that has one. Both empty if no part is known."""
-    known = [MEANINGS[part] for part in re.split(r"[./]", name) if part in MEANINGS]
+    from left to right, and the unit of the last part that has one. Both empty if no part is known. What a
+    part means behind another one ("export.latency_ms") comes first."""
+    parts = re.split(r"[./]", name)
+    names = [(f"{before}.{part}", part) for before, part in zip(["", *parts], parts, strict=False)]
+    found = (next((key for key in keys if key in MEANINGS), None) for keys in names)
+    known = [MEANINGS[key] for key in found if key]
     unit = next((meaning.unit for meaning in reversed(known) if meaning.unit), "")
     return unit, ": ".join(dict.fromkeys(meaning.text for meaning in known))
 

@@ -81,7 +81,7 @@ def _section(stage: Stage, report: Mapping[str, Any], directory: Path) -> list[s
     return [
         heading(stage.name),
         f"<p class=note>{escape(stage.makes)}</p>",
-        numbers({key: value for key, value in metrics.items() if key not in tables}),
+        numbers({key: value for key, value in metrics.items() if key not in tables}, stage.name),
         *(_titled(title, records(rows)) for title, rows in tables.items()),
         *_curves(stage.name, directory),
         *(_titled(path.stem, _picture(path)) for path in sorted((directory / PICTURES).glob("[!.]*"))),

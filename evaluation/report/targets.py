@@ -9,8 +9,8 @@ from evaluation import wilson
 MET, MISSED, NOT_MEASURED = "met", "not met", "not measured"
 PAPER_TEACHER, PAPER_LOWEST_OBJECT, PAPER_STUDENT = 0.954, 0.911, 0.957
 """Success in the paper (arXiv 2511.12912): teacher, the teacher's worst object, student on a real robot."""
-SCORES = ("score", "score_real", "samplers")
-"""Stages that judge themselves: their metrics have `targets` of the same form."""
+SCORES = {"score": "", "score_real": "real depth: ", "samplers": ""}
+"""Stages that judge themselves (their metrics have `targets` of the same form) and what tells them apart."""
 
 Target = dict[str, str]
 """`target`, `measured` and `met`: MET, MISSED or NOT_MEASURED."""
@@ -26,7 +26,11 @@ def targets(report: Mapping[str, Any]) -> list[Target]:
         _rate(f"teacher succeeds in {PAPER_TEACHER:.1%} (paper)", teacher.get("success"), PAPER_TEACHER),
         _rate(f"teacher with its worst object in {PAPER_LOWEST_OBJECT:.1%} (paper)", lowest,
               PAPER_LOWEST_OBJECT),
-        *(target for stage in SCORES for target in report.get(stage, {}).get("targets", ())),
+        *(
+            target | {"target": of + target["target"]}
+            for stage, of in SCORES.items()
+            for target in report.get(stage, {}).get("targets", ())
+        ),
         _largest("ONNX file computes what JAX does, to", report.get("export", {}).get("max_abs_diff"),
                  report["config"].get("export", {}).get("max_abs_diff", 0.0)),
         _rate(f"exported student succeeds in {PAPER_STUDENT:.1%} on the rig (paper: a real robot)", rig,

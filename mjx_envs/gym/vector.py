@@ -110,8 +110,10 @@ class PickVectorEnv(VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """N pictures (H, W, 3), as `PickEnv.render`; None without a render mode."""
-        if self.render_mode != "rgb_array" or self._scenes is None:
+        if self.render_mode != "rgb_array":
             return None
+        if self._scenes is None:
+            raise error.ResetNeeded("call reset() before render()")
         return tuple(self._simulator.rgb(self._scenes))
 
     def _begin_anew(self, scenes: Scenes, which: Bool[np.ndarray, " n"]) -> Scenes:
