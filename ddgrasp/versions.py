@@ -7,7 +7,8 @@ import platform
 import subprocess
 from pathlib import Path
 
-_ROOT = Path(__file__).parents[1]
+from ddgrasp.shipped import PRETRAINED
+
 _LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "onnxruntime", "numpy")
 
 
@@ -29,7 +30,7 @@ def project_version() -> str:
 
 
 @functools.cache
-def commit(root: Path = _ROOT) -> str:
+def commit(root: Path = PRETRAINED.parent) -> str:
     """Commit of the clone `root` with "-dirty" if tracked files differ from it; "" where nothing says.
 
     An installed version says less: it is of the day of installation, whatever was pulled since.
