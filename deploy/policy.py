@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32
 
 from ddgrasp import artifacts, contract
 from ddgrasp import policy_metadata as metadata
+from ddgrasp.depth import to_metres
 from ddgrasp.errors import UserError
 from ddgrasp.gripper import ClosingLatch, WidthChange
 from ddgrasp.onnx_runtime import ort
@@ -42,6 +43,7 @@ DEPTH_INPUTS = {
     "float32_m": DepthInput(np.dtype(np.float32), "tensor(float)", "m", 1.0),
 }
 """For every one of `metadata.DEPTH_DTYPES`."""
+_UNITS = {kind.dtype.kind: kind for kind in DEPTH_INPUTS.values()}
 
 
 class OnnxPolicy:
@@ -109,7 +111,7 @@ class OnnxPolicy:
     def check_fit(self, depth: np.ndarray) -> str:
         """Why a camera that gives `depth` cannot be used with this file, empty if it can."""
         wanted = self.depth_input.dtype
-        if depth.dtype != wanted:
+        if depth.dtype not in (wanted, np.uint16):  # millimetres, of which metres are made
             return f"wrong depth: type {depth.dtype}, the policy takes {wanted} ({self.info.depth_dtype})"
         if depth.shape != self.depth_shape:
             return f"wrong depth: size {depth.shape}, the policy takes {self.depth_shape}"
@@ -120,10 +122,10 @@ class OnnxPolicy:
         valid = depth[depth > 0]
         if not valid.size:
             return ""
-        median = float(np.median(valid))
-        if PLAUSIBLE_MEDIAN_M[0] <= median * self.depth_input.unit_m <= PLAUSIBLE_MEDIAN_M[1]:
+        median, given = float(np.median(valid)), _UNITS[valid.dtype.kind]
+        if PLAUSIBLE_MEDIAN_M[0] <= median * given.unit_m <= PLAUSIBLE_MEDIAN_M[1]:
             return ""
-        return f"wrong depth: median {median:g} cannot be {self.depth_input.unit}"
+        return f"wrong depth: median {median:g} cannot be {given.unit}"
 
     def check_frame(self, depth: np.ndarray) -> str:
         """Why this one frame cannot be used, empty if it can: type, size, finiteness, valid pixels."""
@@ -148,7 +150,10 @@ class OnnxPolicy:
         """
         if problem := self.check_fit(depth) or _wrong_state(state):
             raise UserError(f"{problem}.")
-        depth = depth.copy()  # cameras fill their buffers again
+        if depth.dtype == self.depth_input.dtype:
+            depth = depth.copy()  # cameras fill their buffers again
+        else:
+            depth = to_metres(depth)
         self._frames.append(depth)
         while len(self._frames) < contract.DEPTH_FRAMES:
             self._frames.append(depth)

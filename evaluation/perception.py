@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt16
 
 from ddgrasp import artifacts
 from ddgrasp.config import Config
+from ddgrasp.depth import to_millimetres
 from ddgrasp.errors import UserError
 from ddgrasp.layout import OBSERVATION
 from ddgrasp.progress import Progress
@@ -73,7 +74,7 @@ def measure(config: Config, run_dir: Path, series: Series, progress: Progress) -
 
 
 def _keep(seen: Seen, depth: np.ndarray, state: np.ndarray, observation: np.ndarray) -> None:
-    seen.depth.append(depth)
+    seen.depth.append(depth if depth.dtype == np.uint16 else to_millimetres(depth))
     seen.state.append(state)
     seen.observation.append(observation)
 

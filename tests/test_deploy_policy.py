@@ -125,6 +125,20 @@ def test_metres_go_in_as_metres(tmp_path):
     assert policy.act(depth, STATE)[2] == pytest.approx(0.75)
 
 
+def test_cameras_millimetres_are_made_metres_for_a_file_that_takes_those(tmp_path):
+    path = write_policy(tmp_path / "p.onnx", describe("float32_m"), depth_gain=frames_weighted())
+    in_metres, in_millimetres = OnnxPolicy(path), OnnxPolicy(path)
+    depth = depth_mm(750)
+    assert in_millimetres.check_frame(depth) == in_millimetres.check_unit(depth) == ""
+    given: list[np.ndarray] = []
+    in_millimetres.watch = lambda frames, state: given.append(frames)
+    np.testing.assert_array_equal(
+        in_millimetres.act(depth, STATE), in_metres.act(depth * np.float32(0.001), STATE)
+    )
+    assert given[0].dtype == np.float32 and given[0].max() == pytest.approx(0.75)
+    assert "median 1 cannot be mm" in in_millimetres.check_unit(np.ones(SHAPE, np.uint16))
+
+
 @pytest.mark.parametrize(
     ("depth", "problem"),
     [

@@ -23,14 +23,8 @@ one is another camera, or another mode."""
 
 
 def make(setup: Setup, robot: Robot) -> "RealSenseCamera":
-    """At the policy's picture size; UserError for a policy that takes no millimetres."""
-    info = setup.info
-    if info.depth_dtype != "uint16_mm":
-        raise UserError(
-            f"camera 'realsense' gives uint16 millimetres, the policy takes {info.depth_dtype}: export it "
-            "with export.depth_dtype uint16_mm."
-        )
-    profile = contract.D455.scaled(info.depth_width / contract.D455.width_px)
+    """At the policy's picture size."""
+    profile = contract.D455.scaled(setup.info.depth_width / contract.D455.width_px)
     return RealSenseCamera(setup.clock, profile, serial=setup.config.deploy.realsense.serial)
 
 
