@@ -48,7 +48,8 @@ class Series:
     rig: RigName = "fr3"
     """fr3 (the test rig: another arm, mesh objects, a D455 as it is run) or development."""
     objects: tuple[str, ...] = (EVERYTHING,)
-    """Names, or all: the twelve of training and, in other shapes, the six that no list of training has."""
+    """Names, or all: the paper's twelve, and on rig fr3 the six that no list of training has. The development
+    rig has every object and shape of `ddgrasp objects list` besides."""
     trials: int = 10
     """How many with every object."""
     split: seeds.Split = "development"
@@ -84,7 +85,7 @@ class Series:
         known = self.known()
         if len(self.objects) > 1 and EVERYTHING in self.objects:
             raise UserError(f"--objects {EVERYTHING} names every object: drop the others, or {EVERYTHING}.")
-        names = known if self.objects == (EVERYTHING,) else self.objects
+        names = self.at_hand() if self.objects == (EVERYTHING,) else self.objects
         for name in names:
             if name not in known:
                 raise unknown_name("object", name, (*known, EVERYTHING))
@@ -102,7 +103,7 @@ class Series:
         """`config` with the trials' length, seed, objects and the arm's limits. UserError if `policy` is no
         policy that can be run, or a limit not one that an arm has."""
         OnnxPolicy(policy, noise=config.deploy.noise, execute_steps=config.deploy.execute_steps or None)
-        world = replace(config.world, objects=_listed())
+        world = replace(config.world, objects=self.at_hand() if self.rig == "development" else _listed())
         deploy = config.deploy if self.retry is None else replace(config.deploy, retry=self.retry)
         if self.contact is not None:
             deploy = stopping_at(deploy, self.contact)
@@ -121,12 +122,24 @@ class Series:
         return partial(Rig, change=change, treatment=treatment)
 
     def known(self) -> tuple[str, ...]:
-        """Every object that the rig has."""
-        if self.rig == "development" or self.shapes == "primitive":
+        """Every object that the rig may have, the paper's first; a trial's number counts in this order."""
+        if self.rig == "development":
+            from mjx_envs.objects import OBJECTS, SHAPES
+
+            return tuple(dict.fromkeys((*_listed(), *SHAPES, *OBJECTS)))
+        if self.shapes == "primitive":
             return _listed()
         from rig.meshes.objects import MESH_OBJECTS
 
         return (*_listed(), *(name for name in MESH_OBJECTS if name not in _listed()))
+
+    def at_hand(self) -> tuple[str, ...]:
+        """The objects that the rig has in these trials: on the development rig, whose scene grows with them,
+        the paper's and what is asked for besides."""
+        if self.rig != "development":
+            return self.known()
+        asked = [name for name in self.known() if name in self.objects]
+        return tuple(dict.fromkeys((*_listed(), *asked)))
 
 
 def run(

@@ -150,9 +150,15 @@ def test_a_name_that_is_no_utf_8_is_refused_in_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("command", "expected"),
     [
-        ("play --objects tower", "object 'tower' is a plain shape, for training only (--world.objects): ch"),
-        ("study causes --policy x --objects apple ring", "object 'ring' is a plain shape, for training"),
-        ("deploy trials --policy x --objects puck", "object 'puck' is a plain shape, for training only"),
+        ("play --rig fr3 --objects tower", "object 'tower' is a plain shape, which the development rig"),
+        (
+            "study causes --policy x --objects apple ring",
+            "object 'ring' is a plain shape, which the dev",
+        ),
+        (
+            "deploy trials --policy x --rig fr3 --objects puck",
+            "object 'puck' is a plain shape, which the dev",
+        ),
         ("play aple --objects aple", "'aple' stands without an option"),
         ("play apple", "'apple' stands without an option: objects are given by --objects apple."),
         ("play apple can --trials 2", "objects are given by --objects apple can."),

@@ -24,6 +24,7 @@ from evaluation.report import trials_page
 from evaluation.rig_trials import Series, differing
 from evaluation.table2.rows import ROWS
 from foundation import store
+from mjx_envs.objects import OBJECTS
 from sensors.inpainting import inpainted
 from weights_support import depth_anything_v2_small
 
@@ -37,6 +38,20 @@ QUIET = Progress(quiet=True)
 def policy(tmp_path) -> Path:
     info = describe(depth_height=PROFILE.height_px, depth_width=PROFILE.width_px)
     return write_policy(tmp_path / "policy.onnx", info, bias=constant_bias(0.0))
+
+
+def test_what_a_policy_was_trained_on_besides_the_papers_objects_can_be_tried(policy, tmp_path, monkeypatch):
+    everything = Series("development", trials=2)
+    assert len(everything.plan()) == 12 * 2
+    assert everything.configured(CONFIG, policy).world.objects == everything.names()
+    monkeypatch.setitem(OBJECTS, "mine", replace(OBJECTS["cube"], name="mine", category_id=99))
+    series = replace(everything, objects=("stick", "mine", "cube"), seconds=0.3, trials=1)
+    first = {trial.object_name: trial.index for trial in series.plan()}
+    assert first["cube"] == everything.trial("cube", 0).index and len(set(first.values())) == 3
+    assert min(first["stick"], first["mine"]) >= 12 * 1000
+    assert series.configured(CONFIG, policy).world.objects == (*everything.names(), "stick", "mine")
+    table = rig_trials.run(CONFIG, policy, series, tmp_path / "out", 0, QUIET)
+    assert list(table["objects"]) == ["stick", "mine", "cube"] and table["other"]["n"] == 2
 
 
 @pytest.fixture

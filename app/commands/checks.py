@@ -79,12 +79,12 @@ def check_objects(world: WorldConfig) -> None:
 
 
 def check_tried(series: "Series") -> None:
-    """UserError for a plain shape among the objects of `series`: students train on them, no rig has one."""
+    """UserError for a plain shape among the objects of `series` where its rig, the FR3's, has none."""
     from mjx_envs.objects import SHAPES
 
     if shapes := [name for name in series.objects if name in SHAPES.keys() - series.known()]:
         raise UserError(
-            f"object {shapes[0]!r} is a plain shape, for training only (--world.objects): choose one of "
+            f"object {shapes[0]!r} is a plain shape, which the development rig alone has: choose one of "
             f"{', '.join(series.known())}."
         )
 

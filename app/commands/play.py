@@ -151,7 +151,7 @@ class Play:
                     controls.wait(viewer.watched)
                     continue
                 series = rigs.series(rig := controls.rig)
-                if name in series.known():
+                if name in series.at_hand():
                     _watched(rigs.bench(rig), series.trial(name, tried[rig, name]), viewer, controls)
                     tried[rig, name] += 1
 
@@ -191,7 +191,7 @@ def _objects_by_rig(series: "Series", choice: bool) -> dict[str, tuple[str, ...]
     The FR3's meshes take a second to import, in which trimesh loses a Ctrl-C.
     """
     others = {"development", "fr3"} - {series.rig} if choice and not lacks_fr3() else set()
-    return {rig: replace(series, rig=rig).known() for rig in (series.rig, *others)}
+    return {rig: replace(series, rig=rig).at_hand() for rig in (series.rig, *others)}
 
 
 class _ChosenNoise:

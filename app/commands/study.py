@@ -144,8 +144,9 @@ class StudyCauses:
         rows = causes.chosen(self.rows)
         series = Series("development", self.objects, self.trials, "development", self.number)
         series = replace(series, seconds=self.seconds)
-        check_tried(series)
         series.names()
+        check_tried(there := replace(series, rig="fr3"))  # whose rows they are tried in as well
+        there.names()
         check_folder("--out", self.out)
         made = causes.run(
             config_of(self.policy, self.preset), self.policy, rows, series, self.out, self.workers
