@@ -77,6 +77,7 @@ def make(
     inputs: Mapping[str, Any] | None = None,
     quiet: bool = False,
     leads: bool = True,
+    same_start: bool = False,
 ) -> Artifact:
     """Makes the stage in `run_dir / stage.name`, or returns the finished one if `resume` is on.
 
@@ -85,6 +86,7 @@ def make(
     Args:
       parents: what it is made from; by default the finished stages in `run_dir` that its row names.
       inputs: material from outside the run (`Job.inputs`). An attempt with other inputs is not continued.
+      same_start: whether a finished stage must have begun with the checkpoint that is there now.
       leads: off in all but the first of several processes that make the stage together: they keep quiet and
         write nothing.
     """
@@ -96,6 +98,8 @@ def make(
         _refuse_occupied(run_dir, [stage.name])
     progress = Progress(directory if leads else None, stage.name, quiet=quiet or not leads)
     job = Job(stage, config, directory, progress, parents, inputs or {})
+    if same_start and artifacts.is_finished(directory):
+        artifacts.check_inputs(directory, job.identity())
     artifact = _finished(job) or _made(job, leads)
     _check_parents(artifact, parents)
     return artifact

@@ -107,7 +107,9 @@ def _student(study: Study, row: Row, common: Mapping[str, Artifact]) -> Artifact
         parents["ddg"] = pipeline.make(
             get_stage("ddg"), config, study.out / PAPER, resume=True, parents=recordings
         )
-    pipeline.make(get_stage("student"), config, folder, resume=True, parents=parents)
+    # What the rows begin with must be one, or their students differ in more than the depth.
+    student = get_stage("student")
+    pipeline.make(student, config, folder, resume=True, parents=parents, same_start=True)
     return pipeline.make(get_stage("export"), config, folder, resume=True)
 
 

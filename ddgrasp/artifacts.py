@@ -25,6 +25,8 @@ from ddgrasp.versions import library_versions
 
 MANIFEST = "manifest.json"
 STARTED = "started.json"
+START = "start"
+"""Among a stage's inputs the checkpoint that it began with; notes of before 2026-11-29 do not have it."""
 
 _INDIFFERENT = {
     "export.max_abs_diff": ExportConfig.max_abs_diff,
@@ -245,7 +247,8 @@ def begin(
             else:
                 litter.unlink(missing_ok=True)
     if (started := _check_begun(Path(directory), stage, config)) is not None:
-        _check_same_inputs(directory, started["inputs"], inputs, "begun")
+        earlier = {START: inputs[START]} if START in inputs else {}
+        _check_same_inputs(directory, earlier | started["inputs"], inputs, "begun")
     elif write:
         value = {
             upgrades.VERSION_FIELD: upgrades.VERSION,

@@ -1,5 +1,6 @@
 """What a stage is given to do: the one argument of every stage's `run`."""
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +10,8 @@ from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
-from ddgrasp.stages import Stage
+from ddgrasp.shipped import holding
+from ddgrasp.stages import CHECKPOINTS, Stage
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,19 @@ class Job:
     def identity(self) -> dict[str, str]:
         """What the stage is made from, as text: an attempt with other material is not continued."""
         given = {name: str(v.resolve() if isinstance(v, Path) else v) for name, v in self.inputs.items()}
-        return {name: parent.hash for name, parent in self.parents.items()} | given
+        return {name: parent.hash for name, parent in self.parents.items()} | given | self._start()
+
+    def _start(self) -> dict[str, str]:
+        """The checkpoint that the stage begins with, by its content: its folder may be filled anew."""
+        name = self.stage.name
+        if name not in CHECKPOINTS:
+            return {}
+        section = getattr(self.config, name)
+        named = section.init_from if name != "teacher" else section.start if section.starts_from_file else ""
+        found = holding(named, CHECKPOINTS[name], name) if named else None
+        if found is None:
+            return {}
+        return {artifacts.START: hashlib.sha256((found / CHECKPOINTS[name]).read_bytes()).hexdigest()[:16]}
 
     def finish(self, metrics: Mapping[str, Any], *, origin: str = "trained") -> Artifact:
         """Writes the manifest, the last file of the stage; `metrics` go to report.json (a success rate as

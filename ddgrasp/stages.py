@@ -67,6 +67,10 @@ ON_REQUEST = (
 )  # fmt: skip
 """Stages with a command of their own (`ddgrasp ddg generate`, `score`, `curve`, `samplers`)."""
 
+CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
+"""File that a folder a stage starts from must hold, itself or in a folder named after the stage. Named here
+too, since the stages' own modules import JAX."""
+
 _BY_NAME = {stage.name: stage for stage in (*STAGES, *ON_REQUEST)}
 
 

@@ -17,7 +17,7 @@ import pytest
 from app import commands
 from app.cli import main
 from app.commands import COMMANDS, parse
-from app.commands.checks import CHECKPOINTS, check_config_values, check_networks, stage_folder
+from app.commands.checks import check_config_values, check_networks, stage_folder
 from app.commands.parsing import HELP_ALL
 from ddgrasp import artifacts
 from ddgrasp.config import CAMERAS
@@ -25,6 +25,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.install import pip_install
 from ddgrasp.presets import PRESETS
+from ddgrasp.stages import CHECKPOINTS
 
 ROOT = Path(__file__).parents[1]
 

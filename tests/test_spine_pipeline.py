@@ -151,6 +151,35 @@ def test_a_finished_stage_of_other_material_is_not_taken_for_this_one_s(stages, 
     assert make("moved") == make("b")  # what is finished does not need it any more
 
 
+def test_what_a_stage_begins_with_is_known_by_its_content(stages, tmp_path):
+    run, start = tmp_path / "run", tmp_path / "start" / "policy.msgpack"
+    start.parent.mkdir()
+    start.write_bytes(b"first")
+    teacher = dataclasses.replace(CONFIG.teacher, start=str(start.parent))
+    config = dataclasses.replace(CONFIG, teacher=teacher)
+
+    def made(**options):
+        return pipeline.make(stages[0], config, run, resume=True, quiet=True, **options)
+
+    run.mkdir()
+    (run / "fail_teacher").touch()
+    with pytest.raises(OSError, match="No space"):
+        made()
+    (run / "teacher" / "work").touch()  # what an attempt leaves
+    (run / "fail_teacher").unlink()
+    start.write_bytes(b"second")
+    with pytest.raises(UserError, match="was begun with other inputs: start is '"):
+        made()
+    start.write_bytes(b"first")
+    made()
+    start.write_bytes(b"second")
+    made()  # what is finished does not need it
+    with pytest.raises(UserError, match="was made with other inputs: start is '"):
+        made(same_start=True)
+    start.unlink()
+    made(same_start=True)
+
+
 def test_a_child_of_a_replaced_parent_is_refused(stages, tmp_path):
     run_dir = tmp_path / "run"
     _run(stages, run_dir)

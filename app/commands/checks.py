@@ -19,13 +19,10 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import TEMPORARY
 from ddgrasp.learnable import check_learnable
 from ddgrasp.shipped import PRETRAINED, holding, shipped
+from ddgrasp.stages import CHECKPOINTS
 
 if TYPE_CHECKING:
     from evaluation.rig_trials import Series
-
-CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": "params.msgpack"}
-"""File that a folder a stage starts from must hold, itself or in a folder named after the stage. Named here
-too, since the stages' own modules import JAX."""
 
 
 def check_options(command: Any) -> None:
