@@ -229,7 +229,8 @@ class DaggerConfig(Section, name="student.dagger"):
     steps: StepsOrNone = 600
     """Optimiser steps after each round, on all frames so far."""
     teacher_share: Share = 0.3
-    """Share of the first round's actions that the teacher takes; falls linearly to none."""
+    """Share of the first round's actions that the teacher takes; falls linearly to none in the last one, if
+    there are several."""
 
 
 @dataclass(frozen=True)
