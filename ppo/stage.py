@@ -2,10 +2,13 @@
 
 import shutil
 
+import jax
+
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.files import atomic_path
+from ddgrasp.install import pip_install
 from ddgrasp.job import Job
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
@@ -38,6 +41,8 @@ def run(job: Job) -> Artifact:
     path = directory / teacher_policy.PARAMS_FILE
     hosts.wait_for_all("teacher begins")
     if not _loads(config):
+        if slow := slow_engine(config, jax.default_backend()):
+            job.progress.note(slow)
         train(config, directory, job.progress)
     elif hosts.leads():
         with atomic_path(path) as temporary:
@@ -49,6 +54,16 @@ def run(job: Job) -> Artifact:
         job.finish(metrics, origin="loaded" if _loads(config) else "trained")
     hosts.wait_for_all("teacher is finished")
     return artifacts.read_artifact(directory)
+
+
+def slow_engine(config: Config, platform: str) -> str:
+    """What to say of MJX-JAX where JAX's `platform` is a CPU, as it is where a GPU's JAX is not installed."""
+    if config.world.backend != "jax" or platform != "cpu":
+        return ""
+    return (
+        f"JAX has no accelerator here: MJX steps {config.teacher.num_envs} environments on this machine's "
+        f"cores. {pip_install('cuda')} is for an NVIDIA GPU; --world.backend cpu is many times faster here."
+    )
 
 
 def _loads(config: Config) -> bool:

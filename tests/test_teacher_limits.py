@@ -12,6 +12,7 @@ from config_support import unchecked
 from ddgrasp.config import Config, EvalConfig, RewardConfig, TeacherConfig, WorldConfig
 from ddgrasp.errors import UserError
 from ddgrasp.learnable import check_learnable
+from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
 from learning.checkpoints import Checkpoints
 from mjx_envs.grasp_env import AutoReset, GraspEnv
@@ -36,6 +37,14 @@ def test_the_guide_acts_first_and_not_at_last_unless_there_is_one_round():
     assert [[guide_share(i, rounds) for i in range(rounds)] for rounds in (1, 2, 4)] == [
         [1.0], [1.0, 0.0], [1.0, 0.5, 0.25, 0.0],
     ]  # fmt: skip
+
+
+def test_mjx_on_cores_says_how_it_gets_a_gpu():
+    paper, laptop = PRESETS["paper"], PRESETS["laptop"]
+    assert paper.world.backend == "jax"
+    told = stage.slow_engine(paper, "cpu")
+    assert "MJX steps 8192 environments" in told and "[cuda]" in told and "--world.backend cpu" in told
+    assert stage.slow_engine(paper, "gpu") == stage.slow_engine(laptop, "cpu") == ""
 
 
 def test_an_absurd_learning_rate_stops_before_the_broken_state_is_saved(tmp_path):
