@@ -28,6 +28,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
 from ddgrasp.stages import STAGES, Stage
+from ddgrasp.versions import commit
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
 _REPEAT_S = 0.5
@@ -77,7 +78,6 @@ def make(
     inputs: Mapping[str, Any] | None = None,
     quiet: bool = False,
     leads: bool = True,
-    same_start: bool = False,
 ) -> Artifact:
     """Makes the stage in `run_dir / stage.name`, or returns the finished one if `resume` is on.
 
@@ -86,7 +86,6 @@ def make(
     Args:
       parents: what it is made from; by default the finished stages in `run_dir` that its row names.
       inputs: material from outside the run (`Job.inputs`). An attempt with other inputs is not continued.
-      same_start: whether a finished stage must have begun with the checkpoint that is there now.
       leads: off in all but the first of several processes that make the stage together: they keep quiet and
         write nothing.
     """
@@ -98,8 +97,6 @@ def make(
         _refuse_occupied(run_dir, [stage.name])
     progress = Progress(directory if leads else None, stage.name, quiet=quiet or not leads)
     job = Job(stage, config, directory, progress, parents, inputs or {})
-    if same_start and artifacts.is_finished(directory):
-        artifacts.check_inputs(directory, job.identity())
     artifact = _finished(job) or _made(job, leads)
     _check_parents(artifact, parents)
     return artifact
@@ -124,6 +121,7 @@ def _made(job: Job, leads: bool) -> Artifact:
 
 def _work(job: Job, leads: bool) -> Artifact:
     progress = job.progress
+    commit()  # of the code that runs, which hours later may be another's
     progress.note(f"-> {job.directory}: {job.stage.makes}")
     artifacts.begin(job.directory, job.stage.name, job.config, job.identity(), write=leads)
     with _interruptible(job.stage.name):

@@ -15,6 +15,7 @@ from ddgrasp import artifacts, machine
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text, read_json, to_json
+from ddgrasp.job import start_of
 from ddgrasp.progress import Progress
 from ddgrasp.stages import get_stage
 from ddgrasp.versions import library_versions
@@ -61,9 +62,13 @@ def check_shared(config: Config, out: Path, resume: bool) -> None:
 
 
 def check_place(study: Study, resume: bool) -> None:
-    """Marks the folder as this study's. UserError if it holds one and `resume` is off, another one, or trials
-    of a row that were begun otherwise."""
+    """Marks the folder as this study's. UserError if it holds one and `resume` is off, another one, a student
+    that began with another checkpoint than is there now, or trials of a row that were begun otherwise."""
     check_shared(study.config, study.out, resume)
+    start = start_of(study.config, "student")
+    for made in sorted((study.out / STUDENTS).glob("*/student")):
+        if artifacts.is_finished(made):  # else rows differ in more than the depth
+            artifacts.check_start(made, start)
     pipeline.create(study.out)
     artifacts.begin(study.out, LAST_STAGE, study.config)
     for name in study.rows:
@@ -107,9 +112,7 @@ def _student(study: Study, row: Row, common: Mapping[str, Artifact]) -> Artifact
         parents["ddg"] = pipeline.make(
             get_stage("ddg"), config, study.out / PAPER, resume=True, parents=recordings
         )
-    # What the rows begin with must be one, or their students differ in more than the depth.
-    student = get_stage("student")
-    pipeline.make(student, config, folder, resume=True, parents=parents, same_start=True)
+    pipeline.make(get_stage("student"), config, folder, resume=True, parents=parents)
     return pipeline.make(get_stage("export"), config, folder, resume=True)
 
 

@@ -307,6 +307,14 @@ def check_inputs(directory: Path | str, inputs: Mapping[str, str]) -> None:
     _check_same_inputs(directory, there, {name: inputs[name] for name in there}, "made")
 
 
+def check_start(directory: Path | str, start: Mapping[str, str]) -> None:
+    """UserError if the finished stage in `directory` noted another `START` than `start`, if that has one."""
+    path = Path(directory) / STARTED
+    noted = _read_started(path)["inputs"] if path.exists() else {}
+    if START in noted and START in start:
+        _check_same_inputs(directory, {START: noted[START]}, {START: start[START]}, "made")
+
+
 def _check_same_inputs(
     directory: Path | str, there: Mapping[str, str], here: Mapping[str, str], how: str
 ) -> None:

@@ -36,19 +36,11 @@ class Job:
     def identity(self) -> dict[str, str]:
         """What the stage is made from, as text: an attempt with other material is not continued."""
         given = {name: str(v.resolve() if isinstance(v, Path) else v) for name, v in self.inputs.items()}
-        return {name: parent.hash for name, parent in self.parents.items()} | given | self._start()
-
-    def _start(self) -> dict[str, str]:
-        """The checkpoint that the stage begins with, by its content: its folder may be filled anew."""
-        name = self.stage.name
-        if name not in CHECKPOINTS:
-            return {}
-        section = getattr(self.config, name)
-        named = section.init_from if name != "teacher" else section.start if section.starts_from_file else ""
-        found = holding(named, CHECKPOINTS[name], name) if named else None
-        if found is None:
-            return {}
-        return {artifacts.START: hashlib.sha256((found / CHECKPOINTS[name]).read_bytes()).hexdigest()[:16]}
+        return (
+            {name: parent.hash for name, parent in self.parents.items()}
+            | given
+            | start_of(self.config, self.stage.name)
+        )
 
     def finish(self, metrics: Mapping[str, Any], *, origin: str = "trained") -> Artifact:
         """Writes the manifest, the last file of the stage; `metrics` go to report.json (a success rate as
@@ -57,3 +49,16 @@ class Job:
             self.directory, self.stage.name, self.config, seconds=self.progress.seconds, metrics=metrics,
             parents=self.parents.values(), origin=origin,
         )  # fmt: skip
+
+
+def start_of(config: Config, stage: str) -> dict[str, str]:
+    """The checkpoint that `stage` begins with, by its content, since its folder may be filled anew; nothing if
+    it begins with none, or none is there any more."""
+    if stage not in CHECKPOINTS:
+        return {}
+    section = getattr(config, stage)
+    named = section.init_from if stage != "teacher" else section.start if section.starts_from_file else ""
+    found = holding(named, CHECKPOINTS[stage], stage) if named else None
+    if found is None:
+        return {}
+    return {artifacts.START: hashlib.sha256((found / CHECKPOINTS[stage]).read_bytes()).hexdigest()[:16]}

@@ -4,15 +4,17 @@ What was made by such a one is read as ever, so that these are no checks of the 
 """
 
 from ddgrasp import contract
-from ddgrasp.config import Config, StudentConfig, TeacherConfig
+from ddgrasp.config import Config, DDGDiffusionConfig, StudentConfig, TeacherConfig
 from ddgrasp.errors import UserError
 
 
 def check_learnable(config: Config) -> None:
-    """UserError for settings with which teacher or student would learn nothing, or act before they have."""
+    """UserError for settings with which teacher, generator or student would learn nothing of use, or act
+    before they have."""
     if config.scale == 1:  # a trial run has too few iterations for anything
         _check_actor(config.teacher)
         _check_time(config)
+    _check_noise(config.ddg.diffusion)
     _check_losses(config.student)
     _check_head(config.student)
     _check_sight(config.student)
@@ -38,6 +40,15 @@ def _check_time(config: Config) -> None:
         raise UserError(
             f"world.episode_steps is {config.world.episode_steps}; success is an object held for the last "
             f"{contract.HOLD_STEPS}, and would never be seen: take more."
+        )
+
+
+def _check_noise(diffusion: DDGDiffusionConfig) -> None:
+    if diffusion.log_snr_shift > (most := diffusion.noisy_up_to):
+        raise diffusion.error(
+            "log_snr_shift",
+            f"at most {most:.1f} with {diffusion.steps} steps of schedule {diffusion.schedule}: the last one "
+            "would not be noise, which sampling begins with",
         )
 
 

@@ -15,6 +15,11 @@ def ended_late() -> bool:
     return bool(_late)
 
 
+def note(number: int) -> None:
+    """A signal that ended what could be ended."""
+    _late.append(number)
+
+
 def terminable() -> AbstractContextManager[None]:
     """The first SIGTERM, Ctrl-C or hang-up is KeyboardInterrupt; a second one does not cut stopping short."""
     _late.clear()
@@ -30,7 +35,7 @@ def terminable() -> AbstractContextManager[None]:
 def unbroken() -> AbstractContextManager[None]:
     """Ctrl-C, SIGTERM and hang-ups change `ended_late` alone: what ends anyway, as stopping an arm, comes to
     its end."""
-    return _handled_by(lambda signum, frame: _late.append(signum))
+    return _handled_by(lambda signum, frame: note(signum))
 
 
 def _ending() -> list[signal.Signals]:
@@ -40,7 +45,7 @@ def _ending() -> list[signal.Signals]:
 
 
 @contextmanager
-def _handled_by(handler: Callable[[int, Any], Any] | signal.Handlers) -> Iterator[None]:
+def _handled_by(handler: Callable[[int, Any], Any]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # signals are someone else's
         yield
         return

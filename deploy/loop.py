@@ -33,6 +33,9 @@ class LoopSettings:
     """A frame older than this many periods is stale."""
     retry: bool = False
     """Whether a hand that stands still, or has closed on nothing, tries again (`deploy.retry`)."""
+    by_time: bool = False
+    """Whether deadlines that were missed count as steps where the number of those is bounded: an arm moves no
+    longer on a slow machine."""
 
 
 @dataclass(frozen=True)
@@ -188,6 +191,8 @@ class ControlLoop:
                 done = bool(on_step(step)) or done
             self._report.clock_s, self._report.machine_s = self._now_s(), time.monotonic() - started
             deadline = self._next_deadline(deadline)
+            late = self._settings.by_time and max_steps is not None
+            done = done or (late and self._report.periods >= max_steps)
         self._clock.sleep_until(deadline)
         self._look_at_hand()
 

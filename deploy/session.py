@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -22,8 +23,8 @@ from deploy.devices.options import RIG_CAMERAS, RIG_HOST, SessionOptions, Setup
 from deploy.devices.registry import check_devices, make_devices
 from deploy.dry_run import DryRun
 from deploy.interfaces import Camera, Clock, KnowsObject, Robot, TimedRobot
-from deploy.interrupts import terminable, unbroken
-from deploy.loop import ControlLoop, LoopReport, Step
+from deploy.interrupts import note, terminable, unbroken
+from deploy.loop import ControlLoop, LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.record import ENDED, REPORT_FILE, DeploymentRecord, verdict
 from deploy.setup import check_start, loop_settings, safety_filter, space_notice, speed_notice
@@ -77,7 +78,7 @@ def _run(
         if notice := speed_notice(config.deploy, policy.info):
             say(notice)
     driven = DryRun(robot, say) if options.dry_run else robot
-    settings = loop_settings(config.deploy, policy.info, moves=not options.dry_run)
+    settings = loop_settings(config.deploy, policy.info, moves=not options.dry_run, by_time=options.real)
     loop = ControlLoop(camera, driven, policy, safety, clock, settings, say)
     steps = round(options.seconds * policy.info.control_hz) if math.isfinite(options.seconds) else None
     folder = _new_folder(options.out)
@@ -87,14 +88,9 @@ def _run(
     name = options.object_name or (config.world.objects[0] if options.camera == "stereo" else "")
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
     ending = contextlib.ExitStack()
-
-    def look(step: Step) -> bool:
-        kept.look(step)
-        return steps is not None and loop.report.periods >= steps  # a slow step takes time all the same
-
     try:
         with kept.into(folder):
-            report = loop.run(steps, look)
+            report = loop.run(steps, kept.look)
             # Before the last frames are on the disk: the simulated arm's world goes on meanwhile.
             unattended = options.yes or report.interrupted or bool(report.fault)
             finished = not (options.dry_run or report.interrupted)
@@ -150,7 +146,10 @@ def ask_success(question: str) -> bool | None:
         return None
     try:
         answer = _typed(f"{question} [y/n, or Enter for no answer] ")
-    except (EOFError, KeyboardInterrupt):  # whoever leaves here still wants the report
+    except EOFError:
+        return None
+    except KeyboardInterrupt:  # whoever leaves here still wants the report
+        note(signal.SIGINT)
         return None
     return {"y": True, "yes": True, "n": False, "no": False}.get(answer)
 

@@ -17,10 +17,12 @@ JOINT_MARGIN_RAD = 0.02
 the control unit stops an arm that asks for more than its range."""
 
 
-def loop_settings(config: DeployConfig, info: PolicyMetadata, moves: bool = True) -> LoopSettings:
+def loop_settings(
+    config: DeployConfig, info: PolicyMetadata, moves: bool = True, by_time: bool = False
+) -> LoopSettings:
     """The policy's own rate, the configured patience, whether a hand tries again: one that is not moved
     stands still and stays shut whatever it is told, and would try again for ever."""
-    return LoopSettings(1.0 / info.control_hz, config.stale_periods, config.retry and moves)
+    return LoopSettings(1.0 / info.control_hz, config.stale_periods, config.retry and moves, by_time)
 
 
 def safety_filter(config: DeployConfig, info: PolicyMetadata, robot: str = SIMULATION) -> SafetyFilter:

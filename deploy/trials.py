@@ -2,6 +2,7 @@
 
 import atexit
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -249,6 +250,7 @@ def run_trials(
             "--resume where it has one) goes on; fewer workers need less."
         ) from None
     except (UserError, KeyboardInterrupt):  # those that run come to their end, and are kept
+        signal.setitimer(signal.ITIMER_REAL, 0)  # a stage's interrupt comes again until it has surfaced
         executor.shutdown(wait=True, cancel_futures=True)
         yield from (future.result() for future in waiting if _has_ended_well(future))
         raise
@@ -328,7 +330,6 @@ def _start_worker(
     config: Config, policy_path: Path, make: Callable[[Config, Path], Bench], parent: int
 ) -> None:
     """Leave Ctrl-C to the parent, and go when the parent has gone."""
-    import signal
 
     global _make_bench
     signal.signal(signal.SIGINT, signal.SIG_IGN)

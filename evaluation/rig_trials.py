@@ -281,6 +281,7 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
       config: the policy's own, with the objects that it was trained on.
     """
     trained, config = config.world.objects, series.configured(config, policy)
+    config = replace(config, world=replace(config.world, objects=_listed()))
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
     deploy = config.deploy

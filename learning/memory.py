@@ -29,6 +29,8 @@ class Need:
     """Scratch files that it removes in the end."""
     remedy: str = ""
     """What to lower."""
+    scratch: str = ""
+    """Folder in the stage's own where they lie, if an attempt that goes on finds them."""
 
     def __str__(self) -> str:
         parts = [f"{self.device / 1e9:.1f} GB for its programs", f"{self.host / 1e9:.1f} GB of arrays"]
@@ -56,9 +58,17 @@ def _places(need: Need, directory: Path) -> Iterator[tuple[str, int, int, str]]:
         yield "of memory on the device", need.device, limit, lower
         yield "of memory on the host", need.host, host_bytes(), lower
     there = next(path for path in (directory.absolute(), *directory.absolute().parents) if path.exists())
-    written = sum(path.stat().st_size for path in (directory / need.stage).rglob("*")) if need.disk else 0
+    written = _bytes_below(directory / need.stage / need.scratch) if need.scratch else 0
     free = shutil.disk_usage(there).free
     yield f"of disk in {directory}", need.disk - written, free, "free some, or work on another disk (--out)"
+
+
+def _bytes_below(folder: Path) -> int:
+    total = 0
+    for path in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):  # another process may be at work
+            total += path.stat().st_size
+    return total
 
 
 def device_limit(device: Any) -> int | None:

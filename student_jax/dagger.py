@@ -28,7 +28,7 @@ from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
 from student_jax import device_frames, frames_io, head, pretrained_encoder, start, train
 from student_jax.act import SourceCamera, StudentActor
-from student_jax.data import Frames, Window
+from student_jax.data import CACHE, Frames, Window
 from student_jax.depth_source import DepthSource, check_demos
 from student_jax.policy import PARAMS_FILE, init_params
 
@@ -56,7 +56,7 @@ class Trainer:
         self._config, self._student, self._profile = config, config.student, config.world.profile
         self._teacher, self._source = teacher, source
         self._directory, self._progress = directory, progress
-        self._store = EpisodeStore(directory / frames_io.CACHE, create=True, compressed=False)
+        self._store = EpisodeStore(directory / CACHE, create=True, compressed=False)
         self._window = Window.seen(self._profile, self._student.training.crop_shift_px)
         self._done: list[str] = []
         self.history: list[dict[str, Any]] = []
@@ -87,7 +87,7 @@ class Trainer:
     def _frames(self) -> Frames:
         """All so far, on an accelerator that has room for them beside a training step."""
         room = device_frames.room_bytes(self._config)
-        return frames_io.load(self._directory / frames_io.CACHE, self._window, room)
+        return frames_io.load(self._directory / CACHE, self._window, room)
 
     # --- phases ---
 

@@ -13,6 +13,8 @@ from ddgrasp.config import StudentConfig
 from ddgrasp.layout import ACTION, OBSERVATION, STATE, closes
 from student_jax.policy import Aux, position_from_world
 
+CACHE = "frames.zarr"
+"""The training frames in the student's folder, while it trains."""
 LEAD_IN = contract.DEPTH_FRAMES - 1
 """Steps before a sample that its stack of pictures shows."""
 YAW_MULTIPLE = 2

@@ -19,7 +19,6 @@ from student_jax.data import LEAD_IN, DepthInWindow, Frames, Window, make_frames
 from student_jax.depth_source import VIEWED, DepthSource
 from student_jax.device_frames import DepthOnDevice
 
-CACHE = "frames.zarr"
 _COLUMNS = ("state", "action", "observation", "held")
 _DRAWN = "drawn"
 _STRETCH_SEED = 47_000

@@ -11,7 +11,7 @@ from ddgrasp.config import Config
 from learning.memory import Need, traced_bytes
 from learning.prefetch import AHEAD
 from student_jax import train
-from student_jax.data import Window, kept_of_a_demo
+from student_jax.data import CACHE, Window, kept_of_a_demo
 from student_jax.policy import Aux, param_shapes
 
 _ROW_BYTES = 4 * (9 + 8 + 40 + 1) + 17
@@ -35,7 +35,7 @@ def need(config: Config) -> Need:
     height, width = Window.seen(profile, student.training.crop_shift_px).shape
     disk = frames * 2 * height * width + acting * length * picture
     remedy = "student.training.batch_size, student.dagger.episodes or world.camera_scale"
-    return Need("student", training_bytes(config), host, disk, remedy)
+    return Need("student", training_bytes(config), host, disk, remedy, CACHE)
 
 
 def batch_bytes(config: Config) -> int:

@@ -15,8 +15,9 @@ from demos.stage import STORE
 from demos.store import EpisodeStore
 from mjx_envs.render.batch_render import check_renderer
 from ppo import policy as teacher_policy
-from student_jax import evaluate, frames_io, pretrained_encoder
+from student_jax import evaluate, pretrained_encoder
 from student_jax.dagger import ACTED, Trainer
+from student_jax.data import CACHE
 from student_jax.depth_source import make_source
 from student_jax.head import POSES
 
@@ -32,7 +33,7 @@ def run(job: Job) -> Artifact:
     trainer.run(EpisodeStore(parents["demos"].directory / STORE))
     metrics = evaluate.closed_loop(config, teacher, source, trainer.params, progress)
     metrics |= {"tried": trainer.history, "frames": trainer.frame_count, "encoder_weights": encoder_weights}
-    shutil.rmtree(directory / frames_io.CACHE, ignore_errors=True)
+    shutil.rmtree(directory / CACHE, ignore_errors=True)
     for name in (POSES, ACTED):
         (directory / name).unlink(missing_ok=True)
     loaded = config.student.init_from and not _trains(config)

@@ -336,14 +336,14 @@ def test_nobody_to_ask_moves_nothing(tmp_path, bench, monkeypatch):
 def test_a_board_is_asked_for_whatever_may_move_unasked(tmp_path, bench, monkeypatch):
     monkeypatch.setitem(registry.IMAGERS, "realsense", lambda setup: bench.imager)
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: False))
-    with pytest.raises(UserError, match="is given a board when it is open, and nobody can be asked for it"):
+    with pytest.raises(UserError, match="is given a board when it is open, and nobody can be asked for one"):
         session.run(fast(), options(tmp_path, camera="realsense"), lambda text: None)
     assert bench.arm.commands == 0
     asked: list[str] = []
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
     monkeypatch.setattr(session, "ask_person", asked.append)
     session.run(fast(), options(tmp_path, camera="realsense"), lambda text: None)
-    assert [question.split()[0] for question in asked] == ["Hold"]
+    assert [question.split()[0] for question in asked] == ["Hold", "Take"]
 
 
 def test_a_person_who_is_not_ready_is_not_told_that_nothing_has_moved(tmp_path, bench, monkeypatch):

@@ -484,7 +484,7 @@ def test_killed_server_ends_the_lab_s_own_command_with_a_report(tmp_path, open_g
     assert written["fault"] == report.fault and any("fault" in event for event in written["events"])
     with Fr3Rig("127.0.0.16", primitive("cube")):  # the ports are free again
         again = deploy(preset, path, replace(options, seconds=0.3), say)
-    assert (again.steps, again.fault) == (3, "")
+    assert again.periods >= 3 and again.fault == ""
 
 
 def test_time_that_stands_still_is_put_down_to_the_lost_connection():

@@ -185,6 +185,15 @@ def test_slow_steps_skip_deadlines_and_never_burst(tmp_path):
     assert jitter["max"] == pytest.approx(200.0) and jitter["p50"] == pytest.approx(200.0)
 
 
+@pytest.mark.parametrize(("by_time", "steps"), [(True, 2), (False, 5)])
+def test_an_arm_moves_no_longer_for_slow_steps(tmp_path, by_time, steps):
+    """Of half a second at 10 Hz steps of 0.25 s take three periods each."""
+    settings = LoopSettings(0.1, by_time=by_time)
+    loop, robot, _ = make_loop(tmp_path, [depth_mm()], SimClock(), settings=settings)
+    robot.read_takes_s = 0.25
+    assert loop.run(max_steps=5).steps == steps
+
+
 def test_one_slow_step_leaves_the_grid_unchanged(tmp_path):
     clock = SimClock()
     loop, robot, _ = make_loop(tmp_path, [depth_mm()], clock)

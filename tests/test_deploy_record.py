@@ -349,16 +349,6 @@ def test_whoever_ends_a_deployment_that_ends_anyway_wants_no_next_one(run, signa
     assert not interrupts.ended_late()
 
 
-def test_slow_steps_take_time_from_what_was_given(run):
-    class Slow(ColourCamera):
-        def read(self):
-            time.sleep(0.25)
-            return super().read()
-
-    report, _ = run(Slow)
-    assert report.steps <= 3 and report.periods >= 5  # half a second at 10 Hz
-
-
 def test_nor_is_the_report_cut_short_while_frames_go_to_the_disk(run, monkeypatch, signals_count):
     add = RecordingWriter.add
 

@@ -97,12 +97,14 @@ def test_more_than_there_is_is_refused_with_the_remedy(tmp_path):
 def test_what_is_on_the_disk_already_is_not_asked_for_again(tmp_path, monkeypatch):
     free = SimpleNamespace(free=300)
     monkeypatch.setattr("learning.memory.shutil.disk_usage", lambda path: free)
-    need = Need("student", 0, 0, 1000)
+    need = Need("student", 0, 0, 1000, scratch="frames.zarr")
     with pytest.raises(UserError, match="GB of disk"):
         check(need, tmp_path)
     (tmp_path / "student" / "frames.zarr").mkdir(parents=True)
     (tmp_path / "student" / "frames.zarr" / "chunk").write_bytes(bytes(700))
     check(need, tmp_path)
+    with pytest.raises(UserError, match="GB of disk"):
+        check(replace(need, scratch=""), tmp_path)  # what a stage keeps is not in its need
 
 
 def test_of_a_demo_no_more_is_asked_for_than_is_kept():

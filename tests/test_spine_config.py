@@ -261,7 +261,14 @@ def test_a_teacher_whose_actor_would_never_learn_is_refused():
         check_learnable(preset)
 
 
-@pytest.mark.parametrize(("name", "accepted"), [("linear", 12), ("cosine", 34)])
+def test_a_schedule_that_does_not_end_in_noise_is_refused_before_it_is_fitted_and_read_as_ever():
+    shifted = DDGDiffusionConfig(500, "linear", 3.0)
+    ddg = dataclasses.replace(PRESETS["demo"].ddg, diffusion=shifted)
+    with pytest.raises(UserError, match=r"log_snr_shift is 3\.0; expected at most 0\.5 with 500 steps"):
+        check_learnable(dataclasses.replace(PRESETS["demo"], ddg=ddg))
+
+
+@pytest.mark.parametrize(("name", "accepted"), [("linear", 15), ("cosine", 36)])
 def test_schedules_that_configurations_take_have_noise_at_both_ends(name, accepted):
     taken = 0
     for steps in (2, 50, 499, 500, 1000, 5000, 5001, 100_000):
@@ -272,7 +279,7 @@ def test_schedules_that_configurations_take_have_noise_at_both_ends(name, accept
                 continue
             alpha_bars = diffusion.make_schedule(name, config.steps, config.log_snr_shift).alpha_bars
             assert np.all(alpha_bars > 0) and np.all(1 - alpha_bars > 0)
-            assert alpha_bars[-1] < 0.01, (steps, shift)
+            assert (alpha_bars[-1] < 0.01) == (shift < config.noisy_up_to), (steps, shift)
             taken += 1
     assert taken == accepted  # of 48
 

@@ -35,7 +35,7 @@ class DDGFit(OneStage):
             super().run()
             return
         inputs = recordings_in("--data", self.data)
-        config = check_config_values(self.config)
+        config = check_config_values(self.config, self.out)
         tell_fit(config, self.data, self.out / self.stage)
         pipeline.make(get_stage(self.stage), config, self.out, resume=self.resume, parents={}, inputs=inputs)
 

@@ -145,8 +145,9 @@ class StudyCauses:
         series = Series("development", self.objects, self.trials, "development", self.number)
         series = replace(series, seconds=self.seconds)
         series.names()
-        check_tried(there := replace(series, rig="fr3"))  # whose rows they are tried in as well
-        there.names()
+        if any(causes.ROWS[name].needs for name in rows):
+            check_tried(there := replace(series, rig="fr3"))
+            there.names()
         check_folder("--out", self.out)
         made = causes.run(
             config_of(self.policy, self.preset), self.policy, rows, series, self.out, self.workers

@@ -39,7 +39,7 @@ class TeacherTrain(OneStage):
     def run(self) -> None:
         """Trains with every process that --hosts names."""
         stage = get_stage(self.stage)
-        check_config_values(self.config)
+        check_config_values(self.config, self.out)
         pipeline.check_place(self.config, self.out, resume=self.resume, stages=[stage])
         from ppo import hosts
 

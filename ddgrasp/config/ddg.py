@@ -201,14 +201,16 @@ class DDGDiffusionConfig(Section, name="ddg.diffusion"):
                 "steps",
                 f"{least} to {most} with schedule linear: fewer do not end in noise",
             )
-        noise, signal = _ENDS[self.schedule](self.steps)
-        kept = f"the last one would keep more than {_MOST_SIGNAL:.0%} of the signal's variance"
-        limits = {
-            math.log(noise / _LEAST_NOISE): "the first one would add less noise than float32 tells",
-            _log_snr(_MOST_SIGNAL) - _log_snr(signal): kept,
-        }
-        if self.log_snr_shift > (most := min(limits)):
-            raise self.error("log_snr_shift", f"at most {most:.1f} with {self.steps} steps: {limits[most]}")
+        noise, _ = _ENDS[self.schedule](self.steps)
+        if (most := math.log(noise / _LEAST_NOISE)) < self.log_snr_shift:
+            why = "the first one would add less noise than float32 tells"
+            raise self.error("log_snr_shift", f"at most {most:.1f} with {self.steps} steps: {why}")
+
+    @property
+    def noisy_up_to(self) -> float:
+        """Largest `log_snr_shift` with which the last step is noise, as a sampler takes it."""
+        _, signal = _ENDS[self.schedule](self.steps)
+        return _log_snr(_MOST_SIGNAL) - _log_snr(signal)
 
 
 @dataclass(frozen=True)

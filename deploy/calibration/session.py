@@ -95,8 +95,11 @@ def run(
     clock: Clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
     confirm = (lambda question: None) if options.yes else ask_person
     give = confirm if options.camera == "rig" else ask_person  # whose hand has a board
-    if give is not confirm and not (options.dry_run or sys.stdin.isatty()):
-        raise UserError("the hand is given a board when it is open, and nobody can be asked for it here.")
+    if options.camera != "rig" and not (options.dry_run or sys.stdin.isatty()):
+        raise UserError(
+            "the hand is given a board when it is open, and nobody can be asked for one here: run this on a "
+            "terminal."
+        )
     setup = Setup(config, session, info, clock, confirm, say)
     robot, imager = ROBOTS["franka"](setup), IMAGERS[options.camera](setup)
     keep_time_of(robot, clock, session)
@@ -220,7 +223,7 @@ def _view(driver: Driver, imager: Imager, board: CharucoBoard, taken: Taken) -> 
 
 def _give_back(driver: Driver, options: CalibrationOptions, say: Callable[[str], None]) -> None:
     """The board into a person's hand, where there is one."""
-    if options.yes or not sys.stdin.isatty():
+    if (options.yes and options.camera == "rig") or not sys.stdin.isatty():
         say("the hand keeps the board")
         return
     try:
