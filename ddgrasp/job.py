@@ -52,8 +52,8 @@ class Job:
 
 
 def start_of(config: Config, stage: str) -> dict[str, str]:
-    """The checkpoint that `stage` begins with, by its content, since its folder may be filled anew; nothing if
-    it begins with none, or none is there any more."""
+    """The checkpoint that `stage` begins with, by its content, since its folder may be filled anew; nothing
+    if it begins with none, or none is there any more."""
     if stage not in CHECKPOINTS:
         return {}
     section = getattr(config, stage)

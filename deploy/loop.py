@@ -191,8 +191,7 @@ class ControlLoop:
                 done = bool(on_step(step)) or done
             self._report.clock_s, self._report.machine_s = self._now_s(), time.monotonic() - started
             deadline = self._next_deadline(deadline)
-            late = self._settings.by_time and max_steps is not None
-            done = done or (late and self._report.periods >= max_steps)
+            done = done or (self._settings.by_time and self._report.periods >= (max_steps or math.inf))
         self._clock.sleep_until(deadline)
         self._look_at_hand()
 

@@ -32,6 +32,7 @@ CONFIG = get_preset("debug")
 PROFILE = CONFIG.world.profile
 SERIES = Series("development", ("cube",), trials=1, seconds=0.5)
 QUIET = Progress(quiet=True)
+TRIALS = rig_trials.TRIALS_FILE
 
 
 @pytest.fixture
@@ -52,6 +53,9 @@ def test_what_a_policy_was_trained_on_besides_the_papers_objects_can_be_tried(po
     assert series.configured(CONFIG, policy).world.objects == (*everything.names(), "stick", "mine")
     table = rig_trials.run(CONFIG, policy, series, tmp_path / "out", 0, QUIET)
     assert list(table["objects"]) == ["stick", "mine", "cube"] and table["other"]["n"] == 2
+    more = replace(series, objects=("ring", "stick"))
+    table = rig_trials.run(CONFIG, policy, more, tmp_path / "out", 0, QUIET)
+    assert list(table["objects"]) == ["ring", "stick"] and len(read_log(tmp_path / "out" / TRIALS)[1]) == 4
 
 
 @pytest.fixture
