@@ -68,15 +68,16 @@ CONFIG = Config(
 SIZES = [
     "--preset",
     "debug",
-    "--trajectories",
-    "2",
-    "--frames",
-    "2",
     "--kid-subset-size",
     "2",
     "--bootstrap",
     "3",
+    "--trajectories",
+    "2",
+    "--frames",
+    "2",
 ]
+OF_REAL = SIZES[: SIZES.index("--trajectories")]
 
 
 def write_recording(path: Path, frames: int, size: tuple[int, int]) -> None:
@@ -173,7 +174,7 @@ def test_a_stopped_score_goes_on_to_the_same_figures(scored, run_dir, capsys):
 
 def test_a_real_cameras_recordings_are_fitted_and_scored(tmp_path, capsys):
     write_recording(tmp_path / "room", 26, (48, 64))
-    command = ["ddg", "score", *SIZES, "--out", str(tmp_path / "out"), "--real", str(tmp_path / "room")]
+    command = ["ddg", "score", *OF_REAL, "--out", str(tmp_path / "out"), "--real", str(tmp_path / "room")]
     assert cli.main([*command, "--fit-frames", "20", "--score-frames", "16"]) == 2
     assert "must not overlap" in capsys.readouterr().err
     assert cli.main([*command, "--run-dir", str(tmp_path)]) == 2
@@ -236,7 +237,7 @@ def test_scored_recordings_are_of_one_camera_and_long_enough(tmp_path, capsys):
         write_recording(tmp_path / "rooms" / name, 9, (48, 64))
     meta = tmp_path / "rooms" / "a" / "meta.json"
     meta.write_text(meta.read_text().replace("D435", "D455"))
-    command = ["ddg", "score", *SIZES, "--out", str(tmp_path / "out"), "--real", str(tmp_path / "rooms")]
+    command = ["ddg", "score", *OF_REAL, "--out", str(tmp_path / "out"), "--real", str(tmp_path / "rooms")]
     assert cli.main([*command, "--fit-frames", "2", "--score-frames", "19"]) == 2
     said = capsys.readouterr().err
     assert "b has focal length and baseline (38.4, 0.05), " in said and "a (38.4, 0.095)" in said

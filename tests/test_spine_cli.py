@@ -494,3 +494,20 @@ def test_a_teacher_s_world_is_its_run_s_wherever_the_run_stands(tmp_path):
             assert parse("teacher eval", [*args, "--out", place]).world == config.world
     student = artifacts.finish(tmp_path / "student", "student", config, seconds=1.0, metrics={}).directory
     assert parse("teacher eval", [str(student)]).world == PRESETS["demo"].world  # and `run` says what it is
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("ddg score --real REAL --trajectories 200", "--trajectories"),
+        ("ddg score --real REAL --repeat-scenes 2", "--repeat-scenes"),
+        ("ddg score --curve-steps 9", "--curve-steps"),
+        ("ddg curve --columns inpaint ddg", "--columns"),
+        ("ddg samplers --tsne-maps 9", "--tsne-maps"),
+        ("ddg samplers --curve-trajectories 5", "--curve-trajectories"),
+    ],
+)
+def test_what_a_score_would_not_read_is_refused(command, option, tmp_path):
+    words = [str(tmp_path) if word == "REAL" else word for word in command.split()]
+    with pytest.raises(UserError, match=rf"^{option}: .* does nothing with it; leave it out\.$"):
+        parse(" ".join(words[:2]), [*words[2:], "--out", str(tmp_path / "out")]).run()

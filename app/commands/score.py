@@ -1,6 +1,7 @@
 """ddgrasp ddg score, curve, samplers, features: how real generated depth is."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -16,6 +17,11 @@ from ddgrasp.config.checks import Count, Seed
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.stages import get_stage
+
+_OF_CURVE = ("curve_trajectories", "curve_steps")
+_OF_RIG = ("trajectories", "frames", "repeat_scenes", "repeats")
+_OF_TABLE = ("columns", "tsne_maps", "monocular", "monocular_weights")
+"""Fields of `ScoreConfig` that one kind of score alone reads."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +41,18 @@ class Scoring:
     resume: bool = False
     """Continue what is there."""
 
-    def _make(self, stage_name: str) -> None:
+    def _refuse(self, ignored: Sequence[str], command: str) -> None:
+        """UserError for an option of scores that `command` does not read."""
+        usual = get_preset(self.preset).score
+        for name in ignored:
+            if getattr(self.score, name) != getattr(usual, name):
+                raise UserError(f"--{name.replace('_', '-')}: {command} does nothing with it; leave it out.")
+
+    def _make(self, stage_name: str, ignored: Sequence[str]) -> None:
         """Makes the stage from the run's own parts, and prints its table."""
         from evaluation.depth_score.page import print_result
 
+        self._refuse(ignored, f"`ddgrasp ddg {stage_name}`")
         check_score(self.score)
         stage, source = get_stage(stage_name), self.run_dir or self.out
         config = replace(load_config(source, "ddg"), score=self.score, seed=self.seed)
@@ -65,7 +79,7 @@ class DDGScore(Scoring):
         """Scores the run's generator on the rig, or one fitted on a real camera."""
         if self.real is None:
             self._refuse_options_of_real()
-            self._make("score")
+            self._make("score", _OF_CURVE)
             return
         from evaluation.depth_score.page import print_result
         from evaluation.depth_score.real import real_config
@@ -80,6 +94,7 @@ class DDGScore(Scoring):
                 f"--ddg.init-from {self.ddg.init_from} with --real: what is scored is fitted on the first "
                 "frames, and a generator from elsewhere may have seen the last ones; leave one of them out."
             )
+        self._refuse((*_OF_RIG, *_OF_CURVE), "a score with --real")
         recordings = recordings_in("--real", self.real)
         check_score(self.score)
         preset = replace(get_preset(self.preset), ddg=self.ddg, score=self.score, seed=self.seed)
@@ -107,7 +122,7 @@ class DDGCurve(Scoring):
 
     def run(self) -> None:
         """Fits and scores each point that is not there yet."""
-        self._make("curve")
+        self._make("curve", _OF_TABLE)
 
 
 @dataclass(frozen=True)
@@ -116,7 +131,7 @@ class DDGSamplers(Scoring):
 
     def run(self) -> None:
         """Scores each sampler on the same trajectories."""
-        self._make("samplers")
+        self._make("samplers", (*_OF_TABLE, *_OF_CURVE))
 
 
 @dataclass(frozen=True)
