@@ -427,7 +427,7 @@ def test_start_asks_first_then_homes_and_moves_slowly_to_the_start_pose():
             robot.start()
         robot.stop()
         np.testing.assert_allclose(rig.channel.ask("state")["q_rad"], away, atol=2e-3)
-        assert "and move to the start pose (0.03 rad away) at 5% of its speed" in asked[0]
+        assert "and move to the start pose (0.03 rad away) at 5 % of its speed" in asked[0]
         import franky
 
         gripper = franky.Gripper(rig.host)

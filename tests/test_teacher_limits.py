@@ -122,10 +122,11 @@ def test_more_batches_of_cloning_than_memory_are_refused_by_their_own_name():
 def test_minibatches_of_one_step_are_refused():
     """PPO divides advantages by their deviation, less their mean: of one nothing is left."""
     teacher = dataclasses.replace(TEACHER, num_envs=2, unroll_steps=1)
+    config = dataclasses.replace(CONFIG, world=WorldConfig())
     with pytest.raises(UserError, match="2 of 2 environments' unroll_steps 1 are one control step each"):
-        check_learnable(dataclasses.replace(CONFIG, teacher=teacher))
+        check_learnable(dataclasses.replace(config, teacher=teacher))
     for values in ({"unroll_steps": 2}, {"minibatches": 1}, {"start": "pretrained", "total_steps": 0}):
-        check_learnable(dataclasses.replace(CONFIG, teacher=dataclasses.replace(teacher, **values)))
+        check_learnable(dataclasses.replace(config, teacher=dataclasses.replace(teacher, **values)))
 
 
 def test_a_program_larger_than_memory_is_refused_before_it_runs():
