@@ -246,6 +246,12 @@ class _StopsAt(Progress):
             raise KeyboardInterrupt
 
 
+@pytest.mark.parametrize(("aux", "action"), [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+def test_what_is_shown_while_it_trains_is_what_is_trained(aux, action):
+    shown = train.told(StudentTrainingConfig(aux_weight=aux, action_weight=action))
+    assert ("position_error_mm" in shown, "action" in shown) == (aux > 0, action > 0)
+
+
 def test_a_fit_interrupted_and_resumed_ends_as_an_uninterrupted_one(tmp_path):
     config = Config(
         "test", student=dataclasses.replace(CONFIG, training=dataclasses.replace(CONFIG.training, steps=5))

@@ -52,8 +52,8 @@ def check_config_values(config: Config, run_dir: Path | None = None) -> Config:
     check_objects(config.world)
     check_learnable(config)
     ahead = [stage for stage in CHECKPOINTS if not (run_dir and artifacts.is_finished(run_dir / stage))]
-    for stage in ahead:
-        if stage != "teacher":
+    for stage in ("ddg", "student"):
+        if stage in ahead:
             check_start(stage, f"{stage}.init_from", getattr(config, stage).init_from)
     if config.ddg.init_from and "ddg" in ahead:
         start.check(config.ddg)
