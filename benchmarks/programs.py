@@ -248,7 +248,7 @@ def head_step(config: Config) -> Program:
 def dagger_acting(config: Config) -> Program:
     """The student's actions for all environments of a DAgger round."""
     settings = (config.student, config.world.profile, _student_params(config))
-    return act._act, (*settings, *_pictures(config, config.student.dagger.episodes))
+    return act.act_on_depth, (*settings, *_pictures(config, config.student.dagger.episodes))
 
 
 def pose_acting(config: Config) -> Program:

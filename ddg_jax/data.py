@@ -65,13 +65,20 @@ class Frames:
         return np.arange(len(self)) - first
 
     def split(self, holdout_fraction: float) -> tuple["Frames", "Frames"]:
-        """(training, held-out) frames: the held-out ones are the last, at least one."""
-        held = max(1, round(len(self) * holdout_fraction))
-        if held >= len(self):
+        """(training, held-out) frames: the held-out ones are the last, at least one.
+
+        Whole recordings where that holds out half to one and a half times as many, since the frames of one
+        resemble each other; otherwise the last part of one.
+        """
+        asked = max(1, round(len(self) * holdout_fraction))
+        if asked >= len(self):
             raise UserError(
                 f"ddg.training.holdout_fraction {holdout_fraction:g} of {len(self)} frame(s) leaves none to "
                 "fit on: record more, or hold out less."
             )
+        whole = len(self) - (np.flatnonzero(np.diff(self.recording)) + 1)
+        near = whole[np.abs(whole - asked) <= asked / 2]
+        held = int(near[np.argmin(np.abs(near - asked))]) if len(near) else asked
         return self.part(slice(0, len(self) - held)), self.part(slice(len(self) - held, len(self)))
 
 

@@ -154,10 +154,7 @@ def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
     """A fresh learner and its environments."""
     k_policy, k_value, k_env, k_next = jax.random.split(key, 4)
     networks = make_networks(config)
-    policy = networks.policy_network.init(k_policy)
-    if config.start == NOTHING:
-        policy = _with_small_output(policy)
-    params = network_params(policy, networks.value_network.init(k_value))
+    params = network_params(fresh_policy(config, k_policy), networks.value_network.init(k_value))
     normalizer = running_statistics.init_state(
         specs.Array((contract.OBSERVATION_SIZE,), jnp.dtype("float32"))
     )
@@ -172,13 +169,18 @@ def init(config: TeacherConfig, env: AutoReset, key: jax.Array) -> LearnerState:
     )
 
 
-def _with_small_output(policy: Any) -> Any:
-    """Brax's freshly drawn policy parameters with the last layer's weights a hundredth: at the start the arm
-    stands still but for the noise, whatever it observes (Andrychowicz et al. 2021, section 3.2)."""
-    layers = policy["params"]
+def fresh_policy(config: TeacherConfig, key: jax.Array) -> Any:
+    """Policy parameters from which PPO or cloning begins: Brax's, the last layer's weights a hundredth.
+
+    From nothing all of them: the arm stands still but for the noise, whatever it observes (Andrychowicz et
+    al. 2021, section 3.2). Otherwise those that the noise's size is made of, which cloning leaves as drawn,
+    so that it is `action_std` and `gripper_std`, whatever is observed.
+    """
+    layers = make_networks(config).policy_network.init(key)["params"]
     last = f"hidden_{len(layers) - 1}"
-    small = layers[last] | {"kernel": 0.01 * layers[last]["kernel"]}
-    return {"params": layers | {last: small}}
+    is_noise = jnp.arange(2 * contract.ACTION_SIZE) >= contract.ACTION_SIZE  # Brax's order: means, noise
+    factor = jnp.where(is_noise | (config.start == NOTHING), 0.01, 1.0)
+    return {"params": layers | {last: layers[last] | {"kernel": factor * layers[last]["kernel"]}}}
 
 
 def warm_start(state: LearnerState, saved: dict) -> LearnerState:

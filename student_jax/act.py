@@ -62,7 +62,7 @@ class StudentActor:
         teacher_share: float = 0.0,
         keep: Path | None = None,
     ):
-        self._act = partial(_act, config, profile, params)
+        self._act = partial(act_on_depth, config, profile, params)
         self._config, self._corrupt, self._rng, self._teacher_share = config, corrupt, rng, teacher_share
         self._noise_scale = float(noise == "normal")
         self._chunk = np.zeros(0)
@@ -89,7 +89,15 @@ class StudentActor:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _act(config, profile, params, depth_mm, state, noise):
+def act_on_depth(
+    config: StudentConfig,
+    profile: contract.CameraProfile,
+    params: Any,
+    depth_mm: UInt16[jax.Array, "B 3 H W"],
+    state: Float[jax.Array, "B 9"],
+    noise: Float[jax.Array, "B K 8"],
+) -> Float[jax.Array, "B K 8"]:
+    """Chunks of actions for frames, from the start `noise` of the reverse diffusion."""
     return sample_actions(params, to_metres(depth_mm), state, noise, config, profile)
 
 

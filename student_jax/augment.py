@@ -81,18 +81,15 @@ def _edge_noise(
     config: StudentConfig,
 ) -> Float[jax.Array, "B F H W"]:
     """Disparity errors at edges, one a cell of EDGE_CELL_PX, half of it the same in all frames."""
-    batch, _, height, width = disparity_px.shape
+    _, _, height, width = disparity_px.shape
     table = profile.fx_px * profile.baseline_m / table_depth(profile, config.picture.max_depth_m)
-    relief = jnp.where(valid, disparity_px - table, 0.0)
-    pad = [(0, 0), (0, 0), (0, -height % EDGE_CELL_PX), (0, -width % EDGE_CELL_PX)]
-    cells = jnp.pad(relief, pad, mode="edge")
-    rows, columns = (size // EDGE_CELL_PX for size in cells.shape[2:])
-    cells = cells.reshape(*cells.shape[:2], rows, EDGE_CELL_PX, columns, EDGE_CELL_PX)
-    highest, lowest = (_around(sign * (sign * cells).max((3, 5)), sign) for sign in (1.0, -1.0))
-    edge = jnp.clip((highest - lowest) / EDGE_RELIEF_PX, 0.0, 1.0)
+    highest, lowest = (
+        _around(_cells(jnp.where(valid, sign * (disparity_px - table), -jnp.inf))) for sign in (1.0, -1.0)
+    )
+    edge = jnp.clip((highest + lowest) / EDGE_RELIEF_PX, 0.0, 1.0)  # a sum: each is of its own sign
     k_strength, k_shared, k_own = jax.random.split(key, 3)
     noise = _half_shared(k_shared, k_own, edge.shape)
-    strength = config.training.edge_noise_px * jax.random.uniform(k_strength, (batch, 1, 1, 1))
+    strength = config.training.edge_noise_px * jax.random.uniform(k_strength, (len(valid), 1, 1, 1))
     return _enlarged(strength * edge * noise, EDGE_CELL_PX, height, width)
 
 
@@ -104,11 +101,16 @@ def _half_shared(
     return (shared + jax.random.normal(k_own, shape)) / jnp.sqrt(2.0)
 
 
-def _around(cells: Float[jax.Array, "B F h w"], sign: float) -> Float[jax.Array, "B F h w"]:
-    """The largest (`sign` 1) or smallest (-1) of a cell and those beside it."""
-    return sign * jax.lax.reduce_window(
-        sign * cells, -jnp.inf, jax.lax.max, (1, 1, 3, 3), (1, 1, 1, 1), "SAME"
-    )
+def _cells(values: Float[jax.Array, "B F H W"]) -> Float[jax.Array, "B F h w"]:
+    """The largest value of each cell of EDGE_CELL_PX."""
+    size = (1, 1, EDGE_CELL_PX, EDGE_CELL_PX)
+    rest = [(0, 0), (0, 0), *((0, -length % EDGE_CELL_PX) for length in values.shape[2:])]
+    return jax.lax.reduce_window(values, -jnp.inf, jax.lax.max, size, size, rest)
+
+
+def _around(cells: Float[jax.Array, "B F h w"]) -> Float[jax.Array, "B F h w"]:
+    """The largest of a cell and those beside it."""
+    return jax.lax.reduce_window(cells, -jnp.inf, jax.lax.max, (1, 1, 3, 3), (1, 1, 1, 1), "SAME")
 
 
 def _enlarged(cells: Float[jax.Array, "B F h w"], cell_px: int, height: int, width: int) -> jax.Array:

@@ -1,5 +1,6 @@
 """What training the student takes: of the device by shapes alone, of host and disk by counting frames."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -8,9 +9,11 @@ import jax.numpy as jnp
 
 from ddgrasp import contract
 from ddgrasp.config import Config
+from demos.memory import drawing_bytes
 from learning.memory import Need, traced_bytes
 from learning.prefetch import AHEAD
 from student_jax import train
+from student_jax.act import act_on_depth
 from student_jax.data import CACHE, Window, kept_of_a_demo
 from student_jax.policy import Aux, param_shapes
 
@@ -26,7 +29,7 @@ def need(config: Config) -> Need:
     length = config.world.episode_steps
     frames = config.demos.episodes * kept_of_a_demo(student, length)
     frames += student.dagger.rounds * student.dagger.episodes * length
-    acting = max(student.dagger.episodes, config.evaluation.student_trials)
+    acting = max(student.dagger.episodes * bool(student.dagger.rounds), config.evaluation.student_trials)
     host = (
         (AHEAD + 2) * batch_bytes(config)
         + frames * _ROW_BYTES
@@ -34,8 +37,12 @@ def need(config: Config) -> Need:
     )
     height, width = Window.seen(profile, student.training.crop_shift_px).shape
     disk = frames * 2 * height * width + acting * length * picture
-    remedy = "student.training.batch_size, student.dagger.episodes or world.camera_scale"
-    return Need("student", training_bytes(config), host, disk, remedy, CACHE)
+    device = max(training_bytes(config), acting_bytes(config, acting), _drawing_bytes(config, acting))
+    remedy = (
+        "student.training.batch_size, student.dagger.episodes, evaluation.student_trials or "
+        "world.camera_scale"
+    )
+    return Need("student", device, host, disk, remedy, CACHE)
 
 
 def batch_bytes(config: Config) -> int:
@@ -59,6 +66,24 @@ def training_bytes(config: Config) -> int:
     trained, frozen = train.split(student, param_shapes(student, profile))
     state = jax.eval_shape(partial(train.init_state, student, steps, 0), trained)
     return traced_bytes(train.train_step, student, profile, steps, state, frozen, batch)
+
+
+def acting_bytes(config: Config, count: int) -> int:
+    """What the actions for `count` environments take."""
+    student, profile = config.student, config.world.profile
+    depth_mm = _shape(count, contract.DEPTH_FRAMES, profile.height_px, profile.width_px, dtype=jnp.uint16)
+    state, noise = (
+        _shape(count, contract.POLICY_STATE_SIZE),
+        _shape(count, student.head.chunk, contract.ACTION_SIZE),
+    )
+    return traced_bytes(
+        act_on_depth, student, profile, param_shapes(student, profile), depth_mm, state, noise
+    )
+
+
+def _drawing_bytes(config: Config, count: int) -> int:
+    demos = replace(config.demos, parallel=count, rgb=False)
+    return drawing_bytes(replace(config, demos=demos))
 
 
 def _shape(*sizes: int, dtype: Any = jnp.float32) -> Any:

@@ -13,7 +13,7 @@ from ppo import learner
 def learner_without_envs(config: TeacherConfig) -> learner.LearnerState:
     """A fresh learner of networks, normaliser and optimiser alone; its `env_state` is None."""
     key, networks = jax.random.key(0), learner.make_networks(config)
-    params: Any = learner.network_params(networks.policy_network.init(key), networks.value_network.init(key))
+    params: Any = learner.network_params(learner.fresh_policy(config, key), networks.value_network.init(key))
     normalizer = running_statistics.init_state(specs.Array((40,), jnp.dtype("float32")))
     begun, zero = learner.make_optimizer(config).init(params), jnp.zeros((), jnp.int32)
     return learner.LearnerState(params, normalizer, begun, None, key, zero, zero)  # pyright: ignore

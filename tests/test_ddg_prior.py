@@ -144,7 +144,9 @@ def test_frames_and_batches(recordings):
     assert len(frames) == 6 and frames.recording.tolist() == [0, 0, 0, 1, 1, 1]
     np.testing.assert_allclose(np.mean(frames.depth_m == 0), 2 / 32)
     training, held = frames.split(config.training.holdout_fraction)
-    assert (len(training), len(held)) == (4, 2)
+    assert training.recording.tolist() == [0, 0, 0] and held.recording.tolist() == [1, 1, 1]
+    assert [len(part) for part in frames.split(0.17)] == [5, 1]  # a whole recording would be three times that
+    assert [len(part) for part in training.split(0.34)] == [2, 1]  # there is but one
     one, again, other = (data.make_batch(training, config, 7, step) for step in (3, 3, 4))
     np.testing.assert_array_equal(one.x_0, again.x_0)
     assert not np.array_equal(one.c, other.c)

@@ -56,7 +56,9 @@ def test_estimates_are_near_what_xla_needs(name):
 def test_the_stages_needs_are_those_of_their_programs():
     config = PRESETS["debug"]
     for name, need in (("generator: train step", ddg_memory.training_bytes(config.ddg)),
-                       ("student: train step", student_memory.training_bytes(config))):  # fmt: skip
+                       ("student: train step", student_memory.training_bytes(config)),
+                       ("student: DAgger acting",
+                        student_memory.acting_bytes(config, config.student.dagger.episodes))):  # fmt: skip
         jitted, arguments = PROGRAMS[name](config)
         assert need == traced_bytes(jitted, *arguments)
 
@@ -67,6 +69,13 @@ def test_frames_of_the_paper_need_a_disk_not_memory():
     need = student_memory.need(paper)
     assert need.disk == 2 * (frames * window + 512 * 60 * 360 * 640)  # 54 GB
     assert need.host < need.disk / 15
+
+
+def test_a_students_trials_are_in_its_need():
+    config = PRESETS["debug"]
+    many = replace(config, evaluation=replace(config.evaluation, student_trials=4000))
+    needed = student_memory.need(many).device
+    assert needed >= student_memory.acting_bytes(many, 4000) > student_memory.need(config).device
 
 
 def test_a_batch_of_demos_needs_its_pictures_once():

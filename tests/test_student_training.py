@@ -496,6 +496,18 @@ def test_noise_at_edges_is_where_things_stand_out_of_the_table_and_nowhere_else(
     assert np.mean(np.abs(plain - depth)[:, :, beside] > 1e-4) < 0.02
 
 
+def test_a_hole_in_a_surface_is_no_edge():
+    noise = dataclasses.replace(CONFIG.training, disparity_noise_px=0.0, edge_noise_px=1.0)
+    config = dataclasses.replace(CONFIG, training=noise)
+    depth = np.array(table_depth(PROFILE, 2.5), np.float32)
+    row, column = PROFILE.height_px // 2, PROFILE.width_px // 2
+    depth[row - 14 : row + 14, column - 14 : column + 14] -= 0.05
+    stack = jnp.asarray(depth)[None, None].repeat(4, 0).repeat(3, 1)
+    holed = stack.at[..., row - 1 : row + 1, column - 1 : column + 1].set(0.0)
+    whole, made = (np.asarray(disparity_noise(jax.random.key(0), x, PROFILE, config)) for x in (stack, holed))
+    np.testing.assert_array_equal(made[holed > 0], whole[holed > 0])
+
+
 def test_an_object_that_is_not_seen_is_a_hole_as_large_as_it_is():
     """A 4 cm block on an empty table, drawn by hand through the nominal camera that stands 5 mm too low."""
     training = dataclasses.replace(CONFIG.training, unseen_share=1.0)

@@ -1,5 +1,7 @@
 """Cloning the guide: the policy learns its actions, the normaliser what was seen, and no NaN gets through."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from ppo import learner, warmup
 from ppo.policy import TeacherPolicy, from_learner
 from teacher_support import learner_without_envs
 
-TEACHER = TeacherConfig(start="guide", clone_rounds=2, clone_steps=200, clone_envs=64, hidden=(64,))
+TEACHER = TeacherConfig(
+    start="guide", clone_rounds=2, clone_steps=200, clone_envs=64, hidden=(64,), gripper_std=0.4
+)
 STEPS = 8
 ENV = GraspEnv(WorldConfig(objects=("cube",), episode_steps=STEPS))
 UNSEEN = 123
@@ -70,6 +74,17 @@ def test_the_clone_acts_as_the_guide_does_where_it_has_never_been(clone, collect
     np.testing.assert_allclose(normalizer.mean, kept.mean(0), rtol=1e-4, atol=1e-5)
     std = np.maximum(kept.std(0), learner.OBSERVATION_STD_MIN)
     np.testing.assert_allclose(normalizer.std, std, rtol=1e-3)
+
+
+def test_what_a_clone_explores_with_is_action_std_whatever_it_sees(clone, collector):
+    _, policy, normalizer = clone()
+    seen, networks = np.concatenate(collector.kept), learner.make_networks(TEACHER)
+    logits = networks.policy_network.apply(normalizer, policy, seen)
+    noise: Any = networks.parametric_action_distribution
+    std = noise.create_dist(logits).scale
+    asked = [TEACHER.action_std] * 7 + [TEACHER.gripper_std]
+    floor = TEACHER.min_std * np.array(asked) / np.log(2)
+    np.testing.assert_allclose(std - floor, np.broadcast_to(asked, std.shape), rtol=0.1)
 
 
 def test_a_clone_that_diverges_ends_in_one_line(clone, monkeypatch):

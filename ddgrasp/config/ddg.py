@@ -240,7 +240,8 @@ class DDGTrainingConfig(Section, name="ddg.training"):
     checkpoint_every: Count = 250
     """Steps between whole-state checkpoints."""
     holdout_fraction: Annotated[float, Range(0, 0.95)] = 0.1
-    """Share of the frames, the last ones, kept out of training for the statistics and pictures."""
+    """Share of the frames, the last ones, kept out of training for the statistics and pictures: whole
+    recordings where that is half to one and a half times as many."""
     distil_from: Annotated[int, Range(1, 65_536)] = 16
     """Evaluations of the fitted network from which distillation starts; sampling.steps times a power of
     two (sampler progressive only)."""

@@ -55,9 +55,8 @@ class TeacherConfig(Section, name="teacher"):
     Brax's, whose advantage is a step's own error plus discount, not discount times lambda, times the next
     step's."""
     action_std: Annotated[float, Range(0, 10, above=True)] = 0.15
-    """Standard deviation of the exploration noise of the arm's joints at the start, before the tanh. So from
-    nothing; a cloned policy's varies about it with what it sees, since cloning fits means alone, and a loaded
-    one's is as it was."""
+    """Standard deviation of the exploration noise of the arm's joints at the start, before the tanh. A loaded
+    policy's is as it was."""
     gripper_std: Annotated[float, Range(0, 10, above=True)] = 0.15
     """The same for the gripper's command, which counts by its sign alone."""
     min_std: Annotated[float, Range(0, 10)] = 0.01
