@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,8 @@ from ddgrasp.errors import UserError
 
 STATE_LAYOUT = "q7 rad + gripper width m + its change since the control step before m"
 REMEDY = "make one with `ddgrasp export`"
+_DIGITS = 12
+"""Digits of a camera's scale: a quotient that is a unit in its last place off could round a side otherwise."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,12 @@ class PolicyMetadata:
     student_manifest_hash: str
     closing_steps: int = 0
     """Control steps that a closing of the gripper lasts at least, once begun; files of before have none."""
+
+    @property
+    def profile(self) -> CameraProfile:
+        """The camera of its training: `contract.D455` at the scale of its focal length. Its width alone would
+        not do, since both sides are rounded."""
+        return contract.D455.scaled(round(self.camera["fx"] / contract.D455.fx_px, _DIGITS))
 
     def to_json(self) -> str:
         """The value of the metadata property."""
@@ -203,6 +212,9 @@ def _check_values(metadata: PolicyMetadata, source: str) -> None:
         value = getattr(metadata, name)
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise UserError(f"{source}: {name} is {value!r}, expected a positive integer: {REMEDY}.")
+    focal_px = metadata.camera.get("fx") if isinstance(metadata.camera, dict) else None
+    if not isinstance(focal_px, int | float) or not 0 < focal_px < math.inf:
+        raise UserError(f"{source}: camera's fx is {focal_px!r}, expected pixels: {REMEDY}.")
     closing = metadata.closing_steps
     if not isinstance(closing, int) or isinstance(closing, bool) or closing < 0:
         raise UserError(f"{source}: closing_steps is {closing!r}, expected 0 or more: {REMEDY}.")

@@ -96,9 +96,8 @@ class Fr3Runner:
         clock = RobotClock()
         robot = PlacingRobot(settings.franka, clock, rig.channel, draw.place)
         info = self._policy.info
-        profile = contract.D455.scaled(info.depth_width / contract.D455.width_px)
-        sense = self._sense(profile, clock, draw.rng)
-        camera = fr3_camera.Fr3Camera(rig.host, clock, sense, profile, draw.T_world_cam)
+        sense = self._sense(info.profile, clock, draw.rng)
+        camera = fr3_camera.Fr3Camera(rig.host, clock, sense, info.profile, draw.T_world_cam)
         safety = safety_filter(settings, info, "franka")
         seen = treated(camera, self._bench.treatment)
         loop = ControlLoop(seen, robot, self._policy, safety, clock, loop_settings(settings, info))

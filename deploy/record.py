@@ -86,7 +86,7 @@ class DeploymentRecord:
         if not self._queued:  # a camera's own are all kept
             apart = self._picture_every if rgb is None else 1
             self._meta |= {"hz": contract.CONTROL_HZ / apart, "consecutive_frames": apart == 1}
-        if step.frame.timestamp_s == self._newest_s:  # the loop holds, and has no other
+        if again := step.frame.timestamp_s == self._newest_s:  # the loop holds, and has no other
             self._meta["consecutive_frames"] = False
         self._newest_s = step.frame.timestamp_s
         if rgb is None and step.index % self._picture_every == 0 and isinstance(self._camera, Filmed):
@@ -97,6 +97,8 @@ class DeploymentRecord:
         depth_mm = depth.copy() if depth.dtype == np.uint16 else to_millimetres(depth)
         if step.frame.timestamp_s - self._kept_s > _GAP_S:
             self._meta["consecutive_frames"] = False
+        if again:
+            self._meta["repeated_frames"] = self._meta.get("repeated_frames", 0) + 1
         self._kept_s = step.frame.timestamp_s
         row["frame"] = self._queued
         self._queued += 1

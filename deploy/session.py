@@ -82,8 +82,8 @@ def _run(
     loop = ControlLoop(camera, driven, policy, safety, clock, settings, say)
     steps = round(options.seconds * policy.info.control_hz) if math.isfinite(options.seconds) else None
     folder = _new_folder(options.out)
-    profile = contract.D455.scaled(policy.info.depth_width / contract.D455.width_px)
-    kept = DeploymentRecord(camera, profile, f"{options.camera}, D455 profile", config.deploy.film_every)
+    sensor = f"{options.camera}, D455 profile"
+    kept = DeploymentRecord(camera, policy.info.profile, sensor, config.deploy.film_every)
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
     name = options.object_name or (config.world.objects[0] if options.camera == "stereo" else "")
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}

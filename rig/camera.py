@@ -18,6 +18,8 @@ from sensors.models.materials import rig_materials
 
 FAR_M = 10.0
 """Beyond the matcher's range, so that range limits come from the camera alone."""
+_STANDS = 0
+"""Seed of `standing_pose`."""
 
 
 class RigCamera:
@@ -89,6 +91,12 @@ def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> Float64[np.
     c, s = np.cos(roll), np.sin(roll)
     T_world_cam[:3, :3] = T_world_cam[:3, :3] @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return T_world_cam
+
+
+def standing_pose(config: Config) -> Float64[np.ndarray, "4 4"]:
+    """(4, 4) T_world_cam of the test rig's camera while nobody draws trials: one place, whatever seed the
+    configuration has, so that a calibration of it holds for every policy."""
+    return camera_pose(config, np.random.default_rng(_STANDS))
 
 
 def camera_pose(config: Config, rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:

@@ -19,14 +19,20 @@ SHAPE = (PROFILE.height_px, PROFILE.width_px)
 HOME_RAD = np.array(scene.HOME_RAD)
 
 
-def describe(depth_dtype: str = "uint16_mm", chunk: int = 4, execute_steps: int = 1, **changes):
-    """Metadata of a policy for PROFILE."""
+def describe(
+    depth_dtype: str = "uint16_mm",
+    chunk: int = 4,
+    execute_steps: int = 1,
+    profile: contract.CameraProfile = PROFILE,
+    **changes,
+):
+    """Metadata of a policy for `profile`."""
     described = metadata.describe(
         StudentConfig(
             head=HeadConfig(chunk=chunk, execute_steps=execute_steps, closing_steps=0),
         ),
         ExportConfig(depth_dtype=depth_dtype),
-        PROFILE,
+        profile,
     )
     return dataclasses.replace(described, **changes)
 

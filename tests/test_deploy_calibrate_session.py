@@ -449,6 +449,8 @@ def test_a_calibration_of_another_robot_is_not_taken(tmp_path, monkeypatch):
     standing.save(standing.DEFAULT_FILE, made)
     with pytest.raises(UserError, match="is of camera 'rig' and the robot at '127.0.0.9': name"):
         parse("calibrate", ["--host", "127.0.0.9", "--yes"]).run()
+    with pytest.raises(UserError, match="is of camera 'rig' and the robot at '127.0.0.9': name"):
+        parse("calibrate", ["--host", "127.0.0.9", "--dry-run"]).run()
     standing.check_own(standing.DEFAULT_FILE, "rig", "127.0.0.9")
     place = standing.standing(CONFIG, SessionOptions("franka", "realsense"))
     assert "is of camera 'rig' and the robot at 127.0.0.9): assumes the camera at" in place.line

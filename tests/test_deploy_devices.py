@@ -81,9 +81,23 @@ def test_replay_keeps_the_pace_of_a_faster_recording(recording, hz, shown_mm):
     assert camera.read().depth[0, 0] == shown_mm
 
 
+def test_a_recording_of_another_size_is_played_as_the_policys_camera_would_have_seen_it(tmp_path):
+    columns = np.tile(np.arange(1, 849, dtype=np.uint16), (480, 1))
+    mine = {"fx_px": contract.D455_STREAM.fx_px}
+    for name, meta in (("known", mine), ("unknown", {})):
+        with RecordingWriter(tmp_path / name, meta) as writer:
+            writer.add(np.zeros((480, 848, 3), np.uint8), columns)
+    known, unknown = (
+        ReplayCamera.open(tmp_path / name, SimClock(), PROFILE).read().depth for name in ("known", "unknown")
+    )
+    assert known.dtype == np.uint16 and known.shape == (180, 320)
+    np.testing.assert_array_equal(known[90, [0, 1, 160, 318, 319]], [0, 2, 426, 847, 0])
+    assert unknown.shape == (480, 848)  # which the loop refuses
+
+
 def test_loop_over_a_replay_holds_once_the_recording_ends(recording, tmp_path):
     clock = SimClock()
-    info = describe(depth_height=SIZE[0], depth_width=SIZE[1])
+    info = describe(profile=contract.D455.scaled(1 / 16))
     # Joint 1 moves by 1e-4 rad per millimetre beyond 700 in the newest frame.
     gain, bias = np.zeros((3, 4, 8)), constant_bias(-0.7)
     gain[2, :, 0] = 1e-3
@@ -542,8 +556,7 @@ def test_a_file_that_is_absent_is_said_before_anything_else():
 
 def test_every_pair_is_refused_or_can_be_made(recording):
     preset = get_preset("debug")
-    shape = (preset.world.profile.height_px, preset.world.profile.width_px)
-    info = describe(depth_height=shape[0], depth_width=shape[1])
+    info = describe(profile=preset.world.profile)
     made, refused = {}, set()
     for robot in registry.ROBOTS:
         for camera in registry.CAMERAS:
@@ -568,7 +581,9 @@ def test_every_pair_is_refused_or_can_be_made(recording):
     }
     robot, camera = made["sim", "stereo"]
     camera.start()
-    assert camera.read().depth.shape == shape and robot.read_state().q_rad.shape == (7,)
+    profile = preset.world.profile
+    assert camera.read().depth.shape == (profile.height_px, profile.width_px)
+    assert robot.read_state().q_rad.shape == (7,)
 
 
 @pytest.mark.parametrize(("camera", "why"), [("stereo", "sees the simulated rig"), ("replay", "blindly")])

@@ -466,7 +466,7 @@ def test_ctrl_c_on_the_way_to_the_start_pose_stops_the_arm(monkeypatch):
 def test_killed_server_ends_the_lab_s_own_command_with_a_report(tmp_path, open_gl):
     preset = get_preset("debug")
     profile = preset.world.profile
-    info = describe(depth_height=profile.height_px, depth_width=profile.width_px)
+    info = describe(profile=profile)
     path = write_policy(tmp_path / "policy.onnx", info, bias=constant_bias(0.1))
     said: list[str] = []
     with Fr3Rig("127.0.0.16", primitive("cube")) as rig:

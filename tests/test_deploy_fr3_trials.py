@@ -193,7 +193,7 @@ def test_a_connection_lost_at_the_start_is_made_again(said):
 
 def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):
     policy = write_policy(
-        tmp_path / "policy.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.0, -1.0)
+        tmp_path / "policy.onnx", describe(profile=contract.D455.scaled(0.25)), bias=constant_bias(0.0, -1.0)
     )
     series = Series(objects=("cube",), trials=2, shapes="primitive", camera="ideal", seconds=0.5)
     config = replace(get_preset("debug"))
@@ -218,7 +218,7 @@ def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):
 
 def test_a_trial_whose_rig_is_killed_is_run_again(tmp_path, open_gl):
     policy = write_policy(
-        tmp_path / "policy.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.0, -1.0)
+        tmp_path / "policy.onnx", describe(profile=contract.D455.scaled(0.25)), bias=constant_bias(0.0, -1.0)
     )
     series = Series(objects=("cube",), trials=1, shapes="primitive", camera="ideal", seconds=0.5)
     runner = series.make(get_preset("debug"))(series.configured(get_preset("debug"), policy), policy)

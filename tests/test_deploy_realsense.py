@@ -1,6 +1,8 @@
 """The RealSense's camera and imager before a scripted library: begun, read, ended, and gone wrong."""
 
+import re
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -35,8 +37,8 @@ def scripted(monkeypatch):
     return make
 
 
-def camera(serial: str = "") -> RealSenseCamera:
-    return RealSenseCamera(SimClock(), STREAM, serial=serial, stream=STREAM)
+def camera(serial: str = "", say: Callable[[str], None] = lambda text: None) -> RealSenseCamera:
+    return RealSenseCamera(SimClock(), STREAM, serial=serial, stream=STREAM, say=say)
 
 
 def started() -> RealSenseCamera:
@@ -52,6 +54,24 @@ def test_the_camera_that_is_configured_streams_depth_and_colour(scripted):
     camera(SERIAL).start()
     streams = [("depth", 64, 48, "z16", 30), ("color", 64, 48, "rgb8", 30)]
     assert library.asked == [(SERIAL,), *streams, ("emitter", 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("Intel RealSense D455", "camera: Intel RealSense D455"),
+        (
+            "Intel RealSense D435",
+            r"camera: Intel RealSense D435, whose noise is not .*: docs/hardware\.md says how",
+        ),
+    ],
+)
+def test_which_camera_it_is_is_said(scripted, monkeypatch, name, line):
+    monkeypatch.setattr("realsense_support.NAME", name)
+    scripted()
+    said: list[str] = []
+    camera(say=said.append).start()
+    assert len(said) == 1 and re.match(line, said[0])
 
 
 def test_the_first_read_waits_and_later_ones_do_not(scripted):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from app.commands import parse
+from ddgrasp import contract
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy import interrupts, session
@@ -50,7 +51,7 @@ class ColourCamera:
 def run(tmp_path, monkeypatch):
     """Deploys a policy that bends joint 1, before a camera; (report, the folder it left, None if none)."""
     policy = write_policy(
-        tmp_path / "p.onnx", describe(depth_height=180, depth_width=320), bias=constant_bias(0.2)
+        tmp_path / "p.onnx", describe(profile=contract.D455.scaled(0.25)), bias=constant_bias(0.2)
     )
 
     def deployed(camera=ColourCamera, say=lambda text: None, **changes):
@@ -384,7 +385,7 @@ def test_a_camera_of_a_rig_that_gives_colour_with_every_frame_is_kept_as_often(r
             return np.zeros((180, 320, 3), np.uint8)
 
     meta = Recording.open(run(Rig)[1]).meta
-    assert (meta["hz"], meta["consecutive_frames"]) == (10.0, True)
+    assert (meta["hz"], meta["consecutive_frames"]) == (10.0, True) and "repeated_frames" not in meta
 
 
 def test_a_frame_that_came_again_is_no_next_one(run):
@@ -399,6 +400,7 @@ def test_a_frame_that_came_again_is_no_next_one(run):
     report, folder = run(Stalled)
     recording = Recording.open(folder)
     assert report.holds == 1 and len(recording) == 5 and not recording.consecutive
+    assert recording.meta["repeated_frames"] == 1
 
 
 def test_frames_before_and_after_an_outage_do_not_follow_each_other(run):

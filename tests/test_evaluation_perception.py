@@ -115,7 +115,7 @@ def run_dir(tmp_path) -> Path:
     save_params(tmp_path / "student" / PARAMS_FILE, params)
     student = artifacts.finish(tmp_path / "student", "student", config, seconds=1.0, metrics={})
     (tmp_path / "export").mkdir()
-    info = describe(depth_height=profile.height_px, depth_width=profile.width_px)
+    info = describe(profile=profile)
     write_policy(tmp_path / "export" / POLICY_FILE, info, bias=constant_bias(0.0))
     artifacts.finish(tmp_path / "export", "export", config, seconds=1.0, metrics={}, parents=[student])
     return tmp_path

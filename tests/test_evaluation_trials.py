@@ -37,7 +37,7 @@ TRIALS = rig_trials.TRIALS_FILE
 
 @pytest.fixture
 def policy(tmp_path) -> Path:
-    info = describe(depth_height=PROFILE.height_px, depth_width=PROFILE.width_px)
+    info = describe(profile=PROFILE)
     return write_policy(tmp_path / "policy.onnx", info, bias=constant_bias(0.0))
 
 

@@ -31,6 +31,15 @@ def test_what_is_written_is_read_back():
     assert read.to_json() == GOOD.to_json()
 
 
+@pytest.mark.parametrize("scale", [*(n / 200 for n in range(20, 201)), 1 / 3, 5 / 32])
+def test_a_policy_s_camera_is_the_one_of_its_training_at_every_scale(scale):
+    profile = contract.D455.scaled(scale)
+    described = metadata.describe(StudentConfig(), ExportConfig(), profile)
+    read = metadata.validate({contract.ONNX_METADATA_KEY: described.to_json()})
+    assert (read.depth_height, read.depth_width) == (read.profile.height_px, read.profile.width_px)
+    assert read.profile.fx_px == pytest.approx(profile.fx_px)
+
+
 def test_a_file_of_before_does_not_latch_a_closing():
     described = json.loads(GOOD.to_json())
     assert described.pop("closing_steps") == 8
@@ -47,6 +56,8 @@ def test_a_file_of_before_does_not_latch_a_closing():
         ({"control_hz": 30.0}, "control_hz is 30.0, this code expects 10.0"),
         ({"action_scale_rad": -0.1}, "action_scale_rad is -0.1, this code expects 0.1"),
         ({"joint_names": ["a"]}, "joint_names"),
+        ({"camera": {"fx": "640"}}, "camera's fx is '640', expected pixels"),
+        ({"camera": None}, "camera's fx is None, expected pixels"),
         ({"closing_steps": -1}, "closing_steps is -1, expected 0 or more"),
     ],
 )

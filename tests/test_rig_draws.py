@@ -9,7 +9,7 @@ from ddgrasp.config import RandomConfig, RecordConfig, WorldConfig
 from ddgrasp.presets import get_preset
 from mjx_envs import draws, kinematics, scene
 from mjx_envs.camera import nominal_camera
-from rig.camera import camera_pose, jittered_pose
+from rig.camera import camera_pose, jittered_pose, standing_pose
 from rig.world import RigWorld, make_world
 
 # Recorded before randomisation had one place (November 2026): published trials hang on these numbers.
@@ -97,6 +97,13 @@ def test_a_trial_follows_from_its_seed(world, seed, name):
     }
     for quantity, expected in WORLDS[seed, name].items():
         np.testing.assert_allclose(seen[quantity], expected, rtol=1e-14, err_msg=quantity)
+
+
+def test_the_standing_camera_is_where_it_was_calibrated_whatever_policy_looks_through_it():
+    preset = get_preset("debug")
+    one, other = (standing_pose(replace(preset, seed=seed)) for seed in (0, 1))
+    np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(one, camera_pose(preset, np.random.default_rng(0)))
 
 
 @pytest.mark.parametrize("seed", JITTERED)

@@ -89,7 +89,8 @@ class RecordRealsense:
     """Serial number of the camera; empty takes the first."""
 
     def run(self) -> None:
-        """Records, and says what was kept; UserError if the camera stopped by itself, or the disk is full."""
+        """Records, and says what was kept. UserError if the camera stopped by itself, or the disk is full;
+        KeyboardInterrupt where somebody ended it, so that what follows in a script does not begin."""
         from ddgrasp.progress import Progress
         from sensors.recordings import realsense_live as live
 
@@ -101,6 +102,8 @@ class RecordRealsense:
         print(live.summary(imported, take, frames))
         if take.trouble:
             raise UserError(take.trouble)
+        if take.stopped:
+            raise KeyboardInterrupt
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,8 @@ class RigFr3:
         thing = (scene.meshed if self.shapes == "mesh" else scene.primitive)(self.object_name)
         with Fr3Rig(self.host, thing, self.seed, self.speed, with_board=self.board) as rig:
             what = "calibrate" if self.board else "deploy --policy FILE.onnx --robot franka"
-            drive = f"ddgrasp {what} --host {self.host} --camera rig"
+            kept = f"runs/practice{'/calibration.json' if self.board else ''}"  # apart from an arm's own
+            drive = f"ddgrasp {what} --host {self.host} --camera rig --out {kept}"
             print(f"FR3 at {self.host} before {self.object_name!r}. Drive it: {drive}", flush=True)
             while rig.running():
                 time.sleep(0.2)

@@ -123,7 +123,7 @@ class Deploy:
     dry_run: bool = False
     """Everything but the motion: what would be sent is printed and drawn."""
     yes: bool = False
-    """Move without asking first."""
+    """Move without asking first, nor for success at the end."""
     out: Path = Path("runs/deployments")
     """Folder that every run leaves its report in."""
     calibration: Path | None = None

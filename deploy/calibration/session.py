@@ -321,7 +321,7 @@ def _truth(imager: Imager) -> np.ndarray | None:
 def _check_out(options: CalibrationOptions, host: str) -> None:
     """UserError, before anything moves, unless a calibration and a picture beside it can be written, over
     none of another camera or robot."""
-    if options.out is None and not options.dry_run:
+    if options.out is None:
         standing.check_own(standing.DEFAULT_FILE, options.camera, host)
     out = options.file
     if out.is_dir() or out.suffix == ".png":

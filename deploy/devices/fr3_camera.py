@@ -28,13 +28,13 @@ Sense = Callable[["ScenePicture", Pose, str], Depth]
 
 def make(setup: Setup, robot: Robot) -> "Fr3Camera":
     """A D455 before the rig that runs at the robot's host, at its nominal place within its error."""
-    profile, rng = _profile(setup), np.random.default_rng(setup.config.seed)
+    profile, rng = setup.info.profile, np.random.default_rng(setup.config.seed)
     return _at_place(setup, profile, stereo(setup.config.record.stereo, profile, setup.clock, rng))
 
 
 def make_ideal(setup: Setup, robot: Robot) -> "Fr3Camera":
     """A camera without errors at the same place."""
-    profile = _profile(setup)
+    profile = setup.info.profile
     return _at_place(setup, profile, ideal(profile))
 
 
@@ -177,13 +177,9 @@ def pinhole(profile: contract.CameraProfile, T_world_cam: Pose) -> Pinhole:
     return Pinhole(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.height_px, p.width_px, T_world_cam)
 
 
-def _profile(setup: Setup) -> contract.CameraProfile:
-    return contract.D455.scaled(setup.info.depth_width / contract.D455.width_px)
-
-
 def _at_place(setup: Setup, profile: contract.CameraProfile, sense: Sense) -> Fr3Camera:
-    from rig.camera import camera_pose
+    from rig.camera import standing_pose
 
     config = setup.config
-    pose = camera_pose(config, np.random.default_rng(config.seed))
+    pose = standing_pose(config)
     return Fr3Camera(config.deploy.franka.host, setup.clock, sense, profile, pose, in_colour=True)

@@ -23,10 +23,10 @@ BLUR_PX, NOISE_GRAY = 0.5, 2.0
 
 
 def make(setup: Setup) -> "Fr3Imager":
-    """Where `--camera rig` stands with the same seed."""
-    from rig.camera import camera_pose
+    """Where `--camera rig` stands."""
+    from rig.camera import standing_pose
 
-    pose = camera_pose(setup.config, np.random.default_rng(setup.config.seed))
+    pose = standing_pose(setup.config)
     return Fr3Imager(setup.config.deploy.franka.host, pose, setup.config.seed)
 
 

@@ -35,7 +35,7 @@ class SessionOptions:
     dry_run: bool = False
     """Everything but the motion: what would be sent is said and drawn."""
     yes: bool = False
-    """Move without asking first."""
+    """Move without asking first, nor for success at the end."""
     host: str = ""
     """Address of the robot's control unit; empty takes deploy.franka.host, or `RIG_HOST` with its cameras."""
     out: Path = Path("runs/deployments")

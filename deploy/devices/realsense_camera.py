@@ -6,6 +6,7 @@ a synthetic stream; it has not been run on a camera by us.
 
 import contextlib
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -21,11 +22,17 @@ INTRINSICS_TOLERANCE = 0.1
 """A focal length or a principal point further than this share of the focal length from the stream's nominal
 one is another camera, or another mode."""
 
+_TRAINED_FOR = "D455"
+_OTHER = (
+    f"whose noise is not that of the {_TRAINED_FOR} that shipped policies know: docs/hardware.md says how to "
+    "train for it"
+)
+
 
 def make(setup: Setup, robot: Robot) -> "RealSenseCamera":
     """At the policy's picture size."""
-    profile = contract.D455.scaled(setup.info.depth_width / contract.D455.width_px)
-    return RealSenseCamera(setup.clock, profile, serial=setup.config.deploy.realsense.serial)
+    serial = setup.config.deploy.realsense.serial
+    return RealSenseCamera(setup.clock, setup.info.profile, serial=serial, say=setup.say)
 
 
 class RealSenseCamera:
@@ -44,14 +51,16 @@ class RealSenseCamera:
         stream: contract.CameraProfile = contract.D455_STREAM,
         stream_hz: int = 30,
         timeout_ms: int = 200,
+        say: Callable[[str], None] = lambda text: None,
     ):
-        """`profile` is the policy's camera, no larger than `stream`, the mode that the camera is run in."""
+        """`profile` is the policy's camera, no larger than `stream`, the mode that the camera is run in;
+        `say` is told which camera it is."""
         if profile.width_px > stream.width_px or profile.height_px > stream.height_px:
             raise UserError(
                 f"the policy takes {profile.width_px}x{profile.height_px} depth, more than the stream's "
                 f"{stream.width_px}x{stream.height_px}: export it with world.camera_scale 0.5 or less."
             )
-        self._clock, self._profile, self._serial = clock, profile, serial
+        self._clock, self._profile, self._serial, self._say = clock, profile, serial, say
         self._stream_hz, self._timeout_ms = stream_hz, timeout_ms
         self._pipeline: Any = None
         self._unit_m, self._mode, self._stream = contract.DEPTH_UNIT_M, stream, stream
@@ -78,6 +87,7 @@ class RealSenseCamera:
         self._pipeline = pipeline
         try:
             project(rs, active)
+            name = active.get_device().get_info(rs.camera_info.name)
             self._unit_m = active.get_device().first_depth_sensor().get_depth_scale()
             intrinsics = active.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
         except RuntimeError as error:
@@ -86,6 +96,8 @@ class RealSenseCamera:
                 f"the RealSense streams, and does not answer ({error}): plug it in anew."
             ) from error
         self._stream = self._checked(intrinsics)
+        known = _TRAINED_FOR in name
+        self._say(f"camera: {name}" if known else f"camera: {name}, {_OTHER}")
 
     def read(self) -> Frame:
         """The newest frame; waits for the first alone. A stream that pauses leaves its last one, whose time
@@ -145,7 +157,7 @@ class RealSenseCamera:
                 self.stop()
                 raise UserError(
                     f"the camera's {name} is {value:.1f} px, a D455's at {had.width_px}x"
-                    f"{had.height_px} is {nominal:.1f} px: use a D455, or train with yours."
+                    f"{had.height_px} is {nominal:.1f} px: use a D455, or a camera whose depth is like it."
                 )
         fx, fy, cx, cy = (value for value, _, _ in reported.values())
         return replace(had, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)

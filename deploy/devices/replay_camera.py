@@ -1,10 +1,15 @@
 """A recording played back as a camera, at the pace of the loop's clock."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from jaxtyping import UInt16
+
 from ddgrasp import contract
+from ddgrasp.depth import at_profile
 from deploy.devices.options import Setup
 from deploy.interfaces import Clock, Frame, Robot
 
@@ -15,7 +20,7 @@ if TYPE_CHECKING:
 def make(setup: Setup, robot: Robot) -> "ReplayCamera":
     """Plays the chosen recording; UserError if there is none."""
     assert setup.options.recording is not None  # `registry.check_devices` sees to it
-    return ReplayCamera.open(setup.options.recording, setup.clock)
+    return ReplayCamera.open(setup.options.recording, setup.clock, setup.info.profile)
 
 
 class ReplayCamera:
@@ -30,22 +35,26 @@ class ReplayCamera:
         recording: "sensors.recordings.recording.Recording",
         clock: Clock,
         period_s: float = contract.CONTROL_DT_S,
+        profile: contract.CameraProfile | None = None,
     ):
+        """Depth of another size than `profile`'s becomes what that camera would have seen, if the recording
+        names its focal length."""
         self._recording, self._clock, self._period_s = recording, clock, period_s
+        self._profile, self._had = profile, _camera(recording)
         self._start_s: float | None = None
         self._shown = -1
         self._frame: Frame | None = None
 
     @classmethod
-    def open(cls, path: Path, clock: Clock) -> "ReplayCamera":
+    def open(cls, path: Path, clock: Clock, profile: contract.CameraProfile | None = None) -> "ReplayCamera":
         """Play the recording in `path` at its own rate, if it names one; UserError if there is none."""
         from sensors.recordings.recording import Recording
 
         recording = Recording.open(path)
         hz = recording.meta.get("hz")
         if not isinstance(hz, int | float) or not math.isfinite(hz):
-            return cls(recording, clock)
-        return cls(recording, clock, 1.0 / max(hz, contract.CONTROL_HZ))
+            return cls(recording, clock, profile=profile)
+        return cls(recording, clock, 1.0 / max(hz, contract.CONTROL_HZ), profile)
 
     def __len__(self) -> int:
         return len(self._recording)
@@ -64,8 +73,25 @@ class ReplayCamera:
         if self._frame is None or index != self._shown:
             self._shown = index
             due_s = self._start_s + index * self._period_s
-            self._frame = Frame(self._recording.depth_mm(index), due_s, self._recording.rgb(index))
+            self._frame = Frame(self._depth_mm(index), due_s, self._recording.rgb(index))
         return self._frame
 
     def stop(self) -> None:
         """Nothing to close."""
+
+    def _depth_mm(self, index: int) -> UInt16[np.ndarray, "H W"]:
+        depth_mm, wanted = self._recording.depth_mm(index), self._profile
+        if wanted is None or self._had is None or depth_mm.shape == (wanted.height_px, wanted.width_px):
+            return depth_mm
+        return at_profile(depth_mm, self._had, wanted)
+
+
+def _camera(recording: "sensors.recordings.recording.Recording") -> contract.CameraProfile | None:
+    """What recorded, its axis through the middle of the picture; None if its focal length is not known."""
+    focal_px = recording.meta.get("fx_px")
+    if not isinstance(focal_px, int | float) or not 0 < focal_px < math.inf:
+        return None
+    return replace(
+        contract.D455, width_px=recording.width_px, height_px=recording.height_px,
+        fx_px=focal_px, fy_px=focal_px, cx_px=recording.width_px / 2, cy_px=recording.height_px / 2,
+    )  # fmt: skip

@@ -78,6 +78,8 @@ class Take:
     """Frames that were due but gone, because writing was too slow."""
     trouble: str = ""
     """Why it ended before its time, and the remedy; empty if it did not."""
+    stopped: bool = False
+    """Whether somebody ended it."""
 
     def meta(self, hz: int) -> dict[str, Any]:
         """Fields of meta.json: the rate that came of `hz`, and whether there are gaps."""
@@ -178,6 +180,7 @@ def _kept(
         take.lost += lost  # only now: before a frame that could not be written there is no gap
         take.frames += 1
         task.advance()
+    take.stopped = stop.is_set()
     if not take.frames:
         raise KeyboardInterrupt("Stopped before the first frame: nothing was recorded.")
 
