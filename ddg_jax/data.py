@@ -44,6 +44,8 @@ class Frames:
     """Which one a frame is from."""
     skipped_frames: int = 0
     refused_recordings: int = 0
+    apart: frozenset[int] = frozenset()
+    """Recordings, as `recording` counts them, whose frames do not follow each other."""
 
     def __len__(self) -> int:
         return len(self.depth_m)
@@ -64,22 +66,34 @@ class Frames:
         first = np.searchsorted(self.recording, self.recording)
         return np.arange(len(self)) - first
 
-    def split(self, holdout_fraction: float) -> tuple["Frames", "Frames"]:
-        """(training, held-out) frames: the held-out ones are the last, at least one.
+    @property
+    def stretch(self) -> Int[np.ndarray, " N"]:
+        """(N,) the same number for frames that follow each other: a recording's, or the frame's own."""
+        alone = np.isin(self.recording, list(self.apart))
+        return np.where(alone, -1 - np.arange(len(self)), self.recording)
 
-        Whole recordings where that holds out half to one and a half times as many, since the frames of one
-        resemble each other; otherwise the last part of one.
-        """
-        asked = max(1, round(len(self) * holdout_fraction))
-        if asked >= len(self):
-            raise UserError(
-                f"ddg.training.holdout_fraction {holdout_fraction:g} of {len(self)} frame(s) leaves none to "
-                "fit on: record more, or hold out less."
-            )
-        whole = len(self) - (np.flatnonzero(np.diff(self.recording)) + 1)
-        near = whole[np.abs(whole - asked) <= asked / 2]
-        held = int(near[np.argmin(np.abs(near - asked))]) if len(near) else asked
+    def split(self, holdout_fraction: float) -> tuple["Frames", "Frames"]:
+        """(training, held-out) frames: the held-out ones are the last (`held_out_count`)."""
+        held = held_out_count(np.unique(self.recording, return_counts=True)[1], holdout_fraction)
         return self.part(slice(0, len(self) - held)), self.part(slice(len(self) - held, len(self)))
+
+
+def held_out_count(lengths: Int[np.ndarray, " R"], holdout_fraction: float) -> int:
+    """How many frames, the last ones, are held out of recordings of so many frames: at least one.
+
+    Whole recordings where that is half to one and a half times as many as asked for, since the frames of one
+    resemble each other; otherwise the last part of one. UserError if none is left to fit on.
+    """
+    total = int(lengths.sum())
+    asked = max(1, round(total * holdout_fraction))
+    if asked >= total:
+        raise UserError(
+            f"ddg.training.holdout_fraction {holdout_fraction:g} of {total} frame(s) leaves none to fit on: "
+            "record more, or hold out less."
+        )
+    whole = np.cumsum(lengths[:0:-1])
+    near = whole[np.abs(whole - asked) <= asked / 2]
+    return int(near[np.argmin(np.abs(near - asked))]) if len(near) else asked
 
 
 def frames_bytes(config: DDGConfig, count: int) -> int:
@@ -98,12 +112,48 @@ def load_frames(
     is no recording, none can be used, they are of another contract version
     (sensors/recordings/recording.py), or memory is too small for them, before any is read.
     """
-    folders = _folders(root)
+    return _loaded(root, _folders(root), config, prior, seed, progress, max_frames)
+
+
+def load_held_out(root: Path, config: DDGConfig, prior: Prior, seed: int, progress: Progress) -> Frames:
+    """The held-out frames alone, for a generator that is not fitted. Where every picture can be used, no
+    other recording is read; where not, which ones are held out shows in the reading."""
+    folders, fraction = _folders(root), config.training.holdout_fraction
+    lengths = _lengths_if_whole(folders)
+    if lengths is None:
+        return load_frames(root, config, prior, seed, progress).split(fraction)[1]
+    held = held_out_count(lengths, fraction)
+    first = len(folders) - 1 - int(np.flatnonzero(np.cumsum(lengths[::-1]) >= held)[0])
+    frames = _loaded(root, folders[first:], config, prior, seed, progress, first_number=first)
+    return frames.part(slice(-held, None))
+
+
+def _lengths_if_whole(folders: list[Path]) -> Int[np.ndarray, " R"] | None:
+    """Frames of each recording; None if one of them has some that are damaged, blind or there again."""
+    lengths = []
+    for folder in folders:
+        try:
+            recording = find_recordings(folder)[0]
+        except UserError:
+            return None
+        if recording.skipped or recording.meta.get("repeated_frames"):
+            return None
+        lengths.append(len(recording))
+    return np.array(lengths)
+
+
+def _loaded(
+    root: Path, folders: list[Path], config: DDGConfig, prior: Prior, seed: int, progress: Progress,
+    max_frames: int | None = None, first_number: int = 0,
+) -> Frames:  # fmt: skip
+    """See `load_frames`; the recordings in `folders` count from `first_number`."""
     pictures = depth_picture_count(folders)
     host = frames_bytes(config, pictures if max_frames is None else min(pictures, max_frames))
     memory.check(memory.Need("ddg", 0, host, remedy="the number of recordings"), root)
     most = sys.maxsize if max_frames is None else max_frames
-    depth, priors, skipped, refused = _read_all(folders, config, prior, seed, progress, most)
+    depth, priors, apart, skipped, refused = _read_all(
+        folders, config, prior, seed, progress, most, first_number
+    )
     if not depth:
         raise UserError(
             f"{root}: none of its {len(folders)} recording(s) can be used. The first: {refused[0]}"
@@ -114,16 +164,24 @@ def load_frames(
     noisy = np.concatenate(list(depth.values()))
     depth.clear()  # as large as all that follows
     surface = surfaces(noisy, config.depth.surface, progress)
-    return Frames(noisy, surface, np.concatenate(priors), index, skipped, len(refused))
+    return Frames(noisy, surface, np.concatenate(priors), index, skipped, len(refused), frozenset(apart))
 
 
 def _read_all(
-    folders: list[Path], config: DDGConfig, prior: Prior, seed: int, progress: Progress, left: int
-) -> tuple[dict[int, np.ndarray], list[np.ndarray], int, list[UserError]]:
+    folders: list[Path],
+    config: DDGConfig,
+    prior: Prior,
+    seed: int,
+    progress: Progress,
+    left: int,
+    first_number: int,
+) -> tuple[dict[int, np.ndarray], list[np.ndarray], set[int], int, list[UserError]]:
     """Depth of each recording that can be used, by its number, among the first `left` frames; their priors;
-    number of frames left out of them; why the other recordings were."""
+    those whose frames do not follow each other; number of frames left out of them; why the other recordings
+    were."""
     depth, priors, skipped, refused, sizes, sensors = {}, [], 0, [], set(), Counter()
-    for number, folder in enumerate(progress.track(folders, "reading recordings")):
+    apart: set[int] = set()
+    for number, folder in enumerate(progress.track(folders, "reading recordings"), first_number):
         if not left:
             break
         try:
@@ -144,13 +202,15 @@ def _read_all(
         rng = np.random.default_rng((seed, number))
         priors.append(prior.from_recording(frames, rgb, rng, recording.consecutive).astype(np.float16))
         depth[number] = frames
+        if not recording.consecutive:
+            apart.add(number)
         sensors[str(recording.meta.get("sensor", "unnamed"))] += 1
     if len(sensors) > 1:
         progress.note(
             "recordings of several sensors, which one generator will mix: "
             + ", ".join(f"{name} ({count})" for name, count in sorted(sensors.items()))
         )
-    return depth, priors, skipped, refused
+    return depth, priors, apart, skipped, refused
 
 
 def surfaces(
@@ -192,8 +252,13 @@ def _read(
         )
     size = (config.depth.height_px, config.depth.width_px)
     frames = np.stack([crop_nearest(recording.depth_m(i), size) for i in range(count)])
-    usable = np.flatnonzero((frames > 0).any(axis=(1, 2)))
-    blind = len(frames) - len(usable)
+    seen = np.asarray((frames > 0).any(axis=(1, 2)))
+    again = np.zeros(len(frames), bool)
+    if recording.meta.get("repeated_frames"):  # a deployment keeps a picture for every step
+        again[1:] = seen[1:] & (frames[1:] == frames[:-1]).all(axis=(1, 2))
+        progress.note(f"{recording.path}: left out {again.sum()} frame(s) that came again")
+    usable = np.flatnonzero(seen & ~again)
+    blind = int((~seen).sum())
     if len(usable) == 0:
         raise UserError(
             f"{recording.path}: no frame has a valid pixel in the window that the generator sees."
@@ -201,7 +266,7 @@ def _read(
     if blind:
         progress.note(f"{recording.path}: left out {blind} frame(s) without a valid pixel in the window")
     rgb = np.stack([recording.rgb(int(i)) for i in usable]) if prior.needs_rgb else None
-    return frames[usable], rgb, len(recording.skipped) + blind
+    return frames[usable], rgb, len(recording.skipped) + len(frames) - len(usable)
 
 
 def _tell_of_crop(recording: Recording, config: DDGConfig, progress: Progress) -> None:

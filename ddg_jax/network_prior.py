@@ -55,8 +55,11 @@ class DepthNetworkPrior:
         consecutive: bool = True,
     ) -> Float32[np.ndarray, "T H W"]:
         """See `Prior`; depth gives the size only."""
-        del rng, consecutive
-        return self._from_rgb(rgb, depth_m.shape[1:])
+        del rng
+        size = depth_m.shape[1:]
+        if consecutive or rgb is None:
+            return self._from_rgb(rgb, size)
+        return np.concatenate([self._from_rgb(frame[None], size) for frame in rgb])
 
     def from_sim(
         self, depth_m: Float[np.ndarray, "T H W"], rgb: UInt8[np.ndarray, "T h w 3"] | None = None

@@ -91,13 +91,14 @@ class InverseDepthPrior:
         Frame by frame: each stage of a whole recording's would be as large as the recording.
         """
         inverse = self._with_decoys(depth_m, rng)
+        scaled = self._scaled if consecutive else self._scaled_apart
         if self.surface == PIECEWISE:
-            return self._scaled(self._blurred(map(piecewise_smooth, inverse), depth_m.shape))
+            return scaled(self._blurred(map(piecewise_smooth, inverse), depth_m.shape))
         filled = map(fill_from_background, inverse)
         smooth = map(smooth_surface, smooth_in_time(filled) if consecutive else filled)
         if self.surface == PLANES:
             smooth = map(on_planes, smooth)
-        return self._scaled(self._blurred(smooth, depth_m.shape))
+        return scaled(self._blurred(smooth, depth_m.shape))
 
     def from_sim(
         self, depth_m: Float[np.ndarray, "T H W"], rgb: UInt8[np.ndarray, "T h w 3"] | None = None
@@ -120,6 +121,12 @@ class InverseDepthPrior:
     def _scaled(self, inverse: np.ndarray) -> np.ndarray:
         """c of inverse depth that nobody else needs."""
         return normalise(inverse)
+
+    def _scaled_apart(self, inverse: np.ndarray) -> np.ndarray:
+        """The same of frames that are each a sequence of its own, in their place."""
+        for frame in inverse:
+            frame[:] = self._scaled(frame[None])[0]
+        return inverse
 
     def _blurred(self, inverse: Iterable[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
         made = np.empty(shape, np.float32)

@@ -41,15 +41,20 @@ def run(job: Job) -> Artifact:
     config, directory, progress = job.config, job.directory, job.progress
     root = job.inputs["data"] if "data" in job.inputs else job.parents["record"].directory
     prior = make_prior(config.ddg)
-    frames = data.load_frames(root, config.ddg, prior, config.seed, progress)
-    training, held_out = frames.split(config.ddg.training.holdout_fraction)
+    read = root, config.ddg, prior, config.seed, progress
+    if _fits(config.ddg):
+        frames = data.load_frames(*read)
+        training, held_out = frames.split(config.ddg.training.holdout_fraction)
+    else:
+        frames = held_out = data.load_held_out(*read)
+        training = held_out.part(slice(0))
     generator = fitted_generator(config.ddg, prior, training, directory, config.seed, progress)
     scored = held_out.part(slice(-SCORED_FRAMES, None))
     metrics = {
         "prior": prior.name,
         "prior_source": prior.source,
         "frames": {
-            "training": len(training) if _fits(config.ddg) else 0,
+            "training": len(training),
             "held_out": len(held_out),
             "skipped": frames.skipped_frames,
             "refused_recordings": frames.refused_recordings,
@@ -114,7 +119,7 @@ def _score(generator: Generator, frames: data.Frames, progress: Progress) -> dic
     return {
         **{
             name: {
-                **hole_statistics(panels[name], frames.recording),
+                **hole_statistics(panels[name], frames.stretch),
                 **deviation_statistics(panels[name], frames.surface_m),
             }
             for name in ("recorded", "generated")
@@ -134,11 +139,9 @@ def _panels(generator: Generator, frames: data.Frames, seed: int) -> dict[str, n
     }
 
 
-def hole_statistics(
-    depth_m: Float[np.ndarray, "N H W"], recording: Int[np.ndarray, " N"]
-) -> dict[str, float]:
+def hole_statistics(depth_m: Float[np.ndarray, "N H W"], stretch: Int[np.ndarray, " N"]) -> dict[str, float]:
     """Share of invalid pixels, regions per frame, median region, left band and validity flicker of (N, H, W)
-    metres; `recording` (N,) says which frames follow each other.
+    metres; frames of one `stretch` (N,) follow each other.
     """
     sizes = [stats.hole_sizes_px(frame) for frame in (depth_m > 0).astype(np.uint16)]
     every = np.concatenate(sizes)
@@ -147,15 +150,15 @@ def hole_statistics(
         "hole_components": float(np.mean([len(s) for s in sizes])),
         "hole_median_px": float(np.median(every)) if len(every) else 0.0,
         "left_band_px": float(np.mean([stats.left_band_px(frame) for frame in depth_m])),
-        "flicker_fraction": flicker_fraction(depth_m > 0, recording),
+        "flicker_fraction": flicker_fraction(depth_m > 0, stretch),
     }
 
 
-def flicker_fraction(valid: Bool[np.ndarray, "N H W"], recording: Int[np.ndarray, " N"]) -> float:
-    """Share of pixels that change validity between neighbouring frames of one recording; valid (N, H, W),
-    recording (N,). nan if every frame is from another one.
+def flicker_fraction(valid: Bool[np.ndarray, "N H W"], stretch: Int[np.ndarray, " N"]) -> float:
+    """Share of pixels that change validity between neighbouring frames of one stretch; valid (N, H, W),
+    stretch (N,). nan if every frame is from another one.
     """
-    same = recording[1:] == recording[:-1]
+    same = stretch[1:] == stretch[:-1]
     return float(np.mean(stats.validity_changes(valid)[same])) if same.any() else float("nan")
 
 

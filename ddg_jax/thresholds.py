@@ -58,7 +58,7 @@ def masked(
     clean_m = frames.surface_m
     made = grafted(replace(config, graft=replace(config.graft, noise_threshold=threshold)), clean_m, x)
     mask = made.predicted_m == 0
-    holes = hole_statistics(np.where(mask, 0.0, 1.0), frames.recording)
+    holes = hole_statistics(np.where(mask, 0.0, 1.0), frames.stretch)
     recorded = frames.depth_m == 0
     known = ~mask & (clean_m > 0)
     error_mm = 1000 * np.abs(made.predicted_m - clean_m)[known] if known.any() else np.array([np.nan])
@@ -89,7 +89,7 @@ def analyse(
     x = predict(jax.random.key(seed), generator, frames.prior, episode=frames.recording, frame=frames.number)
     thresholds = THRESHOLDS if config.depth.representation == DEPTH else WIDE_THRESHOLDS
     rows = [masked(config, x, frames, threshold) for threshold in thresholds]
-    recorded = hole_statistics(frames.depth_m, frames.recording)
+    recorded = hole_statistics(frames.depth_m, frames.stretch)
     value = {
         "recorded": recorded,
         "used": config.graft.noise_threshold,

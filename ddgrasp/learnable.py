@@ -50,6 +50,12 @@ def _check_noise(diffusion: DDGDiffusionConfig) -> None:
             f"at most {most:.1f} with {diffusion.steps} steps of schedule {diffusion.schedule}: the last one "
             "would not be noise, which sampling begins with",
         )
+    if diffusion.log_snr_shift < (least := diffusion.exact_from):
+        raise diffusion.error(
+            "log_snr_shift",
+            f"at least {least:.1f} with {diffusion.steps} steps of schedule {diffusion.schedule}: sampling's "
+            "first step would lose the network's answer to rounding; or take fewer steps",
+        )
 
 
 def _check_losses(student: StudentConfig) -> None:

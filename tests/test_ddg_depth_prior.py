@@ -52,6 +52,10 @@ def test_recordings_and_simulation_on_rgb_see_the_network(weights):
     assert c.shape == (3, 20, 28) and c.std() > 0.1 and abs(np.median(c)) < 0.1
     np.testing.assert_array_equal(prior.from_sim(depth, rgb), c)
     np.testing.assert_array_equal(prior.from_recording(2 * depth, rgb, np.random.default_rng(1)), c)
+    apart = prior.from_recording(depth, rgb, np.random.default_rng(0), consecutive=False)
+    for one, picture in zip(apart, rgb, strict=True):
+        np.testing.assert_array_equal(one, prior.from_sim(depth[:1], picture[None])[0])
+    assert np.abs(apart - c).max() > 1e-3
     assert isinstance(prior.source, dict)
     assert (prior.source["network"], prior.source["source_sha256"]) == ("depth_anything_v2_small", "ab12")
     with pytest.raises(UserError, match="no RGB"):

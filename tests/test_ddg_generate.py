@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from app import cli
+from app.commands import parse
 from ddg_jax import generate, sample, train
 from ddg_jax.prior import make_prior
 from ddgrasp import artifacts, contract
@@ -69,6 +70,19 @@ def run(tmp_path_factory):
         store.append({"depth_mm": depth}, {"object": np.int64(0)})
     artifacts.finish(directory / "demos", "demos", DEMOS_CONFIG, seconds=1, metrics={})
     return directory
+
+
+def test_a_generator_of_another_shape_is_refused_before_anything_is_made(run, tmp_path):
+    depth = DDGDepthConfig(height_px=24, width_px=24)
+    square = dataclasses.replace(CONFIG, ddg=dataclasses.replace(CONFIG.ddg, depth=depth))
+    save_params(tmp_path / "ddg" / sample.PARAMS_FILE, made_up_params(square.ddg))
+    artifacts.finish(tmp_path / "ddg", "ddg", square, seconds=1, metrics={})
+    words = ["--out", str(tmp_path / "out"), "--model", str(tmp_path), "--demos", str(run)]
+    with pytest.raises(
+        UserError, match=r"depth is 48x32, the generator's 24x24: .* --ddg.depth.height-px 16"
+    ):
+        parse("ddg generate", words).run()
+    assert not (tmp_path / "out").exists()
 
 
 def clean_episodes(run) -> list[np.ndarray]:

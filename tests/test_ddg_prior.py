@@ -2,6 +2,7 @@
 
 import json
 import tracemalloc
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -82,6 +83,16 @@ def test_frames_that_do_not_follow_each_other_leave_each_other_alone():
     assert np.abs(apart - made.from_recording(photos, None, rng)).max() > 0.01
 
 
+def test_each_of_unrelated_photos_has_a_scale_of_its_own():
+    near, far = (np.linspace(d, 2 * d, 24 * 32, dtype=np.float32).reshape(1, 24, 32) for d in (0.5, 1.5))
+    made = prior.make_prior(DDGConfig(prior=PriorConfig(source="inverse_depth", decoy_holes=0.0)))
+    photos, rng = np.concatenate([near, far]), np.random.default_rng(0)
+    apart = made.from_recording(photos, None, rng, consecutive=False)
+    for c, photo in zip(apart, (near, far), strict=True):
+        np.testing.assert_array_equal(c, made.from_recording(photo, None, rng)[0])
+    assert np.abs(apart - made.from_recording(photos, None, rng)).max() > 0.3
+
+
 def test_temporal_smoothing_averages_one_surface_and_keeps_moving_edges():
     inverse = np.ones((3, 1, 2), np.float32)
     inverse[:, 0, 0] = (1.0, 1.03, 1.0)
@@ -159,6 +170,41 @@ def test_frames_and_batches(recordings):
         prior.make_prior(DDGConfig(prior=PriorConfig(source="inverse_dept")))
 
 
+@pytest.mark.parametrize("fraction", [0.17, 0.34, 0.5])
+def test_the_held_out_frames_alone_are_those_that_all_of_them_hold_out(recordings, monkeypatch, fraction):
+    config = DDGConfig(
+        depth=DDGDepthConfig(height_px=18, width_px=32),
+        training=DDGTrainingConfig(holdout_fraction=fraction),
+    )
+    given = recordings, config, prior.make_prior(config), 0, Progress(quiet=True)
+    _, held = data.load_frames(*given).split(fraction)
+    read, plainly = [], data._read
+
+    def noted(recording, *given):
+        read.append(recording.path.name)
+        return plainly(recording, *given)
+
+    monkeypatch.setattr(data, "_read", noted)
+    alone = data.load_held_out(*given)
+    assert read == ["b"]
+    for name in ("depth_m", "surface_m", "prior", "recording"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(held, name))
+
+
+@pytest.mark.parametrize("last_mm", [900, 0])
+def test_what_is_held_out_is_so_among_the_frames_that_can_be_used(tmp_path, last_mm):
+    """Of the first recording half is there again, of the last all or nothing can be used."""
+    for name, repeated in (("a", 10), ("b", 0)):
+        with RecordingWriter(tmp_path / name, {"repeated_frames": repeated}) as writer:
+            for number in range(20):
+                depth_mm = 800 + number // 2 if name == "a" else last_mm and last_mm + number
+                writer.add(np.zeros((18, 32, 3), np.uint8), np.full((18, 32), depth_mm, np.uint16))
+    config = replace(WIDE, training=DDGTrainingConfig(holdout_fraction=0.1))
+    given = tmp_path, config, prior.make_prior(config), 0, Progress(quiet=True)
+    _, held = data.load_frames(*given).split(0.1)
+    np.testing.assert_array_equal(data.load_held_out(*given).depth_m, held.depth_m)
+
+
 def _record(path, frames: int = 2, size=(36, 64), **changes):
     with RecordingWriter(path, {}) as writer:
         for _ in range(frames):
@@ -185,6 +231,32 @@ WIDE = DDGConfig(depth=DDGDepthConfig(height_px=18, width_px=32))
 def load(root, config=WIDE):
     notes = Notes()
     return data.load_frames(root, config, prior.make_prior(config), 0, notes), notes.said
+
+
+@pytest.mark.parametrize("follow", [False, True])
+def test_frames_go_together_only_where_a_recording_says_that_they_follow_each_other(tmp_path, follow):
+    """A table, then a box on it within what counts as one surface."""
+    with RecordingWriter(tmp_path / "a", {"consecutive_frames": follow}) as writer:
+        for height_mm in (0, 49):
+            depth = np.full((36, 64), 1300, np.uint16)
+            depth[12:24, 20:40] -= np.uint16(height_mm)  # 0.03 of 0.77 per metre
+            writer.add(np.zeros((36, 64, 3), np.uint8), depth)
+    metric = PriorConfig(source="metric_inverse_depth", decoy_holes=0.0)
+    frames, _ = load(tmp_path, DDGConfig(depth=WIDE.depth, prior=metric))
+    assert (np.ptp(frames.prior[0].astype(float)) > 0.01) == follow  # the table alone is flat
+    assert frames.stretch.tolist() == ([0, 0] if follow else [-1, -2])  # between which nothing flickers
+
+
+def test_a_frame_that_came_again_is_learnt_from_once(tmp_path):
+    """A deployment whose camera stalled holds a picture for every step."""
+    with RecordingWriter(tmp_path / "a", {"repeated_frames": 3}) as writer:
+        for depth_mm in (800, 801, 801, 801, 801, 800):
+            writer.add(np.zeros((36, 64, 3), np.uint8), np.full((36, 64), depth_mm, np.uint16))
+    frames, said = load(tmp_path)
+    np.testing.assert_allclose(frames.depth_m[:, 0, 0], [0.8, 0.801, 0.8], rtol=1e-6)
+    assert said[0].endswith("left out 3 frame(s) that came again") and frames.skipped_frames == 3
+    _record(tmp_path / "b", frames=4)
+    assert len(load(tmp_path)[0]) == 3 + 4  # what no camera gave twice stays
 
 
 def _depth(root, name, frame, image):

@@ -48,7 +48,7 @@ CONFIG = Config(
 def recordings(tmp_path_factory):
     root = tmp_path_factory.mktemp("recordings")
     for name in ("a", "b"):
-        with RecordingWriter(root / name, {}) as writer:
+        with RecordingWriter(root / name, {"consecutive_frames": True}) as writer:
             for t in range(4):
                 depth = np.full((32, 48), 900, np.uint16)
                 depth[8:20, 20 + 2 * t : 30 + 2 * t] = 600
@@ -84,6 +84,24 @@ def test_manifest_says_what_was_made(fitted):
     assert [step for step, _ in read_curves(fitted.directory)["loss"]] == [10]
     picture = cv2.imread(str(fitted.directory / "samples.png"))
     assert picture.shape == (4 * 16, 2 * 24, 3)
+
+
+def test_a_generator_is_not_fitted_on_the_frames_that_it_is_judged_on(recordings, tmp_path, monkeypatch):
+    """In the fit's and the score's place what they are given."""
+    given = {}
+
+    def fitted(config, prior, frames, directory, seed, progress):
+        given["fit"] = frames
+
+    def scored(generator, frames, progress):
+        given["score"] = frames
+        return {}
+
+    monkeypatch.setattr(stage, "fitted_generator", fitted)
+    monkeypatch.setattr(stage, "_score", scored)
+    stage.run(make_job("ddg", CONFIG, tmp_path / "ddg", data=recordings))
+    assert given["fit"].recording.tolist() == [0, 0, 0, 0, 1, 1]
+    assert given["score"].recording.tolist() == [1, 1]
 
 
 def test_generator_loads_and_generates_at_another_size(fitted):

@@ -29,6 +29,8 @@ def test_an_interval_has_the_spread_of_the_draws_around_the_point():
     found = interval(10.0, list(np.linspace(20, 40, 101)))
     assert (found["low"], found["high"]) == pytest.approx((10 - 9.5, 10 + 9.5))
     assert np.isnan(interval(1.0, [])["low"])
+    within = interval(0.99, [0.90, 0.95, 1.0], 0.0, 1.0)
+    assert within == {"value": 0.99, "low": pytest.approx(0.9425), "high": 1.0}
 
 
 def test_weighted_kernels_give_the_discrepancy_of_the_drawn_rows():

@@ -129,6 +129,12 @@ def test_numbers_of_numpy_are_numbers():
     assert EncoderConfig(output_stride=np.int64(16)).output_stride == 16  # pyright: ignore
 
 
+def test_an_output_stride_that_the_stages_do_not_reach_is_refused():
+    assert EncoderConfig(stage_blocks=(1, 1, 1, 1), output_stride=32).output_stride == 32
+    with pytest.raises(UserError, match=r"output_stride is 32; expected at most 16, which is what 3 stage"):
+        EncoderConfig(output_stride=32)
+
+
 def test_a_whole_number_is_a_float_where_floats_are_held():
     whole = DeployConfig(stale_periods=3, arm_lower_m=(-1, -1, 0))
     given = DeployConfig(stale_periods=3.0, arm_lower_m=(-1.0, -1.0, 0.0))
@@ -266,6 +272,29 @@ def test_a_schedule_that_does_not_end_in_noise_is_refused_before_it_is_fitted_an
     ddg = dataclasses.replace(PRESETS["demo"].ddg, diffusion=shifted)
     with pytest.raises(UserError, match=r"log_snr_shift is 3\.0; expected at most 0\.5 with 500 steps"):
         check_learnable(dataclasses.replace(PRESETS["demo"], ddg=ddg))
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "shift", "error"),
+    [("linear", 2500, 0.0, 0.0), ("linear", 4000, 0.0, 0.4), ("cosine", 1000, -10.0, 0.02)],
+)
+def test_a_schedule_whose_first_prediction_rounding_would_drown_is_refused(name, steps, shift, error):
+    """A sampler makes eps of the network's x_0 in float32, and x_0 of eps again."""
+    settings, schedule = DDGDiffusionConfig(steps, name, shift), diffusion.make_schedule(name, steps, shift)
+    x, x_0 = np.random.default_rng(0).standard_normal(10_000).astype(np.float32), np.float32(0.5)
+    signal = np.float32(schedule.alpha_bars[-1])
+    eps = (x - np.sqrt(signal) * x_0) / np.sqrt(1 - signal)
+    back = np.clip(diffusion.predict_x_0(schedule, x, np.array(steps - 1), eps), -1, 1)
+    off = float(np.abs(back - x_0).mean())
+    ddg = dataclasses.replace(PRESETS["demo"].ddg, diffusion=settings)
+    config = dataclasses.replace(PRESETS["demo"], ddg=ddg)
+    if not error:
+        assert off < 0.01
+        check_learnable(config)
+        return
+    assert off > error
+    with pytest.raises(UserError, match=rf"log_snr_shift is {shift}; expected at least .* {steps} steps"):
+        check_learnable(config)
 
 
 @pytest.mark.parametrize(("name", "accepted"), [("linear", 15), ("cosine", 36)])

@@ -127,10 +127,11 @@ class DDGGenerate:
 
     def run(self) -> None:
         """Writes depth.zarr episode by episode and prints how much of it is invalid."""
+        from ddg_jax.sample import check_aspect
         from demos.store import STORE, EpisodeStore
 
         demos = stage_folder("--demos", self.demos, "demos")
-        EpisodeStore(demos / STORE)
+        size = EpisodeStore(demos / STORE).steps("depth_mm", 0, 1).shape[1:]
         parents = {
             "ddg": artifacts.read_artifact(_fitted(self.model)),
             "demos": artifacts.read_artifact(demos),
@@ -138,6 +139,7 @@ class DDGGenerate:
         fitted, config = (
             artifacts.config_from_json(parents[name].manifest.config) for name in ("ddg", "demos")
         )
+        check_aspect(size, fitted.ddg)
         config = replace(config, ddg=fitted.ddg, seed=self.seed)
         stage = get_stage("noisy")
         made = pipeline.make(stage, config, self.out, resume=self.resume, parents=parents).manifest

@@ -12,7 +12,8 @@ from ddgrasp.config import SCORE_FEATURES
 from ddgrasp.errors import unknown_name
 
 NEAR_M, FAR_M = 0.25, 10.0
-"""Depths drawn white and almost black for networks that look at pictures; holes are black."""
+"""Depths drawn white and black for networks that look at pictures; holes are black, too, so that such
+networks cannot tell a hole from what is 9.3 m away or more."""
 
 
 @dataclass(frozen=True)

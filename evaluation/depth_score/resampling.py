@@ -1,5 +1,6 @@
 """Bootstrap over whole episodes: frames of one trajectory resemble each other, trajectories do not."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -33,9 +34,11 @@ def draws(
     return [rng.choice(names, len(names)) for _ in range(count)]
 
 
-def interval(point: float, resampled: Sequence[float]) -> dict[str, float]:
+def interval(
+    point: float, resampled: Sequence[float], least: float = -math.inf, most: float = math.inf
+) -> dict[str, float]:
     """{value, low, high}: percentile interval of the resampled values, moved so that their mean lies on the
-    point.
+    point, as far as it is within what the figure can be.
 
     Resampling with replacement repeats maps, which moves Frechet distances and polynomial MMD upwards by more
     than they vary: only the spread is taken from it.
@@ -45,7 +48,8 @@ def interval(point: float, resampled: Sequence[float]) -> dict[str, float]:
         return {"value": float(point), "low": float("nan"), "high": float("nan")}
     tail = (1 - LEVEL) / 2
     low, high = np.quantile(values - values.mean(), (tail, 1 - tail))
-    return {"value": float(point), "low": float(point + low), "high": float(point + high)}
+    low, high = (float(np.clip(point + end, least, most)) for end in (low, high))
+    return {"value": float(point), "low": low, "high": high}
 
 
 def intervals(

@@ -62,7 +62,7 @@ def _compare(
 
 def _ratio(figures: Table, base: Table) -> dict[str, float]:
     resampled = np.asarray(figures["resampled_fid"]) / np.asarray(base["resampled_fid"])
-    return interval(figures["fid"]["value"] / base["fid"]["value"], list(resampled))
+    return interval(figures["fid"]["value"] / base["fid"]["value"], list(resampled), least=0.0)
 
 
 # --- hole-level figures ----------------------------------------------------------------------------
