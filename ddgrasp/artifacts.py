@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp import contract, machine, upgrades
-from ddgrasp.config import Config, DDGTrainingConfig, DeployConfig, ExportConfig, TeacherConfig
+from ddgrasp.config import Config
 from ddgrasp.config.checks import has_sections
 from ddgrasp.errors import UserError
 from ddgrasp.files import TEMPORARY, atomic_write_json, read_json, to_json
-from ddgrasp.stages import config_fields, get_stage
+from ddgrasp.stages import INDIFFERENT, config_fields, get_stage
 from ddgrasp.versions import library_versions
 
 MANIFEST = "manifest.json"
@@ -28,14 +28,6 @@ STARTED = "started.json"
 START = "start"
 """Among a stage's inputs the checkpoint that it began with; notes of before 2026-11-29 do not have it."""
 
-_INDIFFERENT = {
-    "export.max_abs_diff": ExportConfig.max_abs_diff,
-    "deploy.workers": DeployConfig.workers,
-    "teacher.checkpoint_every": TeacherConfig.checkpoint_every,
-    "ddg.training.checkpoint_every": DDGTrainingConfig.checkpoint_every,
-}
-"""Fields that decide whether or how a result comes about, not what it is. They count as these values when
-configurations are compared, so that a stage that missed its bound, or took too much memory, goes on."""
 _ORIGINS = ("trained", "loaded")
 
 
@@ -370,7 +362,7 @@ def _to_tuple(value: Any) -> Any:
 
 def _relevant(config: Mapping[str, Any], stage: str) -> dict[str, Any]:
     compared = copy.deepcopy(dict(config))
-    for name, value in _INDIFFERENT.items():
+    for name, value in INDIFFERENT.items():
         *sections, field = name.split(".")
         if isinstance(section := _at(compared, sections), dict):
             section[field] = value

@@ -189,7 +189,6 @@ STUDENT_PAPER = replace(
     LAPTOP,
     preset="student_paper",
     world=WorldConfig(),
-    demos=DemosConfig(episodes=1200),
     student=StudentConfig(
         picture=PictureConfig(channels=("depth",)),
         encoder=EncoderConfig(
@@ -216,13 +215,13 @@ hand. A sample takes 42 ms forward and backward on two Intel Xeon cores, so that
 minutes; after 1,300 steps of 32 it does not look yet, after 24,350 of 64 it has its demos by heart
 (docs/table2.md). Not the paper's: group norm for batch norm, random first weights
 (--student.encoder.weights weights/resnet18), three frames at 112 x 144, 1,500 steps of 64 (the paper gives
-none of these sizes)."""
+none of these sizes), a closing of the hand that lasts, and the loop's rules (deploy.retry)."""
 
 PAPER = Config(
     preset="paper",
     world=WorldConfig(backend="jax", camera_scale=0.5),
     teacher=replace(_FROM_NOTHING, total_steps=100_000_000, num_envs=8192, minibatches=32),
-    demos=DemosConfig(episodes=1200, parallel=256),
+    demos=DemosConfig(episodes=1200, parallel=256, rgb=False),
     record=RecordConfig(trajectories=80),
     ddg=_PAPER_DDG,
     student=StudentConfig(
@@ -255,8 +254,10 @@ bumps: deviations are counted from planes, and the network knows where in the pi
 encoder: ResNet-18 from random numbers, where the paper's starts from ImageNet's weights, for the same reason
     (--student.encoder.weights weights/resnet18); its last stage keeps stride 16, and keypoints pool it.
 student: sees relief over the table instead of depth, its holes filled from around them, and has a hand view,
-    privileged losses and DAgger, which the paper has not: perception to 5 mm is what decides whether it
-    grasps (docs/student_log.md).
+    privileged losses, pose rounds and DAgger, which the paper has not: perception to 5 mm is what decides
+    whether it grasps (docs/student_log.md). Besides the generator's noise it trains with ripple made by hand
+    and a fifth of clean samples (--student.training.disparity-noise-px 0 --student.training.clean-share 0),
+    gives two actions at a time, and its loop has the rules of deploy.retry.
 crops: shifted by up to 12 pixels around the window's place, since the camera's place is known here.
 teacher: networks, number of environments and steps are not in the paper; ours for its 95 %. A fifth of the
     episodes begin with the object in the hand and half of the others above it, and the reward is ours; the

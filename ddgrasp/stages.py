@@ -6,6 +6,14 @@ The one table of the flow: the pipeline runs it, manifests are hashed by it, rep
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from ddgrasp.config import (
+    DDGTrainingConfig,
+    DeployConfig,
+    ExportConfig,
+    FrankaConfig,
+    RealSenseConfig,
+    TeacherConfig,
+)
 from ddgrasp.errors import unknown_name
 
 
@@ -79,6 +87,18 @@ def get_stage(name: str) -> Stage:
     if name not in _BY_NAME:
         raise unknown_name("stage", name, _BY_NAME)
     return _BY_NAME[name]
+
+
+INDIFFERENT = {
+    "export.max_abs_diff": ExportConfig.max_abs_diff,
+    "deploy.workers": DeployConfig.workers,
+    "deploy.franka.host": FrankaConfig.host,
+    "deploy.realsense.serial": RealSenseConfig.serial,
+    "teacher.checkpoint_every": TeacherConfig.checkpoint_every,
+    "ddg.training.checkpoint_every": DDGTrainingConfig.checkpoint_every,
+}
+"""Fields that decide whether or how a result comes about, not what it is. They count as these values when
+configurations are compared, so that a stage that missed its bound, or took too much memory, goes on."""
 
 
 def config_fields(stage: Stage, known: Sequence[Stage] = tuple(_BY_NAME.values())) -> tuple[str, ...]:

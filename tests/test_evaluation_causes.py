@@ -16,6 +16,7 @@ from deploy_support import constant_bias, describe, write_policy
 from evaluation import causes, rig_trials
 from evaluation.report import trials_page
 from evaluation.rig_trials import Series
+from rig.camera import RigCamera
 from rig.world import make_world
 
 CONFIG = get_preset("debug")
@@ -25,7 +26,7 @@ SERIES = Series("development", objects=("cube", "can"), trials=1, seconds=0.5)
 
 @pytest.fixture
 def policy(tmp_path):
-    info = describe(depth_height=PROFILE.height_px, depth_width=PROFILE.width_px)
+    info = describe(profile=PROFILE)
     return write_policy(tmp_path / "policy.onnx", info, bias=constant_bias(0.0, -1.0))
 
 
@@ -70,6 +71,40 @@ def test_the_table_is_kept_and_its_trials_are_not_run_again(tmp_path, policy):
     other = Series("development", ("cube",), 1, number=1, seconds=0.5)
     with pytest.raises(UserError, match="begun otherwise: .*number is 0 there, 1 here"):
         causes.run(CONFIG, policy, names, other, out, 0)
+
+
+def _first_frame(rig, trial, of):
+    """(depth of a trial's first step, `of` its (model, data) at that moment)."""
+    made = []
+
+    def watch(step, camera):
+        made.append((step.frame.depth.astype(int), of(*camera.scene())))
+        return True
+
+    rig.run(trial, watch)
+    return made[0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [Change(sight="ideal", off=(0.05, 0.0)), Change("furniture", sight="ideal")],
+    ids=["camera off", "furniture"],
+)
+def test_every_trial_is_seen_in_its_changed_world_from_where_its_camera_stands(policy, change):
+    config = causes.one_pose(SERIES.configured(CONFIG, policy))
+    rig, plain = Rig(config, policy, change), Rig(config, policy, Change(sight="ideal"))
+    for trial in SERIES.plan():  # two in one rig: nothing stays of the first
+        draw = drawn(config, trial)
+        pose = change.displaced(draw.T_world_cam, draw.world_seed)
+
+        def rendered(model, data, pose=pose):
+            profile = config.world.profile
+            return RigCamera(model, config.record.stereo, profile, ideal=True).clean_mm(data, pose)
+
+        seen, expected = _first_frame(rig, trial, rendered)
+        np.testing.assert_array_equal(seen, expected)
+        before, _ = _first_frame(plain, trial, rendered)
+        assert np.mean(np.abs(seen - before) > 3) > 0.01
 
 
 def test_logs_of_other_lengths_are_not_paired_and_old_ones_without_go_on(tmp_path, policy):

@@ -80,6 +80,12 @@ def test_the_projector_lights_what_a_principal_point_off_the_middle_shows():
     assert np.mean(lost[-20:, 60:]) < 0.15
 
 
+def test_another_projector_lights_the_same_surfaces():
+    one, other = (ActiveStereo(StereoConfig(pattern_seed=seed), PROFILE) for seed in (455, 1))
+    np.testing.assert_array_equal(one._texture, other._texture)
+    assert not np.array_equal(one._pattern, other._pattern)
+
+
 def test_disparity_is_quantised_in_32nds():
     depth_mm = sense(wall(0.6))
     values = np.unique(depth_mm[depth_mm > 0])

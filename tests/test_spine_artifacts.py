@@ -225,6 +225,16 @@ def test_how_a_result_comes_about_may_change_on_resume(name, stage, tmp_path):
     artifacts.check_place(tmp_path, stage, _changed(name, 3))
 
 
+@pytest.mark.parametrize("name", ["deploy.franka.host", "deploy.realsense.serial"])
+def test_a_lab_s_own_devices_do_not_forbid_to_go_on(name, tmp_path):
+    artifacts.begin(tmp_path, "deploy", CONFIG)
+    (tmp_path / "work").touch()
+    section, field = name.split(".")[1:]
+    mine = dataclasses.replace(getattr(CONFIG.deploy, section), **{field: "192.168.0.7"})
+    deploy = dataclasses.replace(CONFIG.deploy, **{section: mine})
+    artifacts.check_place(tmp_path, "deploy", dataclasses.replace(CONFIG, deploy=deploy))
+
+
 def test_an_artifact_of_another_config_is_refused_naming_both_values(tmp_path):
     _finish(tmp_path / "export")
     other = dataclasses.replace(CONFIG, export=ExportConfig(latency_runs=7))

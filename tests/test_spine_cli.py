@@ -503,7 +503,9 @@ def test_a_teacher_s_world_is_its_run_s_wherever_the_run_stands(tmp_path):
         ("ddg score --real REAL --repeat-scenes 2", "--repeat-scenes"),
         ("ddg score --curve-steps 9", "--curve-steps"),
         ("ddg curve --columns inpaint ddg", "--columns"),
+        ("ddg curve --repeats 3", "--repeats"),
         ("ddg samplers --tsne-maps 9", "--tsne-maps"),
+        ("ddg samplers --inpaint-radius-px 5", "--inpaint-radius-px"),
         ("ddg samplers --curve-trajectories 5", "--curve-trajectories"),
     ],
 )
@@ -511,3 +513,12 @@ def test_what_a_score_would_not_read_is_refused(command, option, tmp_path):
     words = [str(tmp_path) if word == "REAL" else word for word in command.split()]
     with pytest.raises(UserError, match=rf"^{option}: .* does nothing with it; leave it out\.$"):
         parse(" ".join(words[:2]), [*words[2:], "--out", str(tmp_path / "out")]).run()
+
+
+@pytest.mark.parametrize("kind", ["curve", "samplers"])
+def test_a_second_extractor_is_refused_where_one_is_read(kind, tmp_path):
+    several = ["--features", "depthfeat-v1", "resnet18", "--out", str(tmp_path)]
+    with pytest.raises(
+        UserError, match=rf"^--features depthfeat-v1 resnet18: `ddgrasp ddg {kind}` scores by one"
+    ):
+        parse(f"ddg {kind}", several).run()

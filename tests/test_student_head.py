@@ -67,6 +67,20 @@ def test_features_in_batches_are_those_of_all_frames_at_once():
     assert len(np.unique(np.asarray(seen.features), axis=0)) == 70
 
 
+def test_every_batch_of_features_is_seen_under_noise_of_its_own(monkeypatch):
+    keys = []
+
+    def encode(student, profile, params, depth_mm, state, crops, key=None):
+        keys.append(key)
+        count = len(state)
+        aux = Aux(np.zeros((count, 3)), np.zeros((count, 2)), np.zeros(count))
+        return Seen(np.zeros((count, feature_count(student))), aux)
+
+    monkeypatch.setattr(train, "encode", encode)
+    head._encode_all(CONFIG, {}, frames_of((40, 30)), np.random.default_rng(7), Progress(quiet=True))
+    assert len({tuple(np.ravel(jax.random.key_data(key))) for key in keys}) == 2
+
+
 def test_samples_of_both_kinds_are_joined_column_by_column():
     a, b = (_samples(frames, number) for number, frames in enumerate((frames_of((4,)), frames_of((2, 3)))))
     joined = head._join(a, b)

@@ -26,6 +26,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.layout import STATE
 from ddgrasp.progress import Progress
 from demos.rollout import Actor, Episodes, Roller
+from mjx_envs.camera import nominal_camera
 from mjx_envs.views import Views
 from ppo.policy import TeacherPolicy
 from student_jax import dagger, evaluate, head, train
@@ -274,6 +275,8 @@ def test_the_head_takes_over_from_the_teacher_round_by_round(teacher, roller, pa
     config = replace(CONFIG, student=replace(CONFIG.student, poses=poses))
     head.fit_on_poses(config, teacher, params, tmp_path, Progress(quiet=True))
     assert given == [(True, 1.0), (False, 0.5), (False, 0.25), (False, 0.0)]
+    begins = np.concatenate([made.observation[:, 0] for made in roller.made])
+    assert len(np.unique(begins, axis=0)) == 4 * COUNT  # no scene twice
 
 
 def check_rows(poses: Frames, made: list[Episodes]) -> None:
@@ -326,3 +329,13 @@ def test_a_perception_that_nothing_has_trained_is_not_measured(teacher, roller, 
     config = replace(CONFIG, student=untrained)
     made = evaluate.closed_loop(config, teacher, Nearer(), params, Progress(quiet=True))
     assert not any("position_error_mm" in counts for counts in made.values())
+
+
+def test_every_episode_has_a_camera_of_its_own_within_the_configured_error(compiled):
+    nominal, most_m = nominal_camera(CONFIG.world.profile).T_world_cam, CONFIG.world.random.camera_position_m
+    made = [compiled.run(jax.random.PRNGKey(seed), lambda scene: scene.expert).T_world_cam for seed in (0, 1)]
+    cameras = np.concatenate(made)
+    for axis in (cameras[:, :3, 3] - nominal[:3, 3]).T:
+        assert np.abs(axis).max() <= most_m + 1e-6 and np.ptp(axis) > most_m / 2
+        assert np.diff(np.sort(axis)).min() > 1e-6
+    assert len(np.unique(cameras[:, :3, :3].reshape(len(cameras), -1), axis=0)) == 2 * COUNT

@@ -284,6 +284,24 @@ def _with_frames(trainer: Trainer) -> Trainer:
     return trainer
 
 
+def test_every_step_of_a_fit_on_pictures_draws_samples_of_its_own(tmp_path, monkeypatch):
+    drawn = []
+
+    def step(config, profile, steps, state, frozen, batch):
+        drawn.append(np.sort(np.asarray(batch.depth_mm[:, -1, 0, 0])))  # a frame's number, by its depth
+        zeros = {name: jnp.zeros(()) for name in ("position_error_mm", "yaw", "held")}
+        return state.replace(step=state.step + 1), zeros
+
+    monkeypatch.setattr(train, "train_step", step)
+    training = dataclasses.replace(CONFIG.training, batch_size=4)
+    config = Config("test", student=dataclasses.replace(CONFIG, training=training))
+    trainer = Trainer(config, cast(Any, None), cast(Any, None), tmp_path, Progress(quiet=True))
+    _with_frames(trainer).params = {"encoder": {"w": np.ones(2, np.float32)}}
+    for phase in ("demos", "dagger-1"):
+        trainer._fit(phase, 6)
+    assert len(np.unique(drawn, axis=0)) > 6
+
+
 def test_a_fit_on_pictures_draws_steps_with_the_object_in_the_hand_by_their_weight(tmp_path, monkeypatch):
     drawn = []
 
@@ -506,6 +524,28 @@ def test_a_hole_in_a_surface_is_no_edge():
     holed = stack.at[..., row - 1 : row + 1, column - 1 : column + 1].set(0.0)
     whole, made = (np.asarray(disparity_noise(jax.random.key(0), x, PROFILE, config)) for x in (stack, holed))
     np.testing.assert_array_equal(made[holed > 0], whole[holed > 0])
+
+
+def test_position_yaw_and_holding_each_pull_at_what_is_seen(monkeypatch):
+    """`_Blind` reports 0.5 for everything, beyond Huber's bound of positions: slope 0.05, weight 40."""
+    _, _, gradient = _blind_step(monkeypatch, **PLAIN, aux_weight=1.0)
+    position = 40 * 0.05
+    yaw = (0.5 - np.cos(0.4)) + (0.5 - np.sin(0.4))  # mean over cosine and sine of 2 (0.5 - target)
+    held = 0.3 * (1 / (1 + np.exp(-0.5)) - 0.5)  # two of four are held
+    assert gradient == pytest.approx(position + yaw + held, rel=1e-4)
+
+
+def test_a_step_shows_the_network_the_windows_that_were_drawn(monkeypatch):
+    crops, apply = [], _Blind.apply
+
+    def kept(self, variables, depth_m, state, crop_rc, method):
+        crops.append(crop_rc)
+        return apply(self, variables, depth_m, state, crop_rc, method)
+
+    monkeypatch.setattr(_Blind, "apply", kept)
+    batch, *_ = _blind_step(monkeypatch, **PLAIN)
+    np.testing.assert_array_equal(crops[0], batch.crop_rc)
+    assert np.any(np.asarray(crops[0]) != PROFILE.crop_origin_px)
 
 
 def test_an_object_that_is_not_seen_is_a_hole_as_large_as_it_is():

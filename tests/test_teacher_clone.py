@@ -76,6 +76,12 @@ def test_the_clone_acts_as_the_guide_does_where_it_has_never_been(clone, collect
     np.testing.assert_allclose(normalizer.std, std, rtol=1e-3)
 
 
+def test_every_round_of_cloning_is_of_episodes_of_its_own(clone, collector):
+    clone()
+    first, second = (seen[: TEACHER.clone_envs] for seen in collector.kept)  # the first step of each
+    assert len(np.unique(np.concatenate([first, second]), axis=0)) == 2 * TEACHER.clone_envs
+
+
 def test_what_a_clone_explores_with_is_action_std_whatever_it_sees(clone, collector):
     _, policy, normalizer = clone()
     seen, networks = np.concatenate(collector.kept), learner.make_networks(TEACHER)

@@ -244,6 +244,30 @@ def _experience(
     )  # fmt: skip
 
 
+def test_an_update_is_made_with_the_configured_numbers(monkeypatch):
+    """None of them is Brax's default."""
+    asked = {}
+
+    class Asked(Exception):
+        pass
+
+    def loss(*_, **given):
+        asked.update(given)
+        raise Asked
+
+    monkeypatch.setattr(learner.ppo_losses, "compute_ppo_loss", loss)
+    odd: dict[str, float] = {
+        "discount": 0.8, "gae_lambda": 0.7, "clip": 0.1, "entropy_cost": 0.01, "reward_scaling": 0.3,
+    }  # fmt: skip
+    config = replace(SETTLING, **odd)
+    state = learner_without_envs(config)
+    data = _experience(config, state)
+    with pytest.raises(Asked):
+        learner.improve(config, devices.make_mesh(), state, data, {})
+    names = ("discounting", "gae_lambda", "clipping_epsilon", "entropy_cost", "reward_scaling")
+    assert [asked[name] for name in names] == list(odd.values())
+
+
 @pytest.fixture(scope="module")
 def settled() -> dict[int, tuple[learner.LearnerState, learner.LearnerState, float]]:
     """Iteration -> learner before and after it, divergence: of a policy that moved as far as `target_kl`."""

@@ -20,11 +20,11 @@ HELD_M, BESIDE_M = np.add(contract.LIFT_TARGET_M, (0, 0.04, 0)), np.add(contract
 
 
 class Still:
-    """Physics in which nothing moves and both pads press; a joint faster than 1e6 rad/s blows them up."""
+    """Physics in which all stays as it is; a joint faster than 1e6 rad/s blows them up."""
 
     def step(self, params, state, ctrl):
         """The state as it was."""
-        return replace(state, qvel=jnp.where(state.qvel > 1e6, jnp.nan, 0.0), touch=jnp.ones(2))
+        return replace(state, qvel=jnp.where(state.qvel > 1e6, jnp.nan, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +41,15 @@ def first(env) -> State:
 
 @pytest.fixture(scope="module")
 def stepped(env, first) -> Callable[..., State]:
-    """(object's place, m; action; the one before; speed of the joints, rad/s; counters of the episode) -> the
-    state a step later."""
+    """(object's place, m; action; the one before; speed of the joints, rad/s; force of both pads, N; counters
+    of the episode) -> the state a step later."""
     step = jax.jit(env.step)
 
-    def after(place_m, action=CLOSE, last=CLOSE, speed_rad_s=0.0, **counters: int) -> State:
+    def after(
+        place_m, action=CLOSE, last=CLOSE, speed_rad_s=0.0, touch_n=(1.0, 1.0), **counters: int
+    ) -> State:
         qpos = first.data.qpos.at[QPOS.object_pos].set(place_m)
-        data = replace(first.data, qpos=qpos, qvel=jnp.full(15, speed_rad_s), touch=jnp.ones(2))
+        data = replace(first.data, qpos=qpos, qvel=jnp.full(15, speed_rad_s), touch=jnp.array(touch_n))
         counted = {name: jnp.asarray(value, jnp.int32) for name, value in counters.items()}
         episode = replace(first.info["episode"], action=last, **counted)
         return step(first.replace(data=data, info=first.info | {"episode": episode}), action)
@@ -73,6 +75,16 @@ def test_success_is_an_object_held_for_the_last_five_steps(stepped, held, steps,
     assert (contract.HOLD_STEPS, WORLD.episode_steps) == (5, 6)
     state = stepped(HELD_M, hold_count=held, steps=steps)
     assert (state.metrics["success"], state.done) == (success, steps == 5)
+
+
+@pytest.mark.parametrize(
+    ("touch_n", "grasped"), [((1.0, 1.0), 1), ((1.0, 0.0), 0), ((0.0, 1.0), 0), ((0.2, 1.0), 0)], ids=str
+)
+def test_an_object_is_grasped_by_both_pads(stepped, touch_n, grasped):
+    state = stepped(HELD_M, touch_n=touch_n, hold_count=4, steps=5)
+    assert bool(state.info["episode"].grasped) == bool(grasped)
+    assert state.metrics["success"] == grasped
+    assert (float(state.metrics["reward/grasp"]) > 0) == bool(grasped)
 
 
 def test_an_episode_whose_physics_blow_up_at_its_end_has_not_succeeded(stepped):

@@ -1,5 +1,7 @@
 """Reward terms against the paper's equations, worked out by hand."""
 
+import math
+
 import jax.numpy as jnp
 import pytest
 
@@ -143,3 +145,17 @@ def test_what_counts_as_grasped(touching, closing, metres):
     state = jnp.array(bool(touching)), jnp.array(bool(closing)), jnp.array(metres)
     assert bool(rewards.grasped(RewardConfig(), *state)) == (touching and closing)
     assert bool(rewards.grasped(PAPER_REWARD, *state)) == (closing and metres < rewards.NEAR_M)
+
+
+def test_the_angles_are_from_the_grasp_and_from_pointing_down_unturned():
+    """The hand points down, turned by 0.5 about the vertical; the grasp is turned by 0.8."""
+
+    def down(yaw_rad: float):
+        return jnp.array([0.0, math.cos(yaw_rad / 2), math.sin(yaw_rad / 2), 0.0])
+
+    there = jnp.array([0.5, 0.1, 0.03])
+    qpos = jnp.zeros(16).at[9:12].set(there).at[12].set(1.0)
+    for weights in (RewardConfig(), PAPER_REWARD):
+        seen = rewards.distances(weights, qpos, there, down(0.8), (there, down(0.5)))
+        assert float(seen.grasp_angle) == pytest.approx(0.3, abs=2e-3)
+        assert float(seen.upright_angle) == pytest.approx(0.5, abs=2e-3)

@@ -20,7 +20,8 @@ from ddgrasp.stages import get_stage
 
 _OF_CURVE = ("curve_trajectories", "curve_steps")
 _OF_RIG = ("trajectories", "frames", "repeat_scenes", "repeats")
-_OF_TABLE = ("columns", "tsne_maps", "monocular", "monocular_weights")
+_OF_TABLE = ("columns", "tsne_maps", "monocular", "monocular_weights", "inpaint_radius_px")
+_OF_REPEATS = ("repeat_scenes", "repeats")
 """Fields of `ScoreConfig` that one kind of score alone reads."""
 
 
@@ -53,6 +54,11 @@ class Scoring:
         from evaluation.depth_score.page import print_result
 
         self._refuse(ignored, f"`ddgrasp ddg {stage_name}`")
+        if stage_name != "score" and len(self.score.features) > 1:
+            raise UserError(
+                f"--features {' '.join(self.score.features)}: `ddgrasp ddg {stage_name}` scores by one of "
+                "them; name one."
+            )
         check_score(self.score)
         stage, source = get_stage(stage_name), self.run_dir or self.out
         config = replace(load_config(source, "ddg"), score=self.score, seed=self.seed)
@@ -122,7 +128,7 @@ class DDGCurve(Scoring):
 
     def run(self) -> None:
         """Fits and scores each point that is not there yet."""
-        self._make("curve", _OF_TABLE)
+        self._make("curve", (*_OF_TABLE, *_OF_REPEATS))
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,8 @@ class DeployConfig(Section, name="deploy"):
     has held something for a second lifts it, and stays there (deploy/retry.py). Without it the policy alone
     acts."""
     stale_periods: Annotated[float, Range(0, 1000, above=True)] = 2.0
-    """A frame older than this many control periods makes the robot hold position."""
+    """A new frame older than this many control periods makes the robot hold position; so does one that has
+    been seen already, whatever its age."""
     acceleration_scale: Annotated[float, Range(0, 100, above=True)] = 2.0
     """Largest change between two steps, relative to Franka's acceleration limit. Targets lead the arm, so
     they may change faster than the arm itself; from 2.8 on, a full reversal of any joint passes."""
@@ -104,7 +105,8 @@ class DeployConfig(Section, name="deploy"):
     workers: Annotated[int, Range(1, 1024)] = 2
     """Processes that run simulated-clock trials."""
     film_every: Annotated[int, Range(1, 10000)] = 6
-    """Steps between two columns of a trial's film strip."""
+    """Steps between two columns of a trial's film strip; a deployment with the stereo camera, which is drawn
+    here, records these frames alone."""
     clock: ClockName = "machine"
     """Whose time the loop keeps: this machine's, or the robot's own (an arm that may be slower than real)."""
     franka: FrankaConfig = field(default_factory=FrankaConfig)

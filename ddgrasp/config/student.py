@@ -94,6 +94,10 @@ class EncoderConfig(Section, name="student.encoder"):
         for name in ("width", "max_channels"):
             if self.norm == "group" and getattr(self, name) % GROUP_CHANNELS:
                 raise self.error(name, f"a multiple of {GROUP_CHANNELS}, as norm group needs")
+        largest = STEM_STRIDE * 2 ** (len(self.stage_blocks) - 1)
+        if self.output_stride > largest:
+            stages = f"{len(self.stage_blocks)} stage(s) of stage_blocks"
+            raise self.error("output_stride", f"at most {largest}, which is what {stages} reach")
 
 
 @dataclass(frozen=True)
@@ -172,7 +176,8 @@ class StudentTrainingConfig(Section, name="student.training"):
     batch_size: Batch = 64
     """Samples per step."""
     noise_draws: Annotated[int, Range(1, 10_000)] = 8
-    """Diffusion steps and noises drawn for each encoded sample: the encoder is what costs."""
+    """Diffusion steps and noises drawn for each encoded sample, since the encoder is what costs; read where
+    action_weight is above 0, the head's own training draws one."""
     learning_rate: LearningRate = 1e-3
     """AdamW's step size after the warm-up; falls to a fiftieth along a cosine."""
     weight_decay: WeightDecay = 1e-4

@@ -47,7 +47,7 @@ class TeacherConfig(Section, name="teacher"):
     """Above 0 the step size is raised and lowered so that an update changes the policy by about this KL
     divergence (as rsl_rl does by its desired_kl); 0 lets it decay linearly."""
     critic_learning_rate: LearningRate = 5e-4
-    """The same for the value network."""
+    """Adam's step size for the value network at the start; always decays linearly to a tenth."""
     discount: Share = 0.97
     """How much a reward one control step later counts (gamma)."""
     gae_lambda: Share = 0.95
@@ -55,8 +55,9 @@ class TeacherConfig(Section, name="teacher"):
     Brax's, whose advantage is a step's own error plus discount, not discount times lambda, times the next
     step's."""
     action_std: Annotated[float, Range(0, 10, above=True)] = 0.15
-    """Standard deviation of the exploration noise of the arm's joints at the start, before the tanh. A loaded
-    policy's is as it was."""
+    """Standard deviation of the exploration noise of the arm's joints at the start, before the tanh. What a
+    loaded policy has learnt of its noise is relative to it: as much as its own training had leaves it as it
+    was."""
     gripper_std: Annotated[float, Range(0, 10, above=True)] = 0.15
     """The same for the gripper's command, which counts by its sign alone."""
     min_std: Annotated[float, Range(0, 10)] = 0.01

@@ -99,7 +99,8 @@ class RandomConfig(Section, name="world.random"):
     camera_angle_rad: Annotated[float, Range(0, 0.5)] = 0.015
     """Camera orientation, each axis."""
     latency_share: Share = 0.0
-    """Share of episodes in which every command takes effect one control step late."""
+    """Share of episodes in which every command takes effect one control step late, in the simulation of
+    training; the rigs' arms have none."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,8 @@ class WorldConfig(Section, name="world"):
     """Physics time step; must divide the control period of 0.1 s. Keep it at 5 ms or less: with 10 ms the
     fingers eject what they grasp."""
     camera_scale: CameraScale = 0.25
-    """Size of the depth camera's picture relative to 1280 x 720."""
+    """Size of the depth camera's picture relative to 1280 x 720. For a RealSense at most 0.66: its stream is
+    848 x 480."""
     reward: RewardConfig = field(default_factory=RewardConfig)
     random: RandomConfig = field(default_factory=RandomConfig)
 

@@ -32,7 +32,7 @@ def stereo(config: StereoConfig, profile: CameraProfile) -> Sense:
     """The rig's camera on clean depth of `profile`'s size; the light is that of the nominal extrinsics."""
     camera = of_scale(config, profile)
     T_world_cam = nominal_camera(profile).T_world_cam
-    texture = albedo_texture(config.pattern_seed, profile.height_px, profile.width_px)
+    texture = albedo_texture(profile.height_px, profile.width_px)
     wear = 1.0 + TABLE_TEXTURE * texture[..., None]
     one_at_a_time = threading.Lock()  # OpenCV's matcher keeps buffers of its own
 
