@@ -15,7 +15,7 @@ from ddgrasp.errors import UserError
 STATE_LAYOUT = "q7 rad + gripper width m + its change since the control step before m"
 REMEDY = "make one with `ddgrasp export`"
 _DIGITS = 12
-"""Digits of a camera's scale: a quotient that is a unit in its last place off could round a side otherwise."""
+"""Digits of a camera's scale: a quotient one unit in its last place off could round a side otherwise."""
 
 
 @dataclass(frozen=True)
