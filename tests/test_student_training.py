@@ -289,8 +289,13 @@ def test_every_step_of_a_fit_on_pictures_draws_samples_of_its_own(tmp_path, monk
 
     def step(config, profile, steps, state, frozen, batch):
         drawn.append(np.sort(np.asarray(batch.depth_mm[:, -1, 0, 0])))  # a frame's number, by its depth
+        assert set(np.unique(batch.action[..., 7])) <= {
+            -1.0,
+            1.0,
+        }  # the gripper's labels are its two commands
         zeros = {name: jnp.zeros(()) for name in ("position_error_mm", "yaw", "held")}
-        return state.replace(step=state.step + 1), zeros
+        averaged = jax.tree.map(lambda x: 0 * x + 7, state.ema)
+        return state.replace(step=state.step + 1, ema=averaged), zeros
 
     monkeypatch.setattr(train, "train_step", step)
     training = dataclasses.replace(CONFIG.training, batch_size=4)
@@ -300,6 +305,7 @@ def test_every_step_of_a_fit_on_pictures_draws_samples_of_its_own(tmp_path, monk
     for phase in ("demos", "dagger-1"):
         trainer._fit(phase, 6)
     assert len(np.unique(drawn, axis=0)) > 6
+    np.testing.assert_array_equal(trainer.params["encoder"]["w"], 7)  # the averaged ones
 
 
 def test_a_fit_on_pictures_draws_steps_with_the_object_in_the_hand_by_their_weight(tmp_path, monkeypatch):

@@ -41,17 +41,19 @@ def first(env) -> State:
 
 @pytest.fixture(scope="module")
 def stepped(env, first) -> Callable[..., State]:
-    """(object's place, m; action; the one before; speed of the joints, rad/s; force of both pads, N; counters
-    of the episode) -> the state a step later."""
+    """(object's place, m; action; the one before; speed of the joints, rad/s; force of both pads, N; what the
+    hand was off by before besides, rad; counters of the episode) -> the state a step later."""
     step = jax.jit(env.step)
 
     def after(
-        place_m, action=CLOSE, last=CLOSE, speed_rad_s=0.0, touch_n=(1.0, 1.0), **counters: int
+        place_m, action=CLOSE, last=CLOSE, speed_rad_s=0.0, touch_n=(1.0, 1.0), off_rad=0.0, **counters: int
     ) -> State:
         qpos = first.data.qpos.at[QPOS.object_pos].set(place_m)
         data = replace(first.data, qpos=qpos, qvel=jnp.full(15, speed_rad_s), touch=jnp.array(touch_n))
         counted = {name: jnp.asarray(value, jnp.int32) for name, value in counters.items()}
         episode = replace(first.info["episode"], action=last, **counted)
+        off = {name: getattr(episode.distances, name) + off_rad for name in ("grasp_angle", "upright_angle")}
+        episode = replace(episode, distances=replace(episode.distances, **off))
         return step(first.replace(data=data, info=first.info | {"episode": episode}), action)
 
     return after
@@ -85,6 +87,27 @@ def test_an_object_is_grasped_by_both_pads(stepped, touch_n, grasped):
     assert bool(state.info["episode"].grasped) == bool(grasped)
     assert state.metrics["success"] == grasped
     assert (float(state.metrics["reward/grasp"]) > 0) == bool(grasped)
+
+
+def test_the_reward_s_acceleration_is_of_the_joints_in_rad_per_s2(stepped):
+    accel = float(stepped(HELD_M, speed_rad_s=0.02).metrics["reward/accel"])
+    assert accel == pytest.approx(-WORLD.reward.accel * 7 * (0.02 / 0.1) ** 2, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "touch_n", "lifted"),
+    [(0.04, (1.0, 1.0), True), (0.02, (1.0, 1.0), False), (0.04, (0.0, 0.0), False)],
+)
+def test_what_is_lifted_is_kept_upright_and_what_lies_is_aligned_with(
+    stepped, first, height_m, touch_n, lifted
+):
+    place_m = first.data.qpos[QPOS.object_pos].at[2].set(first.info["episode"].rest_height + height_m)
+    metrics = stepped(place_m, touch_n=touch_n, off_rad=0.5).metrics
+    expected = {
+        "orient": 0.5 * WORLD.reward.orient * lifted,
+        "align": 0.5 * WORLD.reward.align * (not lifted),
+    }
+    assert {name: float(metrics[f"reward/{name}"]) for name in expected} == pytest.approx(expected, abs=1e-5)
 
 
 def test_an_episode_whose_physics_blow_up_at_its_end_has_not_succeeded(stepped):

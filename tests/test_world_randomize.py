@@ -166,7 +166,9 @@ def test_the_hand_above_the_object_is_turned_from_the_grasp(turn_rad):
     random = replace(NOTHING, pregrasp_share=1, pregrasp_turn_rad=turn_rad)
     env = GraspEnv(WorldConfig(objects=("cube",), random=random))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 200))
-    _, hand = kinematics.grip_pose(state.data.qpos[:, QPOS.arm], jnp)
+    place, hand = kinematics.grip_pose(state.data.qpos[:, QPOS.arm], jnp)
+    above = np.asarray(place - state.obs[:, OBSERVATION.grasp_pos])[:, 2]
+    assert above.min() > -0.01 and np.ptp(above) > 0.7 * randomize.PREGRASP_HEIGHT_M
     grasp = state.obs[:, OBSERVATION.grasp_quat]
     turn = np.asarray(kinematics.quat_mul(hand, kinematics.quat_conj(grasp, jnp), jnp))
     angle = 2 * np.arctan2(turn[:, 3] * np.sign(turn[:, 0]), np.abs(turn[:, 0]))
