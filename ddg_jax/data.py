@@ -124,12 +124,17 @@ def load_held_out(root: Path, config: DDGConfig, prior: Prior, seed: int, progre
         return load_frames(root, config, prior, seed, progress).split(fraction)[1]
     held = held_out_count(lengths, fraction)
     first = len(folders) - 1 - int(np.flatnonzero(np.cumsum(lengths[::-1]) >= held)[0])
-    frames = _loaded(root, folders[first:], config, prior, seed, progress, first_number=first)
+    try:
+        frames = _loaded(root, folders[first:], config, prior, seed, progress, first_number=first)
+    except UserError:
+        frames = None  # the last recordings are not for this prior
+    if frames is None or frames.skipped_frames or frames.refused_recordings:
+        return load_frames(root, config, prior, seed, progress).split(fraction)[1]
     return frames.part(slice(-held, None))
 
 
 def _lengths_if_whole(folders: list[Path]) -> Int[np.ndarray, " R"] | None:
-    """Frames of each recording; None if one of them has some that are damaged, blind or there again."""
+    """Frames of each recording; None if one of them has some that are damaged, black or there again."""
     lengths = []
     for folder in folders:
         try:

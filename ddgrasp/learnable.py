@@ -78,7 +78,11 @@ def _on_pictures(student: StudentConfig) -> bool:
 
 
 def _check_sight(student: StudentConfig) -> None:
-    """What acts must see, and what sees must have been trained."""
+    """What acts must see, and what sees must have been trained, and be what it is called."""
+    encoder = student.encoder
+    if encoder.output_stride > (largest := encoder.largest_stride):
+        stages = f"{len(encoder.stage_blocks)} stage(s) of stage_blocks"
+        raise encoder.error("output_stride", f"at most {largest}, which is what {stages} reach")
     if student.head.conditioning == "film" and not student.head.blocks:
         raise UserError(
             "student.head.blocks is 0 with student.head.conditioning film, which acts in blocks alone: the "

@@ -22,16 +22,17 @@ def need(config: Config) -> Need:
     steps = demos.parallel * config.world.episode_steps
     host = demos.parallel * pixels + steps * _STEP_BYTES
     remedy = "demos.parallel or world.camera_scale"
-    return Need("demos", drawing_bytes(config), host, steps * pixels, remedy)
+    return Need("demos", drawing_bytes(config, demos.parallel, demos.rgb), host, steps * pixels, remedy)
 
 
-def drawing_bytes(config: Config) -> int:
-    """What a picture of every environment takes: the JAX ray caster, all at once, as on accelerators."""
+def drawing_bytes(config: Config, count: int, rgb: bool) -> int:
+    """What a picture of each of `count` environments takes: the JAX ray caster, all at once, as on
+    accelerators."""
     world = replace(config.world, backend="cpu", renderer="jax")
     nobody = TeacherPolicy(np.zeros(0), np.zeros(0), [])
-    roller = Roller(replace(config, world=world), nobody, config.demos.parallel, with_rgb=config.demos.rgb)
+    roller = Roller(replace(config, world=world), nobody, count, with_rgb=rgb)
     programs = roller.programs()
-    return max(traced_bytes(*_call(programs[name])) for name in ("depth", *["rgb"] * config.demos.rgb))
+    return max(traced_bytes(*_call(programs[name])) for name in ("depth", *["rgb"] * rgb))
 
 
 def _call(program: tuple) -> tuple:

@@ -1,5 +1,6 @@
 """The pseudo-real rig's camera: colour and active-stereo depth of a MuJoCo state. JAX-free."""
 
+from dataclasses import replace
 from functools import partial
 
 import mujoco
@@ -7,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8, UInt16
 
 from ddgrasp import contract
-from ddgrasp.config import Config, RecordConfig, StereoConfig
+from ddgrasp.config import Config, RandomConfig, RecordConfig, StereoConfig
 from ddgrasp.depth import to_millimetres
 from mjx_envs import draws, kinematics
 from mjx_envs.camera import Buffers, Camera, look_at, nominal_camera
@@ -94,9 +95,10 @@ def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> Float64[np.
 
 
 def standing_pose(config: Config) -> Float64[np.ndarray, "4 4"]:
-    """(4, 4) T_world_cam of the test rig's camera while nobody draws trials: one place, whatever seed the
-    configuration has, so that a calibration of it holds for every policy."""
-    return camera_pose(config, np.random.default_rng(_STANDS))
+    """(4, 4) T_world_cam of the test rig's camera while nobody draws trials: one place, whatever seed or
+    spread the configuration has, so that a calibration of it holds for every policy."""
+    usual = replace(config, world=replace(config.world, random=RandomConfig()))
+    return camera_pose(usual, np.random.default_rng(_STANDS))
 
 
 def camera_pose(config: Config, rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:

@@ -1,6 +1,5 @@
 """What training the student takes: of the device by shapes alone, of host and disk by counting frames."""
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,6 +15,7 @@ from student_jax import train
 from student_jax.act import act_on_depth
 from student_jax.data import CACHE, Window, kept_of_a_demo
 from student_jax.policy import Aux, param_shapes
+from student_jax.source_check import needs_rgb
 
 _ROW_BYTES = 4 * (9 + 8 + 40 + 1) + 17
 """A training step beside its picture: state, action, observation, held, episode, step and drawn."""
@@ -37,7 +37,8 @@ def need(config: Config) -> Need:
     )
     height, width = Window.seen(profile, student.training.crop_shift_px).shape
     disk = frames * 2 * height * width + acting * length * picture
-    device = max(training_bytes(config), acting_bytes(config, acting), _drawing_bytes(config, acting))
+    drawing = drawing_bytes(config, acting, needs_rgb(config))
+    device = max(training_bytes(config), acting_bytes(config, acting), drawing)
     remedy = (
         "student.training.batch_size, student.dagger.episodes, evaluation.student_trials or "
         "world.camera_scale"
@@ -79,11 +80,6 @@ def acting_bytes(config: Config, count: int) -> int:
     return traced_bytes(
         act_on_depth, student, profile, param_shapes(student, profile), depth_mm, state, noise
     )
-
-
-def _drawing_bytes(config: Config, count: int) -> int:
-    demos = replace(config.demos, parallel=count, rgb=False)
-    return drawing_bytes(replace(config, demos=demos))
 
 
 def _shape(*sizes: int, dtype: Any = jnp.float32) -> Any:

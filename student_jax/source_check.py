@@ -15,13 +15,21 @@ LEARNED = ("learned", "learned_ungrafted")
 def check_source(config: Config) -> None:
     """UserError if the weights of the source, or of the generator's prior, are missing, or the demos will
     lack the colour that the source needs."""
-    name, network = config.student.depth_source, config.ddg.prior.source in NETWORKS
-    by_network = network and DepthNetworkPrior(config.ddg).needs_sim_rgb
+    name = config.student.depth_source
+    if config.ddg.prior.source in NETWORKS:
+        DepthNetworkPrior(config.ddg)
     if name == "monocular":
         MonocularDepth(config.ddg)
-    needs_rgb = by_network if name in LEARNED else name in (*BY_COLOUR, "monocular")
-    if needs_rgb and not config.demos.rgb:
+    if needs_rgb(config) and not config.demos.rgb:
         raise UserError(
             f"student.depth_source {name!r} needs colour in the demos, and demos.rgb is false: give "
             "--demos.rgb, or take another source."
         )
+
+
+def needs_rgb(config: Config) -> bool:
+    """Whether the source sees colour, so that all of its pictures are drawn in it."""
+    name, prior = config.student.depth_source, config.ddg.prior
+    if name in LEARNED:
+        return prior.source in NETWORKS and prior.in_sim == "rgb"
+    return name in (*BY_COLOUR, "monocular")

@@ -129,10 +129,18 @@ def test_numbers_of_numpy_are_numbers():
     assert EncoderConfig(output_stride=np.int64(16)).output_stride == 16  # pyright: ignore
 
 
-def test_an_output_stride_that_the_stages_do_not_reach_is_refused():
-    assert EncoderConfig(stage_blocks=(1, 1, 1, 1), output_stride=32).output_stride == 32
-    with pytest.raises(UserError, match=r"output_stride is 32; expected at most 16, which is what 3 stage"):
-        EncoderConfig(output_stride=32)
+def test_an_output_stride_that_the_stages_do_not_reach_is_refused_and_read_as_ever():
+    for blocks, refused in (((1, 1, 1, 1), False), ((1, 1, 1), True)):
+        encoder = EncoderConfig(stage_blocks=blocks, output_stride=32)
+        student = dataclasses.replace(PRESETS["demo"].student, encoder=encoder)
+        config = dataclasses.replace(PRESETS["demo"], student=student)
+        if not refused:
+            check_learnable(config)
+            continue
+        with pytest.raises(
+            UserError, match=r"output_stride is 32; expected at most 16, which is what 3 stage"
+        ):
+            check_learnable(config)
 
 
 def test_a_whole_number_is_a_float_where_floats_are_held():

@@ -72,11 +72,14 @@ class Calibrate:
         if self.out is not None:
             check_file("--out", self.out)
         from deploy.calibration.session import CalibrationOptions, run
+        from deploy.interrupts import ended_late
 
         run(self.config, CalibrationOptions(
             self.camera, self.host, self.board.made(), self.poses, self.speed,
             dry_run=self.dry_run, yes=self.yes, out=self.out,
         ), say)  # fmt: skip
+        if ended_late():
+            raise KeyboardInterrupt
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,9 @@ from ddgrasp.files import atomic_write_bytes
 from ddgrasp.install import FR3, check_fr3
 from deploy.devices.options import RIG_HOST
 
+PRACTICE, PRACTISED = Path("runs/practice"), "calibration.json"
+"""Folder of what is done on the rig, apart from an arm's own; a calibration in it."""
+
 
 @dataclass(frozen=True)
 class RigFr3:
@@ -38,8 +41,11 @@ class RigFr3:
         thing = (scene.meshed if self.shapes == "mesh" else scene.primitive)(self.object_name)
         with Fr3Rig(self.host, thing, self.seed, self.speed, with_board=self.board) as rig:
             what = "calibrate" if self.board else "deploy --policy FILE.onnx --robot franka"
-            kept = f"runs/practice{'/calibration.json' if self.board else ''}"  # apart from an arm's own
-            drive = f"ddgrasp {what} --host {self.host} --camera rig --out {kept}"
+            kept = PRACTICE / PRACTISED if self.board else PRACTICE
+            place = f" --calibration {PRACTICE / PRACTISED}" if (PRACTICE / PRACTISED).exists() else ""
+            drive = (
+                f"ddgrasp {what} --host {self.host} --camera rig --out {kept}{'' if self.board else place}"
+            )
             print(f"FR3 at {self.host} before {self.object_name!r}. Drive it: {drive}", flush=True)
             while rig.running():
                 time.sleep(0.2)

@@ -94,10 +94,11 @@ class EncoderConfig(Section, name="student.encoder"):
         for name in ("width", "max_channels"):
             if self.norm == "group" and getattr(self, name) % GROUP_CHANNELS:
                 raise self.error(name, f"a multiple of {GROUP_CHANNELS}, as norm group needs")
-        largest = STEM_STRIDE * 2 ** (len(self.stage_blocks) - 1)
-        if self.output_stride > largest:
-            stages = f"{len(self.stage_blocks)} stage(s) of stage_blocks"
-            raise self.error("output_stride", f"at most {largest}, which is what {stages} reach")
+
+    @property
+    def largest_stride(self) -> int:
+        """What the stages reach; a larger `output_stride` makes no other network."""
+        return STEM_STRIDE * 2 ** (len(self.stage_blocks) - 1)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """`ddgrasp calibrate`: where the camera stands, measured with a board that the robot shows it."""
 
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -23,7 +24,7 @@ from deploy.clock import RealClock, RobotClock
 from deploy.devices.options import SessionOptions, Setup
 from deploy.devices.registry import IMAGERS, ROBOTS
 from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, Robot, RobotError
-from deploy.interrupts import terminable, unbroken
+from deploy.interrupts import note, terminable, unbroken
 from deploy.session import ask_person, for_devices, keep_time_of, survived
 from deploy.setup import check_start, safety_filter, space_notice
 from sensors.charuco_board import CharucoBoard, Corners
@@ -229,7 +230,10 @@ def _give_back(driver: Driver, options: CalibrationOptions, say: Callable[[str],
     try:
         ask_person("Take hold of the board: the hand opens. Ready?")
         driver.grip(close=False)
-    except (UserError, EOFError, KeyboardInterrupt):
+    except KeyboardInterrupt:
+        note(signal.SIGINT)  # what was measured is kept, and what follows in a script does not begin
+        say("the hand keeps the board")
+    except (UserError, EOFError):
         say("the hand keeps the board")
     except RobotError as error:
         say(f"the hand may have kept the board: {error}")
@@ -271,7 +275,8 @@ def _solved(
     atomic_write_bytes(sheet, picture.sheet(taken.pictures, taken.views, found, lens, options.board))
     _check_fit(found.rms_px, 1e3 * options.board.square_m, sheet, say)
     standing.save(options.file, result)
-    say(f"{options.file}, {sheet}: `ddgrasp deploy` reads the first, look at the second")
+    reads = "`ddgrasp deploy`" if options.out is None else f"`ddgrasp deploy --calibration {options.file}`"
+    say(f"{options.file}, {sheet}: {reads} reads the first, look at the second")
     away = standing.offset(found.T_base_cam, standing.nominal_pose())
     say(standing.describe(away, config.world.random))
     return result

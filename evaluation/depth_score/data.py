@@ -5,8 +5,8 @@ geometry, on which every method draws its depth; what the camera itself would ha
 it is the real-vs-real floor, and the reference of paired measures. No method sees it.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +52,8 @@ class Episode:
     """If some method needs colour."""
     focal_px: float
     baseline_m: float
+    consecutive: bool = True
+    """Whether the frames follow each other; otherwise each is a photo of its own."""
 
     def repeated(self) -> "Episode":
         """The episode of a world that stands still: the first frame, as often as it was sensed again."""
@@ -188,8 +190,8 @@ class RealFrames:
     baseline_m: float
     unaligned: tuple[Path, ...] = ()
     """Recordings among them whose colour is not aligned to depth."""
-    apart: tuple[Path, ...] = ()
-    """Recordings among them whose frames may be of different moments (`Recording.consecutive`)."""
+    apart: Mapping[int, Path] = field(default_factory=dict)
+    """Recordings among them whose frames may be of different moments (`Recording.consecutive`), by number."""
 
     @property
     def blocks(self) -> list[int]:
@@ -222,7 +224,7 @@ def load_real(root: Path, width_px: int, last: int) -> RealFrames:
     scored = [recordings[number] for number in np.unique(numbers)]
     focal_px, baseline_m = _optics(scored)
     unaligned = tuple(r.path for r in scored if not r.color_aligned)
-    apart = tuple(r.path for r in scored if not r.consecutive)
+    apart = {int(n): r.path for n, r in zip(np.unique(numbers), scored, strict=True) if not r.consecutive}
     size, chosen = _size(recordings[0], width_px), [(recordings[number], i) for number, i in frames[-last:]]
     depth_mm = np.stack([depth.crop_nearest(r.depth_mm(i), size) for r, i in chosen])
     rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
@@ -283,7 +285,7 @@ def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
                 Episode(
                     side, len(episodes), block, depth_mm[rows], clean[rows],
                     np.zeros((0, *depth_mm.shape[1:]), np.uint16), rgb[rows] if with_rgb else None,
-                    frames.focal_px, frames.baseline_m,
+                    frames.focal_px, frames.baseline_m, int(frames.recording[first]) not in frames.apart,
                 )
             )  # fmt: skip
     return episodes

@@ -33,6 +33,8 @@ LIMIT = "sim_graft_limit"
 reach at best, whatever the generator."""
 _REPEATS = 100_000
 """Added to an episode's number where its world stands still: other noise than the moving episode's."""
+_PHOTOS = 1000
+"""Times an episode's number: what its frames count from where each is an episode of its own."""
 
 
 def monocular_network(score: ScoreConfig, ddg: DDGConfig) -> "ddg_jax.network_prior.DepthNetworkPrior | None":
@@ -132,7 +134,8 @@ def _monocular(name: str) -> Callable[[Methods, Episode], Maps]:
 
         assert methods.monocular is not None and episode.rgb is not None
         reference = to_metres(episode.sensed_mm if episode.side == REAL else episode.clean_mm)
-        relative = methods.monocular.relative(episode.rgb, reference.shape[1:])
+        pictures = [episode.rgb] if episode.consecutive else [picture[None] for picture in episode.rgb]
+        relative = np.concatenate([methods.monocular.relative(p, reference.shape[1:]) for p in pictures])
         far_m = methods.generator.config.depth.far_m
         fitted = [metric_depth(r, d, far_m) for r, d in zip(relative, reference, strict=True)]
         return {name: to_millimetres(np.stack(fitted))}
@@ -145,9 +148,12 @@ def _generated(methods: Methods, episode: Episode) -> Maps:
 
     from ddg_jax.sample import generate
 
+    count, number, frame = len(episode.clean_mm), episode.number, None
+    if not episode.consecutive:
+        number, frame = number * _PHOTOS + np.arange(count), np.zeros(count, int)
     made = generate(
         jax.random.key(methods.seed), methods.generator, to_metres(episode.clean_mm), episode.rgb,
-        episode=episode.number,
+        episode=number, frame=frame,
     )  # fmt: skip
     return {"sim_ddg": to_millimetres(made.depth_m), "sim_ddg_no_graft": to_millimetres(made.predicted_m)}
 

@@ -3,7 +3,8 @@
 Everything is kept as sums over an episode, so that episodes add up and can be resampled. NumPy and OpenCV.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -128,6 +129,21 @@ def added(sums: Sequence[Sums]) -> Sums:
 
 
 # --- figures --------------------------------------------------------------------------------------
+
+
+SHARES = (
+    "invalid_share", "flicker", "persistence", "outlier_share", "repeat_iou", "repeat_flicker",
+    *(f"gap_{name}" for name in BINS),
+)  # fmt: skip
+SIGNED = ("bias_mm",)
+"""Figures between 0 and 1, and such as may be negative; all others are 0 or more."""
+
+
+def bounds(names: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """(least, most) of each of these figures."""
+    return {
+        name: (-math.inf if name in SIGNED else 0.0, 1.0 if name in SHARES else math.inf) for name in names
+    }
 
 
 def figures(total: Sums) -> dict[str, float]:

@@ -84,7 +84,7 @@ def run(job: Job) -> Artifact:
 
 
 def _apart(frames: score_data.RealFrames) -> str:
-    first, *others = frames.apart
+    first, *others = frames.apart.values()
     return APART.format(first=first.name, more=f" and {len(others)} more" if others else "")
 
 

@@ -53,10 +53,16 @@ def interval(
 
 
 def intervals(
-    point: Mapping[str, float], resampled: Sequence[Mapping[str, float]]
+    point: Mapping[str, float],
+    resampled: Sequence[Mapping[str, float]],
+    bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> dict[str, dict[str, float]]:
-    """`interval` of every named figure."""
-    return {name: interval(value, [other[name] for other in resampled]) for name, value in point.items()}
+    """`interval` of every named figure, within its `bounds` where it has some."""
+    within = bounds or {}
+    return {
+        name: interval(value, [other[name] for other in resampled], *within.get(name, (-math.inf, math.inf)))
+        for name, value in point.items()
+    }
 
 
 def bootstrap_pairs(

@@ -90,7 +90,8 @@ def _domain_figures(
 
     resampled = [figures([mine[i] for i in o], [real[i] for i in t]) for o, t in drawn]
     curves = {name: list(values) for name, values in holes.curves(holes.added(mine)).items()}
-    return {"figures": intervals(figures(mine, real), resampled), "curves": curves}
+    point = figures(mine, real)
+    return {"figures": intervals(point, resampled, holes.bounds(point)), "curves": curves}
 
 
 # --- targets ---------------------------------------------------------------------------------------

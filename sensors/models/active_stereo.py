@@ -49,7 +49,7 @@ TEXELS_PER_PX = 3
 """Resolution of the stored pattern."""
 TEXTURE_PX, TEXTURE_PX_PER_M = 512, 400.0
 """Size and scale of the albedo texture that `Material.texture` weighs (a 1.3 m tile)."""
-_TEXTURE_SEED = 455
+TEXTURE_SEED = 455
 """Surfaces are the scene's: the same whatever camera looks at them."""
 SPREAD_PX = 9
 """A translucent body spreads the projector's dots over this width: about two of their distances."""
@@ -78,9 +78,15 @@ class ActiveStereo:
     The pattern and the matcher are made once; frames differ by the generator given to `sense`.
     """
 
-    def __init__(self, config: StereoConfig, profile: CameraProfile, windows: float = 1.0):
+    def __init__(
+        self,
+        config: StereoConfig,
+        profile: CameraProfile,
+        windows: float = 1.0,
+        texture_seed: int = TEXTURE_SEED,
+    ):
         """`windows` is how many times wider all windows are than `config` says: they cover the same part of a
-        larger picture then."""
+        larger picture then. `texture_seed` draws the albedo of what it looks at."""
         self.config = config = config.finer(windows) if windows != 1.0 else config
         self._dark_px, self._contrast_px, self._texture_px, self._spread_px = (
             odd(side * windows) for side in (DARK_WINDOW_PX, CONTRAST_WINDOW_PX, TEXTURE_WINDOW_PX, SPREAD_PX)
@@ -93,7 +99,7 @@ class ActiveStereo:
         self._vignetting = (1.0 + self._x**2 + self._y**2) ** np.float32(-VIGNETTING / 2)
         self._projector = _projector_profile(profile)
         self._pattern = _dot_pattern(config, profile, self._projector)
-        self._texture = albedo_texture(TEXTURE_PX, TEXTURE_PX)
+        self._texture = albedo_texture(TEXTURE_PX, TEXTURE_PX, texture_seed)
         self._fb_px_m = p.fx_px * p.baseline_m
         self._disparities = 16 * math.ceil(self._fb_px_m / config.min_range_m / 16)
         self._matcher = matching.matcher(config, self._disparities)
@@ -312,9 +318,11 @@ def _dot_pattern(config: StereoConfig, profile: CameraProfile, projector: Camera
     return (np.minimum(texture, 2.0) * cosine**PROJECTOR_FALLOFF).astype(np.float32)
 
 
-def albedo_texture(height_px: int, width_px: int) -> Float32[np.ndarray, "height width"]:
-    """(height, width) float32 noise of unit variance over several octaves, seamless: always the same."""
-    rng = np.random.default_rng(_TEXTURE_SEED)
+def albedo_texture(
+    height_px: int, width_px: int, seed: int = TEXTURE_SEED
+) -> Float32[np.ndarray, "height width"]:
+    """(height, width) float32 noise of unit variance over several octaves, seamless; `seed` is the scene."""
+    rng = np.random.default_rng(seed)
     frequency = np.hypot(np.fft.fftfreq(height_px)[:, None], np.fft.fftfreq(width_px)[None, :])
     frequency[0, 0] = np.inf
     noise = np.fft.ifft2(np.fft.fft2(rng.standard_normal((height_px, width_px))) / frequency).real

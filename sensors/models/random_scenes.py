@@ -67,7 +67,7 @@ def random_device(rng: np.random.Generator, width_px: int) -> ActiveStereo:
         refine_window_px=int(rng.choice((3, 5, 7))),
         subpixel_steps=int(rng.choice((8, 16, 32))),
     )
-    return ActiveStereo(config, profile)
+    return ActiveStereo(config, profile, texture_seed=config.pattern_seed)
 
 
 def take_picture(rng: np.random.Generator, device: ActiveStereo) -> Picture:
