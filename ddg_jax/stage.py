@@ -87,14 +87,16 @@ def sample_folder(
 
 
 def fitted_generator(
-    config: DDGConfig, prior: Prior, frames: data.Frames, directory: Path, seed: int, progress: Progress
-) -> Generator:
+    config: DDGConfig, prior: Prior, frames: data.Frames, directory: Path, seed: int, progress: Progress,
+    curve: str = "",
+) -> Generator:  # fmt: skip
     """A generator fitted on all of `frames`, or the one that `config.init_from` names; distilled if its
-    sampler is. Parameters and checkpoints go to `directory`, whence it continues.
+    sampler is. Parameters and checkpoints go to `directory`, whence it continues; curves of the fit are named
+    `curve` + scalar.
     """
     if config.sampling.sampler == PROGRESSIVE:
         check_halving(config)
-    fitted = _loaded(config) if config.init_from else fit(config, frames, directory, seed, progress)
+    fitted = _loaded(config) if config.init_from else fit(config, frames, directory, seed, progress, curve)
     generator = Generator(config, fitted, prior)
     generator.save(directory)
     if config.sampling.sampler != PROGRESSIVE:

@@ -195,10 +195,12 @@ def train_step(
     return state, {"loss": loss, "grad_norm": optax.global_norm(grads)}
 
 
-def fit(config: DDGConfig, frames: Frames, directory: Path, seed: int, progress: Progress) -> Params:
+def fit(
+    config: DDGConfig, frames: Frames, directory: Path, seed: int, progress: Progress, curve: str = ""
+) -> Params:
     """Trains for `config.training.steps` and returns the averaged parameters.
 
-    Checkpoints go to `directory`/checkpoints (see `loop.run_steps`).
+    Checkpoints go to `directory`/checkpoints, curves are named `curve` + scalar (see `loop.run_steps`).
     """
 
     def step_once(state: TrainState, step: int) -> tuple[TrainState, dict[str, Array]]:
@@ -213,5 +215,6 @@ def fit(config: DDGConfig, frames: Frames, directory: Path, seed: int, progress:
         every=config.training.checkpoint_every,
         label="fitting the generator",
         progress=progress,
+        curve=curve,
     )
     return jax.tree.map(np.asarray, state.ema)

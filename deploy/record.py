@@ -121,7 +121,7 @@ class DeploymentRecord:
         if self._film:
             steps, rgb, depth_mm = zip(*self._film, strict=True)
             film = Film(steps, np.stack(rgb), np.stack(depth_mm))
-            sheet = contact_sheet(film, f"{ENDED[success]} {report['fault']}")
+            sheet = contact_sheet(film, report["fault"])  # without the verdict, which people may change
             atomic_write_bytes(folder / FILM_FILE, sheet)
 
     def _keep(self, index: int, rgb: np.ndarray, depth_mm: np.ndarray) -> None:

@@ -49,7 +49,7 @@ class RecordingBench:
                 if step.index == 0:  # also where a trial is run again
                     frames.close()
                     profile = self._config.world.profile
-                    kept[:] = [DeploymentRecord(camera, profile, f"{about['camera']}, D455 profile", 1)]
+                    kept[:] = [DeploymentRecord(camera, profile, _sensor(about), 1)]
                     frames.enter_context(kept[0].into(folder))
                 kept[0].look(step)
                 return None if watch is None else watch(step, camera)
@@ -62,6 +62,12 @@ class RecordingBench:
     def close(self) -> None:
         """See Bench."""
         self._bench.close()
+
+
+def _sensor(about: Mapping[str, Any]) -> str:
+    """What recordings call the camera: one whose depth was treated is another."""
+    treated = f", depth {about['depth']}" if "depth" in about else ""
+    return f"{about['camera']}, D455 profile{treated}"
 
 
 def episode_folder(folder: Path, index: int, object_name: str) -> Path:

@@ -12,7 +12,11 @@ PERCEPTION_FILE = "perception.json"
 
 def describe(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows as text."""
-    lines = [list(rows[0]), *([str(value) for value in row.values()] for row in rows)] if rows else []
+    lines = (
+        [list(rows[0]), *(["" if value is None else str(value) for value in row.values()] for row in rows)]
+        if rows
+        else []
+    )
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))] if lines else []
     return "\n".join("  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)) for line in lines)
 

@@ -156,7 +156,9 @@ def run(
     make = series.make(config)
     if record:
         _check_recorded(out)
-        make = RecordedBench(make, out / EPISODES, {"robot": f"rig {series.rig}", "camera": series.camera})
+        about = {"robot": f"rig {series.rig}", "camera": series.camera}
+        about |= {"depth": series.depth} if series.depth != RECORDED else {}
+        make = RecordedBench(make, out / EPISODES, about)
     results = run_missing(config, policy, series.plan(), make, header, out, workers, progress, failures)
     table = tabulate(results, trained_on(header))
     atomic_write_text(out / TABLE_FILE, json.dumps({"series": asdict(series), **table}, indent=1) + "\n")

@@ -75,8 +75,15 @@ def load(directory: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     saved, teacher = read_json(path), artifacts.read_artifact(directory)
-    here, there = ({**world, "objects": None} for world in (teacher.manifest.config["world"], saved["world"]))
-    return saved["objects"] if _alike(here, there) and saved["teacher"] == teacher.hash else []
+    its_own = saved["teacher"] == teacher.hash and is_its_world(teacher, saved["world"])
+    return saved["objects"] if its_own else []
+
+
+def is_its_world(teacher: Artifact, world: Mapping[str, Any]) -> bool:
+    """Whether `world`, a `WorldConfig` as JSON, is the one that the teacher was trained in, whatever the
+    objects."""
+    here, there = ({**settings, "objects": None} for settings in (teacher.manifest.config["world"], world))
+    return _alike(here, there)
 
 
 def _alike(here: Any, there: Any) -> bool:

@@ -43,6 +43,8 @@ def describe(value: dict[str, Any]) -> str:
     """'96.7 % of 300 (94.0 to 98.2)': rate, trials and interval as people read them."""
     if not value["n"]:
         return "no trials"
-    return (
-        f"{100 * value['rate']:.1f} % of {value['n']} ({100 * value['low']:.1f} to {100 * value['high']:.1f})"
+    rate = 100 * value["rate"]
+    digits = next(
+        d for d in range(1, 17) if value["successes"] in (0, value["n"]) or 0 < round(rate, d) < 100
     )
+    return f"{rate:.{digits}f} % of {value['n']} ({100 * value['low']:.1f} to {100 * value['high']:.1f})"

@@ -13,7 +13,7 @@ import pytest
 
 from app.commands import parse
 from app.lerobot import card, dataset, demonstrations, deployments, steps
-from app.lerobot.source import limited, open_source
+from app.lerobot.source import open_source
 from ddgrasp import contract
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
@@ -79,7 +79,7 @@ def test_a_selection_by_object_and_number(tmp_path):
     write_demos(tmp_path)
     chosen = open_source(tmp_path, [NAMES[1]])
     assert [len(read().state) for read in chosen.episodes] == [LENGTHS[0], LENGTHS[2]]
-    assert [len(read().state) for read in limited(chosen, 1).episodes] == [LENGTHS[0]]
+    assert [len(read().state) for read in open_source(tmp_path, [NAMES[1]], most=1).episodes] == [LENGTHS[0]]
     with pytest.raises(UserError, match="Unknown object 'pineapple'"):
         open_source(tmp_path, ["pineapple"])
 
@@ -119,6 +119,19 @@ def test_deployments_that_are_no_episodes_are_named(tmp_path):
         open_source(tmp_path / "thin")
     with pytest.raises(UserError, match="Unknown object 'can'"):
         open_source(tmp_path, ["can"])
+
+
+def test_the_card_is_of_the_episodes_that_are_taken_and_of_what_their_depth_is(tmp_path):
+    write_deployment(tmp_path / "a", robot="sim", camera="stereo", depth="inpaint")
+    write_deployment(tmp_path / "b", robot="sim", camera="ideal")
+    write_deployment(tmp_path / "c", robot="franka", camera="realsense")
+    treated, ideal, raw = open_source(tmp_path).about["Camera"].split("; ")[1::2]
+    about = open_source(tmp_path, most=1).about
+    assert about["Robot"] == "Franka arm; driver or rig: sim."
+    assert about["Camera"] == "stereo, across the table; its depth is what the policy saw, treated: inpaint."
+    assert treated == "its depth is what the policy saw, treated: inpaint"
+    assert ideal == "its depth is clean, without a camera's errors"
+    assert raw == "its depth is raw, with its holes and noise."
 
 
 def test_a_folder_without_episodes(tmp_path):
@@ -348,7 +361,7 @@ def test_a_video_caps_what_is_too_far_and_the_card_says_so(read, tmp_path):
     from lerobot.datasets import LeRobotDataset
 
     written = write_demos(tmp_path / "run", with_rgb=False, largest_mm=6000)
-    contents = write(limited(open_source(tmp_path / "run"), 1), tmp_path / "set")
+    contents = write(open_source(tmp_path / "run", most=1), tmp_path / "set")
     depth_mm = written[0]["depth_mm"]
     assert contents.farther == np.count_nonzero(depth_mm > 4095) > 0
     assert f"{contents.farther} pixels" in (tmp_path / "set" / "README.md").read_text()

@@ -259,6 +259,15 @@ def test_a_frame_that_came_again_is_learnt_from_once(tmp_path):
     assert len(load(tmp_path)[0]) == 3 + 4  # what no camera gave twice stays
 
 
+def test_recordings_of_several_sensors_are_named(tmp_path):
+    for name, sensor in (("a", "D435"), ("b", "D455"), ("c", "D435")):
+        _record(tmp_path / name, sensor=sensor)
+    assert load(tmp_path)[1] == [
+        "recordings of several sensors, which one generator will mix: D435 (2), D455 (1)"
+    ]
+    assert load(tmp_path / "a")[1] == []
+
+
 def _depth(root, name, frame, image):
     (root / name / "depth" / f"{frame:06d}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
 

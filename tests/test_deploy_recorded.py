@@ -57,6 +57,19 @@ def test_a_recorded_trial_is_an_episode(tmp_path, policy):
     assert deployments.verdict(deployments.find(out / rig_trials.EPISODES)).startswith("Success 0.0 % of 1")
 
 
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [({"depth": "inpaint"}, "treated: inpaint"), ({"camera": "ideal"}, "clean, without a camera's errors")],
+)
+def test_depth_that_is_not_the_cameras_is_not_handed_on_as_raw(tmp_path, policy, how, said):
+    series = Series("development", ("apple",), 1, seconds=0.4, **how)
+    rig_trials.run(CONFIG, policy, series, tmp_path, 0, Progress(quiet=True), record=True)
+    about = open_source(tmp_path / rig_trials.EPISODES).about["Camera"]
+    assert said in about and "raw" not in about
+    (folder,) = (tmp_path / rig_trials.EPISODES).iterdir()
+    assert ("inpaint" in Recording.open(folder).meta["sensor"]) == ("depth" in how)
+
+
 def test_recording_changes_nothing_in_a_trial(tmp_path, policy):
     trial = Trial(3, "cube")
     plain, _ = Rig(CONFIG, policy).run(trial)

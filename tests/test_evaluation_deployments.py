@@ -35,6 +35,7 @@ def test_a_fault_that_nobody_judged_is_a_failure():
         (deployment(fault=REFLEX, dry_run=True), None, f"fault: {REFLEX}"),
         (deployment(fault=REFLEX, interrupted=True), None, f"fault: {REFLEX}"),
         (deployment(interrupted=True), None, "interrupted"),
+        (deployment(True, interrupted=True), True, "lifted and held, then interrupted"),
         (deployment(dry_run=True), None, "dry run"),
     ],
 )

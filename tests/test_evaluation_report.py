@@ -26,6 +26,7 @@ from evaluation.report.run_page import render_html
 from evaluation.report.stage import write_report
 from evaluation.report.summary import build_report, print_summary, summary_rows
 from evaluation.report.targets import targets
+from lerobot_support import write_deployment
 from report_support import unexplained
 from rig.film import INVALID_RGB, colored
 
@@ -131,6 +132,11 @@ def test_an_incomplete_run_says_what_was_not_run(tmp_path):
     artifacts.finish(tmp_path / "teacher", "teacher", CONFIG, seconds=1, metrics=METRICS["teacher"])
     rows = summary_rows(build_report(tmp_path))
     assert rows[-1] == ("deploy", "", "", "not run")
+    (tmp_path / "student" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "student" / "checkpoints" / "100").touch()
+    said = {row[0]: row[-1] for row in summary_rows(build_report(tmp_path))}
+    assert said["student"] == "begun, not finished: the same command with --resume goes on"
+    assert said["export"] == "not run"
     assert "student_rig" not in build_report(tmp_path)
 
 
@@ -194,12 +200,14 @@ def test_what_is_no_run_is_refused_for_what_it_is(run_dir, tmp_path):
     row = tmp_path / "table2" / "trials" / "development-test-0" / "ddg"
     row.mkdir(parents=True)
     (tmp_path / "table2" / "study.html").touch()
+    write_deployment(tmp_path / "arm" / "one")
     for place, said in (
         ("empty", "holds no finished stage: nothing to report"),
         ("file", "is a file: name the folder"),
         ("absent", "is not there"),
         ("teacher", f"is one finished stage: name the run that it is of, {run_dir}"),
         ("tried", "holds trials, of ddg: name one of these folders"),
+        ("arm", "holds deployments: they are reported a folder at a time"),
         ("table2", f"is a study, whose tables are in {tmp_path}/table2/study.html: name folders of its rows"),
     ):
         with pytest.raises(UserError, match=said):

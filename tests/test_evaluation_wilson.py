@@ -46,3 +46,12 @@ def test_impossible_counts_are_refused(successes, n):
 
 def test_description():
     assert describe(success(5, 10)) == "50.0 % of 10 (23.7 to 76.3)"
+
+
+@pytest.mark.parametrize(
+    ("successes", "n", "text"),
+    [(2399, 2400, "99.96 % of 2400"), (1, 2400, "0.04 % of 2400"), (2400, 2400, "100.0 %"), (0, 9, "0.0 %"),
+     (1999, 2000, "99.95 %"), (999, 1000, "99.9 %")],
+)  # fmt: skip
+def test_a_hundred_percent_is_all_of_them(successes, n, text):
+    assert describe(success(successes, n)).startswith(text)

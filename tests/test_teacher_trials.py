@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from app import cli
+from app.commands import parse
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Config, PictureConfig, StudentConfig, WorldConfig
 from ddgrasp.errors import UserError
@@ -157,7 +158,12 @@ def test_files_and_report_show_this_teachers_trials(measured, tmp_path):
     elsewhere = {**summary["world"], "episode_steps": 25}
     for change in ({"teacher": "another"}, {"world": elsewhere}):
         teacher_trials.save(directory, summary | change, pictures, MOMENTS)
-        assert "trials" not in build_report(tmp_path)["teacher"]
+        report = build_report(tmp_path)
+        assert "trials" not in report["teacher"] and 'alt="episodes"' not in render_html(report, tmp_path)
+    before = (directory / teacher_trials.TRIALS_FILE).read_bytes()
+    with pytest.raises(UserError, match="trained in another world .*: give --out FOLDER"):
+        parse("teacher eval", [str(tmp_path), "--world.episode-steps", "25"]).run()
+    assert (directory / teacher_trials.TRIALS_FILE).read_bytes() == before
 
 
 def test_trials_of_an_older_world_are_shown():

@@ -34,11 +34,11 @@ class DemosExport:
     def run(self) -> None:
         """Writes the dataset and prints what is in it."""
         from app.lerobot.dataset import check_free, load_lerobot, write
-        from app.lerobot.source import limited, open_source
+        from app.lerobot.source import open_source
         from ddgrasp.progress import Progress
 
         check_free(self.out)
-        source = limited(open_source(self.source, self.objects, self.noisy), self.episodes)
+        source = open_source(self.source, self.objects, self.noisy, self.episodes)
         load_lerobot()
         progress = Progress(name="demos export")
         for line in source.left_out:

@@ -19,6 +19,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import Backend, HostsConfig, WorldConfig
 from ddgrasp.config.checks import Count, Seed
 from ddgrasp.errors import UserError
+from ddgrasp.files import to_json
 from ddgrasp.presets import get_preset
 from ddgrasp.shipped import holding
 from ddgrasp.stages import get_stage
@@ -69,12 +70,18 @@ class TeacherEval:
         """Runs the trials, prints a row per object, keeps figures and pictures."""
         check_objects(self.world)
         directory = stage_folder("RUN-DIR", self.run_dir, "teacher")
+        from evaluation import teacher_trials
+
+        teacher = artifacts.read_artifact(directory)
         if self.out is None:
             _check_own(directory, "give --out FOLDER")
+            if not teacher_trials.is_its_world(teacher, to_json(self.world)):
+                raise UserError(
+                    f"{directory} was trained in another world than --world.* says, so that its report would "
+                    "not show the figures: give --out FOLDER."
+                )
         check_folder("--out", self.out or directory)
-        teacher = artifacts.read_artifact(directory)
         from ddgrasp.progress import Progress
-        from evaluation import teacher_trials
         from mjx_envs.grasp_env import GraspEnv
         from ppo import trials
         from ppo.policy import load_policy

@@ -15,6 +15,7 @@ from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION, STATE
 from deploy.record import STEPS_FILE
 from evaluation.report.deployments import Deployment
+from evaluation.treatments import RECORDED
 from sensors.recordings.recording import Recording, is_recording
 
 OBJECT = "object"
@@ -24,10 +25,11 @@ OPEN = -1.0
 """The gripper's command before the first action: the hand starts open."""
 
 
-def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
+def read(found: Sequence[Deployment], objects: Sequence[str] = (), most: int = 0) -> Source:
     """Those of `found` that can be used as episodes; the others are named with the reason.
 
-    With `objects` only those whose report names one of them. Raises UserError if none is left.
+    With `objects` only those whose report names one of them; the first `most`, 0 for all. Raises UserError if
+    none is left.
     """
     if objects:
         noted = {str(deployment.report.get(OBJECT, "")) for deployment in found} - {""}
@@ -36,6 +38,8 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
         found = [deployment for deployment in found if deployment.report.get(OBJECT) in objects]
     taken, episodes, left_out = [], [], []
     for deployment in found:
+        if most and len(taken) == most:  # what is said of them is of these alone
+            break
         try:
             episodes.append(partial(_as_it_is, _read(deployment, _pictures(deployment))))
             taken.append(deployment)
@@ -45,7 +49,7 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = ()) -> Source:
         raise UserError(f"{found[0].folder.parent}: no episode can be used ({'; '.join(left_out)}).")
     about = {
         "Robot": f"Franka arm; driver or rig: {_each(taken, 'robot')}.",
-        "Camera": f"{_each(taken, 'camera')}, across the table; its depth is raw, with its holes and noise.",
+        "Camera": "; ".join(dict.fromkeys(_seen(deployment) for deployment in taken)) + ".",
         "How it was made": f"A depth-only policy ({_each(taken, 'policy')}) moved the arm, and at times the "
         "control loop's rules for trying again in its place (deploy/retry.py). `action` is what either asked "
         f"for, before the safety filter, or what a slow arm lacked of that; `{BY_POLICY}` says where it is "
@@ -60,6 +64,15 @@ def _as_it_is(episode: Episode) -> Episode:
 
 def _each(deployments: Sequence[Deployment], key: str) -> str:
     return ", ".join(dict.fromkeys(str(deployment.report.get(key, "unknown")) for deployment in deployments))
+
+
+def _seen(deployment: Deployment) -> str:
+    """The camera, and what its depth is."""
+    camera, depth = deployment.report.get("camera", "unknown"), deployment.report.get("depth", RECORDED)
+    if depth != RECORDED:
+        return f"{camera}, across the table; its depth is what the policy saw, treated: {depth}"
+    kind = "clean, without a camera's errors" if "ideal" in camera else "raw, with its holes and noise"
+    return f"{camera}, across the table; its depth is {kind}"
 
 
 def _pictures(deployment: Deployment) -> Recording:

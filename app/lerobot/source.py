@@ -10,24 +10,21 @@ from ddgrasp.errors import UserError
 from evaluation.report.deployments import find
 
 
-def open_source(path: Path, objects: Sequence[str] = (), noisy: Path | None = None) -> Source:
-    """The episodes at `path`, those with `objects` alone if any are named; `noisy`: generated depth for them.
+def open_source(path: Path, objects: Sequence[str] = (), noisy: Path | None = None, most: int = 0) -> Source:
+    """The episodes at `path`, those with `objects` alone if any are named, the first `most`, or all if that
+    is 0; `noisy`: generated depth for them.
 
     Raises:
       UserError: there are none, none with these objects, what is there is damaged, or `noisy` is not theirs.
     """
     if (stage := demonstrations.find(path)) is not None:
-        return demonstrations.read(stage, objects, noisy)
+        source = demonstrations.read(stage, objects, noisy)
+        return replace(source, episodes=source.episodes[:most]) if most else source
     if noisy is not None:
         raise UserError(f"--noisy goes with demonstrations, and {path} has none: leave it out.")
     if found := find(path):
-        return deployments.read(found, objects)
+        return deployments.read(found, objects, most)
     raise UserError(
         f"{path} has neither demos/episodes.zarr nor deployments: give a run (runs/demo) or a folder of "
         "deployments (runs/deployments)."
     )
-
-
-def limited(source: Source, episodes: int) -> Source:
-    """The first `episodes` of them, or all if that is 0."""
-    return replace(source, episodes=source.episodes[:episodes]) if episodes else source

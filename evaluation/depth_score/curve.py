@@ -122,7 +122,9 @@ def _fitted(
             config.ddg.sampling, sampler=DPM_SOLVER, steps=EVALUATIONS, spacing="quadratic"
         ),  # as the published curve has it; a second-order sampler leaves specks with linspace steps
     )
-    return fitted_generator(settings, make_prior(settings), frames, folder, config.seed, progress)
+    return fitted_generator(
+        settings, make_prior(settings), frames, folder, config.seed, progress, f"{folder.name}/"
+    )
 
 
 def _frames(

@@ -51,7 +51,10 @@ class Deployment:
             return f"{judged}fault: {self.report['fault']}"
         if not self.is_driven:
             return "dry run"
-        return "interrupted" if self.report["interrupted"] else ENDED[self.report["success"]]
+        judged = ENDED[self.report["success"]]
+        if not self.report["interrupted"]:
+            return judged
+        return "interrupted" if self.report["success"] is None else f"{judged}, then interrupted"
 
 
 def find(folder: Path) -> list[Deployment]:

@@ -91,11 +91,13 @@ def numbers(values: Mapping[str, Any], stage: str = "") -> str:
     return table(("Number", "Value", "Meaning"), rows) if rows else ""
 
 
-def records(rows: Sequence[Mapping[str, Any]]) -> str:
+def records(rows: Sequence[Mapping[str, Any]], stage: str = "") -> str:
     """A table of objects, a column for each of their keys, and under it what the columns mean."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    cells = [[text(row.get(column, ""), explain(column)[0]) for column in columns] for row in rows]
-    meanings = (f"{column}: {meaning}" for column in columns if (meaning := explain(column)[1]))
+    cells = [
+        [text(row.get(column, ""), explain(f"{stage}.{column}")[0]) for column in columns] for row in rows
+    ]
+    meanings = (f"{column}: {meaning}" for column in columns if (meaning := explain(f"{stage}.{column}")[1]))
     return table(columns, cells) + f"<p class=note>{escape('; '.join(meanings))}</p>"
 
 

@@ -42,6 +42,8 @@ MEANINGS: dict[str, Meaning] = {
     "episodes": Meaning("kept, all successful"),
     "tried_now": Meaning("episodes played to get them"),
     "steps": Meaning("control steps"),
+    "curve.steps": Meaning("optimiser steps of the fit"),
+    "samplers.frames": Meaning("pictures made, a second"),
     "trajectories": Meaning("recordings"),
     "frames": Meaning("pictures"),
     "training": Meaning("trained on"),
@@ -63,7 +65,9 @@ MEANINGS: dict[str, Meaning] = {
     "grafted_error_m": Meaning("largest change of a pixel that grafting keeps", "m"),
     "deviation_p99_per_m": Meaning("1 of 100 pixels is further off the surface, inverse depth", "1/m"),
     # student
-    "rollout_success": Meaning("episodes in which it succeeded while it collected frames", SHARE),
+    "rollout_success": Meaning(
+        "episodes that succeeded while it collected frames, in part the teacher's doing", SHARE
+    ),
     "position": Meaning("perception's loss on where to grasp"),
     "position_error_mm": Meaning("median distance of the perceived grasp from the true one", MM),
     "yaw": Meaning("perception's loss on the object's angle"),

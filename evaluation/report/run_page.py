@@ -27,6 +27,7 @@ from evaluation.report.html import (
 from evaluation.report.meanings import explain
 from evaluation.report.summary import summary_rows, trial_run
 from evaluation.report.targets import targets
+from evaluation.teacher_trials import SHEET_FILE
 
 SUMMARY, ORIGIN = "Summary", "How it was made"
 _STUDENT = {"student": ("student_clean", "student_ddg"), "deploy": ("student_rig",)}
@@ -82,10 +83,16 @@ def _section(stage: Stage, report: Mapping[str, Any], directory: Path) -> list[s
         heading(stage.name),
         f"<p class=note>{escape(stage.makes)}</p>",
         numbers({key: value for key, value in metrics.items() if key not in tables}, stage.name),
-        *(_titled(title, records(rows)) for title, rows in tables.items()),
+        *(_titled(title, records(rows, stage.name)) for title, rows in tables.items()),
         *_curves(stage.name, directory),
-        *(_titled(path.stem, _picture(path)) for path in sorted((directory / PICTURES).glob("[!.]*"))),
+        *(_titled(path.stem, _picture(path)) for path in _pictures(directory, metrics)),
     ]
+
+
+def _pictures(directory: Path, metrics: Mapping[str, Any]) -> list[Path]:
+    """Those of the stage; the sheet of a teacher's trials where these are shown, too."""
+    found = sorted((directory / PICTURES).glob("[!.]*"))
+    return [path for path in found if path.name != SHEET_FILE or "trials" in metrics]
 
 
 def _titled(title: str, part: str) -> str:

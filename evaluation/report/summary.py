@@ -13,6 +13,7 @@ from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
 from ddgrasp.stages import ON_REQUEST, STAGES, get_stage
 from evaluation import backends, perception_table, teacher_trials, wilson
+from evaluation.report import deployments
 from evaluation.report.targets import MISSED, targets, verdict
 
 REPORT = "report.json"
@@ -55,6 +56,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
         "machine": latest.machine,
         "versions": latest.versions,
         "outdated": outdated,
+        "begun": [s.name for s in STAGES if s.name not in found and artifacts.has_work(run_dir / s.name)],
         "stages": {},
     }
     for name, manifest in finished.items():
@@ -89,6 +91,8 @@ def _why_nothing(run_dir: Path) -> str:
         return f"is one finished stage: name the run that it is of, {run_dir.resolve().parent}."
     if (study := run_dir / _STUDY).is_file():
         return f"is a study, whose tables are in {study}: name folders of its rows, in {run_dir / 'trials'}."
+    if deployments.find(run_dir):
+        return "holds deployments: they are reported a folder at a time, `ddgrasp report FOLDER`."
     if inside := sorted(path.parent.name for path in run_dir.glob("*/trials.jsonl")):
         return f"holds trials, of {', '.join(inside)}: name one of these folders, or several."
     return "holds no finished stage: nothing to report. Start one with `ddgrasp run`."
@@ -127,7 +131,7 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     for stage in (*STAGES[:-1], *asked_for, STAGES[-1]):
         entry = report["stages"].get(stage.name)
         if entry is None:
-            rows.append((stage.name, "", "", _why_absent(stage.name, report.get("outdated", {}))))
+            rows.append((stage.name, "", "", _why_absent(stage.name, report)))
             continue
         section = report["config"].get(stage.name, {})
         start = section.get("start") or section.get("init_from", "")
@@ -141,7 +145,10 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def _why_absent(stage: str, outdated: Mapping[str, str]) -> str:
+def _why_absent(stage: str, report: Mapping[str, Any]) -> str:
+    outdated = report.get("outdated", {})
+    if stage in report.get("begun", ()):
+        return "begun, not finished: the same command with --resume goes on"
     if (parent := outdated.get(stage)) is None:
         return "not run"
     if parent in outdated:
