@@ -59,6 +59,11 @@ class BraxPick(envs.Env):
         return self._env.action_size
 
     @property
+    def sys(self) -> Any:
+        """None that Brax's wrapper for a `randomization_fn` could change: UserError."""
+        return self._env._mjx_model
+
+    @property
     def backend(self) -> str:
         """The physics backend: jax, warp or cpu."""
         return self._env.config.backend

@@ -156,7 +156,7 @@ class GraspEnv(MjxEnv):
         rewarded = rewards.grasped(self.config.reward, touching, closing, distances.grip_to_object)
         held = jnp.linalg.norm(object_pos - jnp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
         hold_count = jnp.where(held & grasped, episode.hold_count + 1, 0)
-        succeeds = rewards.succeeds(self.config.reward, held, grasped)
+        succeeds = rewards.succeeds(self.config.reward, held, grasped) & sound
         bonus_count = jnp.where(succeeds, episode.bonus_count + 1, 0)
         terms = rewards.terms(
             self.config.reward,

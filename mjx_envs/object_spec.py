@@ -19,9 +19,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ddgrasp.arrays import AnyArray
+from ddgrasp.errors import UserError
 
 _HIDDEN_M = 0.001
 _AXIS_POINTS = 33
+MOST_REACH_M = 0.14
+"""How far a colliding part may reach from its middle: the scene's filters end at 0.15 m (`mjx_envs.scene`),
+and objects of random size are up to 5 % larger."""
 PAD_HALF_WIDTH_M = 0.0105
 """A finger's pad, across the closing direction."""
 
@@ -131,6 +135,13 @@ class RestPose:
     """As the object's own, in this pose."""
 
 
+def _reach_m(part: Box | Capsule) -> float:
+    """Largest distance of a surface point from the part's middle along an axis of its own."""
+    if isinstance(part, Box):
+        return max(part.half_m)
+    return math.dist(part.start_m, part.end_m) / 2 + part.radius_m
+
+
 class ObjectModel(NamedTuple):
     """An object as MuJoCo takes it, in a layout of S slots. NumPy or JAX; a batch may come first."""
 
@@ -189,6 +200,24 @@ class ObjectSpec:
     """From the parts' frame to the object frame: nothing or a quarter turn (`in_other_pose`)."""
     source: str = ""
     """Where size, mass and friction come from."""
+
+    def __post_init__(self):
+        """UserError for a symmetry that a parallel hand does not have, or a part beyond what collides."""
+        for symmetry in (
+            self.grasp_symmetry,
+            *((self.other_pose.grasp_symmetry,) if self.other_pose else ()),
+        ):
+            if symmetry < 0 or symmetry % 2:
+                raise UserError(
+                    f"{self.name}: grasp_symmetry is {symmetry}; expected 0 or an even number: the hand "
+                    "turned by half a turn grasps the same way, so that an object without symmetry has 2."
+                )
+        reach_m = max(map(_reach_m, (*self.capsules, *((self.box,) if self.box else ()))), default=0.0)
+        if reach_m > MOST_REACH_M:
+            raise UserError(
+                f"{self.name}: a part reaches {reach_m:.3g} m from its middle, and collisions are looked for "
+                f"up to {MOST_REACH_M} m: put it together of shorter ones."
+            )
 
     def in_other_pose(self) -> "ObjectSpec":
         """The same object in its other pose, which must exist."""

@@ -113,6 +113,14 @@ class PickEnv(GraspEnv):
             scene_option=scene_option, modify_scene_fns=modify_scene_fns,
         )  # fmt: skip
 
+    @property
+    def _mjx_model(self) -> Any:
+        """What Playground's wrapper for a `randomization_fn` would replace, and no step reads."""
+        raise UserError(
+            "randomization_fn does nothing here: masses, friction, damping, gains and sizes are drawn by "
+            "config.random (world.random), for each episode anew; leave it out."
+        )
+
     def _model_of(self, state: State) -> mujoco.MjModel:
         """The scene with the object and the dynamics of the state's episode."""
         model, episode = copy(self.mj_model), state.info["episode"]

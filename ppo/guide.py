@@ -23,7 +23,9 @@ GAIN = 1.4
 MAX_ACTION = 0.85
 ALIGNED_M, ALIGNED_RAD = 0.015, 0.25
 """Close the gripper within this of the grasp pose."""
-NEAR_M = 0.03
+NEAR_M, USUAL_OFFSET_M = 0.03, 0.021
+"""Between the pads is what lies within the first of the grip; further for what is grasped further than the
+second from its centre."""
 CLEARANCE_M = 0.10
 
 
@@ -37,7 +39,9 @@ def guide(observation: Float[jax.Array, "40"]) -> Float[jax.Array, "8"]:
     lateral = jnp.linalg.norm(grip[:2] - grasp[:2])
     angle = kinematics.angle_between(grip_quat, grasp_quat, jnp)
     aligned = (lateral < ALIGNED_M) & (jnp.abs(grip[2] - grasp[2]) < ALIGNED_M) & (angle < ALIGNED_RAD)
-    closing = (jnp.linalg.norm(grip - object_pos) < NEAR_M) & (fingers < 0.078)
+    offset = jnp.linalg.norm(grasp - object_pos)
+    near_m = NEAR_M + jnp.maximum(offset - USUAL_OFFSET_M, 0.0)
+    closing = (jnp.linalg.norm(grip - object_pos) < near_m) & (fingers < 0.078)
     held = closing & (jnp.abs(finger_speed) < 0.02) & (fingers > 0.004)
 
     misaligned = jnp.maximum(lateral - 0.008, 0.0) + 0.06 * jnp.maximum(angle - 0.12, 0.0)

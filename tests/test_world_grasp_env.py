@@ -10,7 +10,7 @@ import pytest
 from mujoco_playground import State
 
 from ddgrasp import contract
-from ddgrasp.config import WorldConfig
+from ddgrasp.config import PAPER_REWARD, WorldConfig
 from ddgrasp.layout import QPOS
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 
@@ -128,6 +128,17 @@ def test_an_action_that_is_not_finite_counts_as_zeros_which_open_the_gripper(ste
     state = stepped(first.data.qpos[QPOS.object_pos], CLOSE.at[3].set(jnp.nan), last)
     assert state.done == 1 and float(state.reward) == pytest.approx(reward)
     assert (state.metrics["lost"], state.metrics["blown_up"]) == (1, 0)
+
+
+def test_an_action_that_is_not_finite_earns_no_bonus_of_the_papers_reward(first):
+    env = GraspEnv(replace(WORLD, reward=PAPER_REWARD))
+    env.physics = Still()
+    data = replace(first.data, qpos=first.data.qpos.at[QPOS.object_pos].set(contract.LIFT_TARGET_M))
+    begun = first.replace(data=data)
+    bonus = [
+        float(jax.jit(env.step)(begun, action).metrics["reward/bonus"]) for action in (CLOSE, CLOSE * jnp.nan)
+    ]
+    assert bonus[0] > 0 and bonus[1] == 0
 
 
 def test_joint_actions_beyond_95_percent_are_saturated(stepped):

@@ -92,6 +92,25 @@ def test_an_object_knocked_off_the_table_ends_the_episode():
     assert (terminated, truncated, info["success"]) == (True, False, False)
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_of_many_the_one_whose_object_is_lost_ends_alone(mode):
+    env = make_vec(autoreset_mode=mode)
+    env.reset(seed=5)
+    many = env.unwrapped
+    state = many._scenes.state
+    away = state.data.replace(qpos=state.data.qpos.at[0, 9].set(1.5))
+    many._scenes = many._scenes.replace(state=state.replace(data=away))
+    seen, _, terminated, truncated, info = env.step(np.zeros((2, 8), np.float32))
+    assert (terminated.tolist(), truncated.tolist()) == ([True, False], [False, False])
+    if mode is AutoresetMode.SAME_STEP:
+        assert info["final_info"]["success"].tolist() == [False, False]
+        assert (
+            info["_final_info"].tolist() == [True, False] and abs(seen[0, 25]) < 1.0
+        )  # the next one's object
+    else:
+        assert seen[0, 25] == pytest.approx(1.5, abs=0.01)
+
+
 def test_an_action_that_is_not_finite_ends_the_episode_where_it_stands():
     """The C engine takes a NaN for 0 on every joint and swings the arm there."""
     env = gymnasium.make(ID, world=WORLD).unwrapped

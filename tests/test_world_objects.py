@@ -1,5 +1,7 @@
 """The twelve objects: sizes and masses against their sources, rest, grasp, picture; and a thirteenth."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -15,7 +17,7 @@ from evaluation import object_sheet
 from mjx_envs import grasp_math, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import GraspEnv
-from mjx_envs.object_spec import DEFAULT_SLOTS, Box, Capsule, ObjectSpec, SlotLayout, slot_layout
+from mjx_envs.object_spec import DEFAULT_SLOTS, Box, Capsule, ObjectSpec, RestPose, SlotLayout, slot_layout
 from mjx_envs.objects import OBJECTS, SHAPES, get_object
 from mjx_envs.randomize import ObjectTable, sample_params
 from mjx_envs.render import raycast_numpy
@@ -123,7 +125,7 @@ def test_at_rest_it_stays_for_a_second(name):
 @pytest.mark.parametrize("name", EVERYTHING)
 def test_the_largest_one_fits_between_fingers_and_palm(name):
     spec, largest = get_object(name), 1 + RandomConfig().size
-    assert largest * spec.extents_m()[Y] < contract.GRIPPER_MAX_WIDTH_M
+    assert largest * 2 * spec.half_width_m() < contract.GRIPPER_MAX_WIDTH_M
     branch = grasp_math.yaw_branch(np.array([1.0, 0, 0, 0]), spec.grasp_symmetry)
     grasp_pos, _ = grasp_math.grasp_pose(
         np.array([0.5, 0.0, largest * spec.rest_height_m]), np.array([1.0, 0, 0, 0]),
@@ -148,9 +150,10 @@ BOTH_POSES = tuple(name for name, spec in EVERYTHING.items() if spec.other_pose 
 @pytest.mark.parametrize("name", BOTH_POSES)
 def test_in_its_other_pose_it_stays_and_has_turned(name):
     usual, other = get_object(name), get_object(name).in_other_pose()
-    assert other.extents_m()[Z] == pytest.approx(usual.extents_m()[X], abs=1e-9)
-    assert other.extents_m()[Y] == pytest.approx(usual.extents_m()[Y], abs=1e-9)
-    np.testing.assert_allclose(other.inertia_kg_m2(), usual.inertia_kg_m2()[[Z, Y, X]])
+    assert usual.other_pose is not None
+    turned = {"x": [X, Z, Y], "y": [Z, Y, X]}[usual.other_pose.about]
+    np.testing.assert_allclose(other.extents_m(), usual.extents_m()[turned], atol=1e-9)
+    np.testing.assert_allclose(other.inertia_kg_m2(), usual.inertia_kg_m2()[turned])
     model, data = place(other)
     camera = object_sheet.close_camera(other.rest_height_m)
     picture = raycast_numpy.render(model, data, camera)
@@ -233,6 +236,20 @@ def test_the_round_end_of_what_begins_beside_the_pads_counts():
     assert grasped(*balls, offset_m=(0.06, 0.0, 0.0)).half_width_m() == 0.0
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"grasp_symmetry": 1}, "grasp_symmetry is 1; expected 0 or an even number"),
+        ({"other_pose": RestPose("y", 0.02, grasp_symmetry=3)}, "grasp_symmetry is 3; expected 0 or an even"),
+        ({"capsules": (Capsule((-0.19, 0, 0), (0.19, 0, 0), 0.01),)}, "a part reaches 0.2 m from its middle"),
+        ({"box": Box((0.145, 0.02, 0.02))}, "a part reaches 0.145 m from its middle"),
+    ],
+)
+def test_what_no_hand_grasps_or_no_engine_sees_is_refused(change, message):
+    with pytest.raises(UserError, match=f"^cube: {message}"):
+        replace(get_object("cube"), **change)
+
+
 # --- slots ---------------------------------------------------------------------------------------
 
 
@@ -243,7 +260,7 @@ def test_the_scene_has_as_many_slots_as_the_chosen_objects_need():
     twelve = ObjectTable(TWELVE)
     assert twelve.layout == SlotLayout(capsules=8, cylinders=2, plates=5)
     assert twelve.model.slot_size.shape == (
-        12 + len(set(BOTH_POSES) - set(SHAPES)),
+        12 + len(set(BOTH_POSES) & set(TWELVE)),
         16,
         3,
     ) and twelve.rgb.shape == (12, 16, 3)
@@ -327,19 +344,31 @@ def test_the_list_names_each_object_with_its_source(capsys):
     assert "can" in lines[9] and "66 x 66 x 101 mm" in lines[9] and "YCB" in lines[9]
 
 
-def test_a_thirteenth_object_is_one_dataclass(monkeypatch):
-    bone = ObjectSpec(
-        "bone", 13, mass_kg=0.08, friction=0.6, rgb=(0.9, 0.9, 0.85), rest_height_m=0.02, grasp_symmetry=2,
-        box=Box((0.04, 0.01, 0.01)),
-        capsules=tuple(
-            Capsule((x, y, 0.0), (x, y, 0.0), 0.02) for x in (-0.045, 0.045) for y in (-0.012, 0.0, 0.012)
-        ),
-    )  # fmt: skip
-    monkeypatch.setitem(OBJECTS, "bone", bone)
-    assert ObjectTable(("cube", "bone")).layout == SlotLayout(capsules=6, cylinders=0)
-    world, act = RigWorld(("bone",)), jax.jit(guide)
+BONE = ObjectSpec(
+    "bone", 13, mass_kg=0.08, friction=0.6, rgb=(0.9, 0.9, 0.85), rest_height_m=0.02, grasp_symmetry=2,
+    box=Box((0.04, 0.01, 0.01)),
+    capsules=tuple(
+        Capsule((x, y, 0.0), (x, y, 0.0), 0.02) for x in (-0.045, 0.045) for y in (-0.012, 0.0, 0.012)
+    ),
+)  # fmt: skip
+POST = ObjectSpec(
+    "post", 13, mass_kg=0.1, friction=0.8, rgb=(0.5, 0.5, 0.5), rest_height_m=0.065, grasp_symmetry=4,
+    box=Box((0.02, 0.02, 0.065)), grasp_offset_m=(0.0, 0.0, 0.045),
+)  # fmt: skip
+"""Held 4.5 cm above its middle."""
+
+
+@pytest.mark.parametrize(
+    ("spec", "layout"),
+    [(BONE, SlotLayout(capsules=6, cylinders=0)), (POST, DEFAULT_SLOTS)],
+    ids=["bone", "post"],
+)
+def test_a_thirteenth_object_is_one_dataclass(monkeypatch, spec, layout):
+    monkeypatch.setitem(OBJECTS, spec.name, spec)
+    assert ObjectTable(("cube", spec.name)).layout == layout
+    world, act = RigWorld((spec.name,)), jax.jit(guide)
     for seed in range(3):
-        world.reset(seed, "bone")
+        world.reset(seed, spec.name)
         assert world.observation()[39] == pytest.approx(np.log(13))
         for _ in range(60):
             action = np.asarray(act(jnp.asarray(world.observation(), jnp.float32)))

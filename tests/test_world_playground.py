@@ -85,6 +85,25 @@ def test_episodes_repeat_under_playgrounds_wrapper(rollout):
     np.testing.assert_allclose(metrics["sum_reward"], rewards[3:6].sum(axis=0), rtol=1e-6)
 
 
+def _with_one_lost(state: Any, data: str) -> Any:
+    """The first environment's object beyond reach."""
+    return state.tree_replace({f"{data}.qpos": getattr(state, data).qpos.at[0, 9].set(1.5)})
+
+
+def _ends_alone_and_begins_again(first: Any, step: Any, data: str) -> None:
+    ended = step(_with_one_lost(first, data), jnp.zeros((2, 8)))
+    assert ended.done.tolist() == [1, 0] and ended.info["truncation"].tolist() == [0, 0]
+    np.testing.assert_array_equal(ended.obs[0], first.obs[0])  # put back
+    after = step(ended, jnp.zeros((2, 8)))
+    assert after.done.tolist() == [0, 0] and after.info["episode"].steps.tolist() == [1, 2]
+    assert abs(float(getattr(after, data).qpos[0, 9]) - float(getattr(first, data).qpos[0, 9])) < 0.01
+
+
+def test_an_episode_whose_object_is_lost_ends_alone_and_no_time_was_up(rollout):
+    env, first, _ = rollout
+    _ends_alone_and_begins_again(first, jax.jit(env.step), "data")
+
+
 def test_playgrounds_render_shows_the_object_in_its_place(rollout, open_gl):
     env, first, _ = rollout
     state = jax.tree.map(lambda leaf: leaf[0], first)
@@ -138,6 +157,24 @@ def test_braxs_training_evaluates_it(of):
     counted: Any = state.info["eval_metrics"]
     np.testing.assert_allclose(counted.episode_metrics["reward"], rewards[0] + rewards[1], rtol=1e-6)
     assert counted.episode_steps.tolist() == [2, 2, 2, 2]
+
+
+def test_under_braxs_wrappers_too_a_lost_object_ends_one_episode_alone():
+    env = envs.create(brax_env.NAME, episode_length=4, batch_size=2, config_overrides=ON_CPU)
+    first = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    _ends_alone_and_begins_again(first, jax.jit(env.step), "pipeline_state")
+
+
+def test_a_randomisation_function_is_refused_with_what_there_is_instead():
+    def mine(model, *_):
+        return model, None
+
+    with pytest.raises(UserError, match=r"randomization_fn .*: .*config\.random"):
+        envs.training.wrap(brax_env.BraxPick(config_overrides=ON_CPU), randomization_fn=mine)
+    loaded = playground_env.PickEnv(config_overrides=ON_CPU)
+    env = wrapper.wrap_for_brax_training(loaded, randomization_fn=mine)
+    with pytest.raises(UserError, match=r"randomization_fn .*: .*config\.random"):
+        env.reset(jax.random.split(jax.random.PRNGKey(0), 2))
 
 
 def test_episodes_repeat_under_braxs_wrappers():

@@ -49,7 +49,7 @@ def test_quaternion_product_turns_twice():
 @pytest.mark.parametrize("name", sorted(OBJECTS))
 def test_objects_fit_the_gripper_and_are_named_in_errors(name):
     spec = get_object(name)
-    assert 2 * spec.half_extents_m()[1] < contract.GRIPPER_MAX_WIDTH_M
+    assert 2 * spec.half_width_m() < contract.GRIPPER_MAX_WIDTH_M
     assert spec.rest_height_m > 0 and spec.mass_kg > 0
     with pytest.raises(UserError, match=f"Did you mean '{name}'"):
         get_object(name + "x")

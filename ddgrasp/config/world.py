@@ -112,12 +112,13 @@ class WorldConfig(Section, name="world"):
     backend: Backend = "cpu"
     """Physics: cpu (MuJoCo's C engine on all cores), jax (MJX) or warp (MJX-Warp, on an NVIDIA GPU)."""
     renderer: Renderer = "jax"
-    """Pictures of simulated scenes: jax (the project's ray caster) or warp (MJX-Warp's, on an NVIDIA GPU)."""
+    """Pictures of training's scenes: jax (the project's ray caster) or warp (MJX-Warp's, on an NVIDIA GPU);
+    the rigs draw by their own."""
     episode_steps: Annotated[int, Range(1, 10_000)] = 60
     """Control steps in an episode (10 Hz)."""
     sim_dt_s: Annotated[float, Range(0.0001, contract.CONTROL_DT_S)] = 0.005
     """Physics time step; must divide the control period of 0.1 s. Keep it at 5 ms or less: with 10 ms the
-    fingers eject what they grasp."""
+    fingers eject what they grasp. The rigs have 2.5 ms."""
     camera_scale: CameraScale = 0.25
     """Size of the depth camera's picture relative to 1280 x 720. For a RealSense at most 0.66: its stream is
     848 x 480."""

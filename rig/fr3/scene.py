@@ -38,7 +38,7 @@ class SceneObject:
     """Children of <asset>; mesh files by absolute path."""
     grasp_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """From the origin to where a hand grips it from above, its fingers closing along the body's y."""
-    grasp_symmetry: int = 1
+    grasp_symmetry: int = 2
     """Yaws per turn in which it can be gripped alike; 0 = every yaw."""
 
 
