@@ -13,6 +13,7 @@ from brax import envs
 from jaxtyping import Float
 from ml_collections import config_dict
 
+from ddgrasp.errors import UserError
 from mjx_envs import randomize
 from mjx_envs.playground_env import PickEnv
 
@@ -60,8 +61,11 @@ class BraxPick(envs.Env):
 
     @property
     def sys(self) -> Any:
-        """None that Brax's wrapper for a `randomization_fn` could change: UserError."""
-        return self._env._mjx_model
+        """There is none of Brax's: UserError, for its wrapper of a `randomization_fn` above all."""
+        raise UserError(
+            f"{NAME} has no system of Brax's. A randomization_fn does nothing here: masses, friction, "
+            "damping, gains and sizes are drawn by config.random (world.random), for each episode anew."
+        )
 
     @property
     def backend(self) -> str:

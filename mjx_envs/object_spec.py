@@ -25,7 +25,7 @@ _HIDDEN_M = 0.001
 _AXIS_POINTS = 33
 MOST_REACH_M = 0.14
 """How far a colliding part may reach from its middle: the scene's filters end at 0.15 m (`mjx_envs.scene`),
-and objects of random size are up to 5 % larger."""
+and objects of random size are up to 5 % larger by default."""
 PAD_HALF_WIDTH_M = 0.0105
 """A finger's pad, across the closing direction."""
 
@@ -135,6 +135,15 @@ class RestPose:
     """As the object's own, in this pose."""
 
 
+def check_symmetry(name: str, symmetry: int) -> None:
+    """UserError for a `grasp_symmetry` that no parallel hand has."""
+    if symmetry < 0 or symmetry % 2:
+        raise UserError(
+            f"{name}: grasp_symmetry is {symmetry}; expected 0 or an even number: the hand turned by half a "
+            "turn grasps the same way, so that an object without symmetry has 2."
+        )
+
+
 def _reach_m(part: Box | Capsule) -> float:
     """Largest distance of a surface point from the part's middle along an axis of its own."""
     if isinstance(part, Box):
@@ -203,15 +212,9 @@ class ObjectSpec:
 
     def __post_init__(self):
         """UserError for a symmetry that a parallel hand does not have, or a part beyond what collides."""
-        for symmetry in (
-            self.grasp_symmetry,
-            *((self.other_pose.grasp_symmetry,) if self.other_pose else ()),
-        ):
-            if symmetry < 0 or symmetry % 2:
-                raise UserError(
-                    f"{self.name}: grasp_symmetry is {symmetry}; expected 0 or an even number: the hand "
-                    "turned by half a turn grasps the same way, so that an object without symmetry has 2."
-                )
+        check_symmetry(self.name, self.grasp_symmetry)
+        if self.other_pose is not None:
+            check_symmetry(self.name, self.other_pose.grasp_symmetry)
         reach_m = max(map(_reach_m, (*self.capsules, *((self.box,) if self.box else ()))), default=0.0)
         if reach_m > MOST_REACH_M:
             raise UserError(

@@ -210,10 +210,10 @@ def test_recordings_of_frames_that_may_not_follow_each_other_are_known(tmp_path)
         write_recording(tmp_path / name, 8, (48, 64))
         meta = tmp_path / name / "meta.json"
         meta.write_text(json.dumps({**json.loads(meta.read_text()), "consecutive_frames": follow}))
-    assert score_data.load_real(tmp_path, 32, 16).apart == (tmp_path / "c",)
-    assert score_data.load_real(tmp_path / "b", 32, 8).apart == ()
+    assert score_data.load_real(tmp_path, 32, 16).apart == {2: tmp_path / "c"}
+    assert score_data.load_real(tmp_path / "b", 32, 8).apart == {}
     (tmp_path / "b" / "color" / "000003.jpg").unlink()  # between others
-    assert score_data.load_real(tmp_path / "b", 32, 7).apart == (tmp_path / "b",)
+    assert score_data.load_real(tmp_path / "b", 32, 7).apart == {0: tmp_path / "b"}
 
 
 def test_blocks_are_of_one_recording_each(tmp_path):

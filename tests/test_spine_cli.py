@@ -19,6 +19,7 @@ from app.cli import main
 from app.commands import COMMANDS, parse
 from app.commands.checks import check_config_values, check_networks, stage_folder
 from app.commands.parsing import HELP_ALL
+from app.commands.rig import drive_command
 from ddgrasp import artifacts
 from ddgrasp.config import CAMERAS
 from ddgrasp.errors import UserError
@@ -522,3 +523,15 @@ def test_a_second_extractor_is_refused_where_one_is_read(kind, tmp_path):
         UserError, match=rf"^--features depthfeat-v1 resnet18: `ddgrasp ddg {kind}` scores by one"
     ):
         parse(f"ddg {kind}", several).run()
+
+
+def test_what_is_practised_on_a_rig_lies_apart_from_an_arms_own_and_another_rigs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert drive_command("127.0.0.1", True).endswith("--out runs/practice/calibration.json")
+    assert drive_command("127.0.0.1", False).endswith("--camera rig --out runs/practice")
+    (tmp_path / "runs" / "practice").mkdir(parents=True)
+    (tmp_path / "runs" / "practice" / "calibration.json").touch()
+    assert drive_command("127.0.0.1", False).endswith(
+        "--out runs/practice --calibration runs/practice/calibration.json"
+    )
+    assert drive_command("127.0.0.2", False).endswith("--camera rig --out runs/practice/127.0.0.2")

@@ -169,7 +169,7 @@ def test_a_randomisation_function_is_refused_with_what_there_is_instead():
     def mine(model, *_):
         return model, None
 
-    with pytest.raises(UserError, match=r"randomization_fn .*: .*config\.random"):
+    with pytest.raises(UserError, match=r"no system of Brax's. A randomization_fn .*: .*config\.random"):
         envs.training.wrap(brax_env.BraxPick(config_overrides=ON_CPU), randomization_fn=mine)
     loaded = playground_env.PickEnv(config_overrides=ON_CPU)
     env = wrapper.wrap_for_brax_training(loaded, randomization_fn=mine)

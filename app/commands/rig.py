@@ -40,16 +40,22 @@ class RigFr3:
 
         thing = (scene.meshed if self.shapes == "mesh" else scene.primitive)(self.object_name)
         with Fr3Rig(self.host, thing, self.seed, self.speed, with_board=self.board) as rig:
-            what = "calibrate" if self.board else "deploy --policy FILE.onnx --robot franka"
-            kept = PRACTICE / PRACTISED if self.board else PRACTICE
-            place = f" --calibration {PRACTICE / PRACTISED}" if (PRACTICE / PRACTISED).exists() else ""
-            drive = (
-                f"ddgrasp {what} --host {self.host} --camera rig --out {kept}{'' if self.board else place}"
-            )
+            drive = drive_command(self.host, self.board)
             print(f"FR3 at {self.host} before {self.object_name!r}. Drive it: {drive}", flush=True)
             while rig.running():
                 time.sleep(0.2)
             raise UserError(f"the FR3 rig at {self.host} has ended; what it said is above.")
+
+
+def drive_command(host: str, board: bool) -> str:
+    """How to drive the rig at `host`; what comes of it lies apart from an arm's own and another rig's."""
+    kept = PRACTICE if host == RIG_HOST else PRACTICE / host
+    calibration = kept / PRACTISED
+    if board:
+        return f"ddgrasp calibrate --host {host} --camera rig --out {calibration}"
+    place = f" --calibration {calibration}" if calibration.exists() else ""
+    deploy = f"ddgrasp deploy --policy FILE.onnx --robot franka --host {host} --camera rig"
+    return f"{deploy} --out {kept}{place}"
 
 
 @dataclass(frozen=True)

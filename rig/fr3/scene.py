@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddgrasp import contract
-from mjx_envs.object_spec import ObjectSpec, SlotLayout, slot_layout
+from mjx_envs.object_spec import ObjectSpec, SlotLayout, check_symmetry, slot_layout
 from mjx_envs.objects import get_object
 
 OBJECT_BODY, OBJECT_JOINT = "object", "object_free"
@@ -40,6 +40,10 @@ class SceneObject:
     """From the origin to where a hand grips it from above, its fingers closing along the body's y."""
     grasp_symmetry: int = 2
     """Yaws per turn in which it can be gripped alike; 0 = every yaw."""
+
+    def __post_init__(self):
+        """UserError for a symmetry that no parallel hand has."""
+        check_symmetry(self.name, self.grasp_symmetry)
 
 
 def primitive(name: str) -> SceneObject:

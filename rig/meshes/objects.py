@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ddgrasp.errors import unknown_name
+from mjx_envs.object_spec import check_symmetry
 from mjx_envs.objects import OBJECTS
 from rig.meshes import fruit, things
 from rig.meshes.solids import Part, Vector
@@ -35,7 +36,8 @@ class MeshObject:
     """The grip's place in the shape's frame; None is the centre of mass."""
 
     def __post_init__(self):
-        assert self.mass_kg > 0 and self.friction > 0 and self.grasp_symmetry >= 0
+        assert self.mass_kg > 0 and self.friction > 0
+        check_symmetry(self.name, self.grasp_symmetry)
 
 
 def _as_trained(
