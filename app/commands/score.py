@@ -19,9 +19,9 @@ from ddgrasp.presets import get_preset
 from ddgrasp.stages import get_stage
 
 _OF_CURVE = ("curve_trajectories", "curve_steps")
-_OF_RIG = ("trajectories", "frames", "repeat_scenes", "repeats")
-_OF_TABLE = ("columns", "tsne_maps", "monocular", "monocular_weights", "inpaint_radius_px")
 _OF_REPEATS = ("repeat_scenes", "repeats")
+_OF_RIG = ("trajectories", "frames", *_OF_REPEATS)
+_OF_TABLE = ("columns", "tsne_maps", "monocular", "monocular_weights", "inpaint_radius_px")
 """Fields of `ScoreConfig` that one kind of score alone reads."""
 
 

@@ -55,12 +55,11 @@ def interval(
 def intervals(
     point: Mapping[str, float],
     resampled: Sequence[Mapping[str, float]],
-    bounds: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, tuple[float, float]],
 ) -> dict[str, dict[str, float]]:
-    """`interval` of every named figure, within its `bounds` where it has some."""
-    within = bounds or {}
+    """`interval` of every named figure, within its `bounds` (least, most)."""
     return {
-        name: interval(value, [other[name] for other in resampled], *within.get(name, (-math.inf, math.inf)))
+        name: interval(value, [other[name] for other in resampled], *bounds[name])
         for name, value in point.items()
     }
 
