@@ -9,12 +9,13 @@ import math
 import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from ddgrasp import contract
 from ddgrasp.depth import to_millimetres
@@ -32,6 +33,7 @@ ENDED = {True: "lifted and held", False: "failed", None: "not judged"}
 """How a deployment ended, in words, by its success."""
 FILM_COLUMNS = 12
 """Most pictures of the film strip: what comes later is thinned out evenly."""
+_Frame = tuple[UInt8[np.ndarray, "h w 3"], UInt16[np.ndarray, "H W"]]
 _GAP_S = 1.5 * contract.CONTROL_DT_S
 """Two frames further apart do not follow each other: the camera had none, or a step came late."""
 
@@ -50,15 +52,16 @@ class DeploymentRecord:
         }  # fmt: skip
         self._newest_s, self._kept_s = -math.inf, math.inf
         self._rows: list[dict[str, Any]] = []
-        self._queue: queue.Queue[tuple[np.ndarray, np.ndarray] | None] = queue.Queue()
+        self._queue: queue.Queue[tuple[dict[str, Any], _Frame | None] | None] = queue.Queue()
         self._film: list[tuple[int, UInt8[np.ndarray, "h w 3"], np.ndarray]] = []
         self._queued = self._written = 0
         self._trouble = ""
 
     @contextmanager
     def into(self, folder: Path) -> Iterator[None]:
-        """Frames become the recording `folder` when this ends, if there were any."""
-        thread = threading.Thread(target=self._write_frames, args=(folder,), daemon=True)
+        """Frames become the recording `folder` when this ends, if there were any. Its steps are there from
+        the first on, for whoever asks what a process that was killed had done."""
+        thread = threading.Thread(target=self._write, args=(folder,), daemon=True)
         thread.start()
         try:
             yield
@@ -69,6 +72,16 @@ class DeploymentRecord:
 
     def look(self, step: Step) -> None:
         """What the loop's `on_step` is called with."""
+        row = self._row(step)
+        frame = self._frame(step)
+        if frame is not None:
+            row["frame"] = self._queued
+            self._queued += 1
+            self._keep(step.index, *frame)
+        self._rows.append(row)
+        self._queue.put((row, frame))
+
+    def _row(self, step: Step) -> dict[str, Any]:
         row = {"step": step.index, "q_rad": step.state.q_rad.tolist(), "width_m": float(step.state.width_m)}
         row |= {"time_s": step.state.timestamp_s, "held": step.action is None}
         if step.state.met:
@@ -79,9 +92,13 @@ class DeploymentRecord:
         row["by"] = step.by
         row["close"] = step.close
         row["q_target_rad"] = None if step.q_target_rad is None else step.q_target_rad.tolist()
-        self._rows.append(row)
+        return row
+
+    def _frame(self, step: Step) -> _Frame | None:
+        """Copies, since cameras fill their buffers again before the thread has written; None for a step whose
+        frame is not kept."""
         if step.frame is None:
-            return
+            return None
         rgb = step.frame.rgb
         if not self._queued:  # a camera's own are all kept
             apart = self._picture_every if rgb is None else 1
@@ -92,18 +109,15 @@ class DeploymentRecord:
         if rgb is None and step.index % self._picture_every == 0 and isinstance(self._camera, Filmed):
             rgb = self._camera.picture()
         if rgb is None:
-            return
-        depth = step.frame.depth  # copied: cameras fill their buffers again before the thread has written
+            return None
+        depth = step.frame.depth
         depth_mm = depth.copy() if depth.dtype == np.uint16 else to_millimetres(depth)
         if step.frame.timestamp_s - self._kept_s > _GAP_S:
             self._meta["consecutive_frames"] = False
         if again:
             self._meta["repeated_frames"] = self._meta.get("repeated_frames", 0) + 1
         self._kept_s = step.frame.timestamp_s
-        row["frame"] = self._queued
-        self._queued += 1
-        self._queue.put((rgb.copy(), depth_mm))
-        self._keep(step.index, rgb, depth_mm)
+        return rgb.copy(), depth_mm
 
     def finish(
         self, folder: Path, report: Mapping[str, Any], success: bool | None, about: Mapping[str, Any]
@@ -113,7 +127,7 @@ class DeploymentRecord:
         for row in self._rows:
             if row.get("frame", 0) >= self._written:
                 row.pop("frame", None)
-        atomic_write_text(folder / STEPS_FILE, "".join(json.dumps(to_json(row)) + "\n" for row in self._rows))
+        atomic_write_text(folder / STEPS_FILE, "".join(map(_line, self._rows)))
         values = {**about, "success": success, "frames": self._written, **report}
         if self._trouble:
             values["frames_lost"] = self._trouble
@@ -135,34 +149,52 @@ class DeploymentRecord:
         if len(self._film) >= 2 * FILM_COLUMNS:
             self._film, self._film_every = self._film[::2], 2 * self._film_every
 
-    def _write_frames(self, folder: Path) -> None:
-        taken = self._queue.get()
-        if taken is None:
+    def _write(self, folder: Path) -> None:
+        frames = self._taken(folder)
+        first = next(frames, None)
+        if first is None:
             return
         try:
             from sensors.recordings.writer import RecordingWriter
 
             with RecordingWriter(folder, self._meta) as writer:
-                while taken is not None and self._add(writer, *taken):
-                    taken = self._queue.get()
+                for frame in chain([first], frames):
+                    if not self._trouble:  # what cannot be written is not kept in memory either
+                        self._add(writer, *frame)
                 writer.meta.update(self._meta)
         except Exception as error:  # encoders raise what they like
             self._trouble = str(error)  # the arm goes on; the report says what is missing
             self._written = 0
-        while taken is not None:  # what cannot be written is not kept in memory either
-            taken = self._queue.get()
+        for _ in frames:
+            pass
 
-    def _add(self, writer: "RecordingWriter", rgb: np.ndarray, depth_mm: np.ndarray) -> bool:
-        """Whether the frame was written. Raises what prevented it if there is none before."""
+    def _taken(self, folder: Path) -> Iterator[_Frame]:
+        """The frames that `look` puts there, until `into` ends; a line of every step goes into `folder`."""
+        path, mode = folder / STEPS_FILE, "w"
+        while (taken := self._queue.get()) is not None:
+            row, frame = taken
+            with suppress(OSError, ValueError):  # `finish` writes them all, and says why it cannot
+                folder.mkdir(parents=True, exist_ok=True)
+                with open(path, mode) as file:
+                    file.write(_line(row))
+                mode = "a"
+            if frame is not None:
+                yield frame
+
+    def _add(self, writer: "RecordingWriter", rgb: np.ndarray, depth_mm: np.ndarray) -> None:
+        """Raises what prevented it if there is no frame before; otherwise that is noted."""
         try:
             writer.add(rgb, depth_mm)
         except Exception as error:
             if not self._written:
                 raise
             self._trouble = f"those after the first {self._written}: {error}"
-            return False
-        self._written += 1
-        return True
+        else:
+            self._written += 1
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    return json.dumps(to_json(row)) + "\n"
 
 
 def verdict(camera: Camera, ask: Callable[[str], bool | None]) -> bool | None:

@@ -85,6 +85,23 @@ def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
     assert (folder / "film.png").stat().st_size > 1000
 
 
+def test_steps_are_on_the_disk_while_it_runs_so_that_a_kill_leaves_them(run, tmp_path):
+    there = []
+
+    class Looks(ColourCamera):
+        def read(self):
+            if self._reads == 4:  # four steps are done; the disk is a thread's
+                waited = time.monotonic() + 20
+                while len(there) < 4 and time.monotonic() < waited:
+                    (file,) = (tmp_path / "kept").glob("*/steps.jsonl")
+                    there[:] = file.read_text().splitlines()
+            return super().read()
+
+    _, folder = run(Looks)
+    whole = (folder / "steps.jsonl").read_text().splitlines()
+    assert len(there) == 4 and there == whole[:4] and len(whole) == 5
+
+
 def test_a_step_before_which_the_arm_gave_way_says_to_what(run, monkeypatch):
     read, felt = KinematicRobot.read_state, iter([("", None), ("16 N", np.full(7, 1.23456))])
 
