@@ -124,7 +124,8 @@ def _any_yaw(observation: Float[np.ndarray, "N 40"]) -> Bool[np.ndarray, " N"]:
 
 def tabulate(parts: Sequence[Errors], success: Sequence[bool], names: Sequence[str]) -> list[dict[str, Any]]:
     """A row for each part of a trial: of all trials, of those that succeeded, of those that did not, and for
-    each object of the steps with the hand near. `success` and `names` are the trials' outcomes and objects.
+    each object of the steps with the hand near. `success` and `names` are the trials' outcomes and objects;
+    `n_trials` is of how many trials a row is, those that had such steps.
 
     Position (mm): medians without sign, in the plane and in height, and means with it, x away from the base,
     y to its left, z up. Yaw (degrees): median, of objects that have one. Held: share of steps told wrongly.
@@ -139,7 +140,8 @@ def tabulate(parts: Sequence[Errors], success: Sequence[bool], names: Sequence[s
         for hand, steps in _PHASES.items():
             where = [steps(part) for part in chosen]
             if any(w.any() for w in where) and (hand == "near" or title not in names):
-                rows.append({"trials": title, "hand": hand} | _row(chosen, where, hand == "carried"))
+                row = {"trials": title, "n_trials": sum(bool(w.any()) for w in where), "hand": hand}
+                rows.append(row | _row(chosen, where, hand == "carried"))
     return rows
 
 

@@ -84,6 +84,7 @@ def test_what_is_round_has_no_error_of_yaw():
         [apart, perception.errors(turned := _seen([0.3], [0]), _reported(turned, np.zeros(3), 0.2, [False]))],
         [True, True], ["apple", "cube"],
     )  # fmt: skip
+    assert [row["n_trials"] for row in both if row["trials"] == "all"] == [2, 1], "far in two, near in one"
     assert both[0]["yaw_deg"] == pytest.approx(np.degrees(0.2), abs=0.1)
 
 

@@ -73,6 +73,7 @@ MEANINGS: dict[str, Meaning] = {
     "yaw": Meaning("perception's loss on the object's angle"),
     "held": Meaning("perception's loss on whether the object is in the hand"),
     "action": Meaning("loss of the actions, through perception"),
+    "n_trials": Meaning("trials that had such steps"),
     "horizontal_mm": Meaning("median error in the plane", MM),
     "height_mm": Meaning("median error in height", MM),
     "mean_x_mm": Meaning("mean error away from the base", MM),
