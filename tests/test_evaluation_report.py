@@ -348,6 +348,22 @@ def test_two_runs_side_by_side_show_what_differs_alone(run_dir, tmp_path_factory
     assert same == nothing == []
 
 
+def test_a_stage_that_was_made_with_other_settings_says_so(run_dir, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other")
+    for name, metrics in METRICS.items():
+        artifacts.finish(other / name, name, CONFIG, seconds=10, metrics=metrics, origin="trained")
+    score = replace(CONFIG.score, frames=CONFIG.score.frames + 1)
+    for directory, config in ((run_dir, CONFIG), (other, replace(CONFIG, score=score, seed=3))):
+        artifacts.finish(directory / "score", "score", config, seconds=1, metrics={}, origin="trained")
+    assert build_report(run_dir)["stages"]["score"]["made_with"] == {}
+    write_report(other)
+    report = build_report(other)
+    assert report["stages"]["score"]["made_with"] == {"score.frames": score.frames}, "its seed is teacher's"
+    assert "Made with other settings than the run's: 1" in (other / "report.html").read_text()
+    settings, _ = differences([build_report(run_dir), report])
+    assert settings == [("score: score.frames", str(CONFIG.score.frames), str(score.frames))]
+
+
 def test_numbers_that_read_alike_and_differ_are_shown_whole(run_dir):
     one, other = build_report(run_dir), build_report(run_dir)
     other["ddg"]["loss"], other["deploy"]["latency_ms"]["p50"] = 0.020000125, None

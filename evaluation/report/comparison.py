@@ -1,6 +1,6 @@
 """Two runs or more side by side: what was configured otherwise, and what came of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,9 @@ def differences(reports: Sequence[Mapping[str, Any]]) -> tuple[Rows, Rows]:
     Tables in a report, such as one of trials per object, are left out. Values that are too near each other
     for what people read of them are shown to their last digit.
     """
-    settings = [dict(leaves(report["config"])) for report in reports]
+    stages = [item for report in reports for item in report["stages"].items()]
+    others = [(stage, name) for stage, entry in stages for name in entry.get("made_with", {})]
+    settings = [_settings(report, others) for report in reports]
     return _where_different(settings), _where_different([_results(report) for report in reports])
 
 
@@ -60,6 +62,14 @@ def _target_rows(reports: Sequence[Mapping[str, Any]]) -> Rows:
     judged = [{t["target"]: f"{t['measured']} {t['met']}".strip() for t in targets(r)} for r in reports]
     names = dict.fromkeys(name for column in judged for name in column)
     return [(name, *(column.get(name, "") for column in judged)) for name in names]
+
+
+def _settings(report: Mapping[str, Any], others: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """The run's, and `others`, (stage, setting) where some report's stage was made with another."""
+    own = dict(leaves(report["config"]))
+    made_with = {stage: own | entry.get("made_with", {}) for stage, entry in report["stages"].items()}
+    stages = ((stage, name) for stage, name in others if stage in made_with)
+    return own | {f"{stage}: {name}": made_with[stage].get(name) for stage, name in stages}
 
 
 def _results(report: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,10 +19,12 @@ from evaluation.report.html import (
     image,
     is_records,
     judgement,
+    leaves,
     numbers,
     page,
     records,
     table,
+    text,
 )
 from evaluation.report.meanings import explain
 from evaluation.report.summary import summary_rows, trial_run
@@ -82,11 +84,23 @@ def _section(stage: Stage, report: Mapping[str, Any], directory: Path) -> list[s
     return [
         heading(stage.name),
         f"<p class=note>{escape(stage.makes)}</p>",
+        _made_with(report["stages"][stage.name].get("made_with", {}), dict(leaves(report["config"]))),
         numbers({key: value for key, value in metrics.items() if key not in tables}, stage.name),
         *(_titled(title, records(rows, stage.name)) for title, rows in tables.items()),
         *_curves(stage.name, directory),
         *(_titled(path.stem, _picture(path)) for path in _pictures(directory, metrics)),
     ]
+
+
+def _made_with(own: Mapping[str, Any], run: Mapping[str, Any]) -> str:
+    """What the configuration at the page's end does not say of a stage; nothing where it says it all."""
+    if not own:
+        return ""
+    rows = [(name, text(value), text(run.get(name, ""))) for name, value in own.items()]
+    return (
+        f"<details><summary>Made with other settings than the run's: {len(rows)}</summary>"
+        f"{table(('Setting', 'This stage', 'The run'), rows)}</details>"
+    )
 
 
 def _pictures(directory: Path, metrics: Mapping[str, Any]) -> list[Path]:

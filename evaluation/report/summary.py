@@ -14,6 +14,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.stages import ON_REQUEST, STAGES, get_stage
 from evaluation import backends, perception_table, teacher_trials, wilson
 from evaluation.report import deployments
+from evaluation.report.html import leaves
 from evaluation.report.targets import MISSED, targets, verdict
 
 REPORT = "report.json"
@@ -27,8 +28,9 @@ TESTS_PRESET = "debug"
 def build_report(run_dir: Path) -> dict[str, Any]:
     """Report of every finished stage under `run_dir`; UserError if there is none.
 
-    Keys: `stages.<name>.{seconds, trained, loaded, machine}`; `<name>` holds what that stage measured, except
-    keys that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top;
+    Keys: `stages.<name>.{seconds, trained, loaded, machine, made_with}`, the last with what of its own
+    sections that stage was made with and `config` has otherwise; `<name>` holds what that stage measured,
+    except keys that start with `student_` (student_clean, student_ddg, student_rig), which stand at the top;
     `machine` (the last stage's), `versions`, `preset`, `scale` (below 1 in a trial run), `seed`, `config`;
     `targets`, each with what was measured and whether it is met; `outdated.<name>`, the parent for which that
     stage is left out: the one here is not what it was made of, or is left out itself. A success rate is
@@ -66,6 +68,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
             "loaded": manifest.origin == "loaded",
             "created": manifest.created,
             "machine": manifest.machine,
+            "made_with": _made_with(name, manifest.config, latest.config),
         }
         metrics = with_intervals(manifest.metrics)
         report[name] = {key: value for key, value in metrics.items() if not key.startswith(_TOP_LEVEL)}
@@ -96,6 +99,17 @@ def _why_nothing(run_dir: Path) -> str:
     if inside := sorted(path.parent.name for path in run_dir.glob("*/trials.jsonl")):
         return f"holds trials, of {', '.join(inside)}: name one of these folders, or several."
     return "holds no finished stage: nothing to report. Start one with `ddgrasp run`."
+
+
+def _made_with(stage: str, own: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of the stage's own sections whose value is not the run's, as one asked for later may have."""
+    sections, there = get_stage(stage).sections, dict(leaves(run))
+    return {
+        name: value
+        for name, value in leaves(own)
+        if any(f"{name}.".startswith(f"{section}.") for section in sections)
+        and (name not in there or there[name] != value)
+    }
 
 
 def _outdated(found: Mapping[str, Artifact]) -> dict[str, str]:
