@@ -214,8 +214,10 @@ cloning on 1,200 demos, one action from Gaussian noise; no privileged losses, ha
 hand. A sample takes 42 ms forward and backward on two Intel Xeon cores, so that its training is about 67
 minutes; after 1,300 steps of 32 it does not look yet, after 24,350 of 64 it has its demos by heart
 (docs/table2.md). Not the paper's: group norm for batch norm, random first weights
-(--student.encoder.weights weights/resnet18), three frames at 112 x 144, 1,500 steps of 64 (the paper gives
-none of these sizes), a closing of the hand that lasts, and the loop's rules (deploy.retry)."""
+(--student.encoder.weights weights/resnet18), 112 x 144 pixels, a quarter of its 450 x 580 each way, from a
+window around a known place, 1,500 steps of 64 (it names neither), a ninth number of state (how the hand's
+width changes), demos of a perturbed teacher (--demos.noise-share 0), a closing of the hand that lasts
+(--student.head.closing-steps 0), and the loop's rules (deploy.retry)."""
 
 PAPER = Config(
     preset="paper",
@@ -243,6 +245,9 @@ camera: 640 x 360, half of its 1280 x 720 per side, in which the crop window of 
     What the network sees is about what ResNet-18 was made for, and frames, which are read again and again,
     have a quarter of the bytes. The encoder needs multiples of 4: 224 x 288 trims a row and two columns and
     resamples nothing.
+hand: a Franka Hand, where the paper's arm has a UMI gripper; the teacher sees the grasp as a pose
+    (7 numbers), where the paper lists a position (3).
+demos: of a teacher that is perturbed in a sixth of the steps (--demos.noise-share 0 for none).
 generator: at 320 x 180 (the paper does not say), drawing holes and deviations from the surface instead of
     depth itself (the paper's: --ddg.depth.representation depth --ddg.graft.noise-threshold -0.2
     --ddg.training.loss-weight uniform; docs/generator.md compares them).
@@ -252,16 +257,21 @@ sampler: DDIM with 10 evaluations, where the paper goes through all K steps: 100
 bumps: deviations are counted from planes, and the network knows where in the picture it is: what a student's
     success was chosen by (docs/table2.md); the paper says nothing of either.
 encoder: ResNet-18 from random numbers, where the paper's starts from ImageNet's weights, for the same reason
-    (--student.encoder.weights weights/resnet18); its last stage keeps stride 16, and keypoints pool it.
+    (--student.encoder.weights weights/resnet18), and group norm for batch norm; its last stage keeps stride
+    16, and keypoints pool it.
 student: sees relief over the table instead of depth, its holes filled from around them, and has a hand view,
     privileged losses, pose rounds and DAgger, which the paper has not: perception to 5 mm is what decides
     whether it grasps (docs/student_log.md). Besides the generator's noise it trains with ripple made by hand
     and a fifth of clean samples (--student.training.disparity-noise-px 0 --student.training.clean-share 0),
-    gives two actions at a time, and its loop has the rules of deploy.retry.
+    gives two actions at a time, whose diffusion starts from zeros (--deploy.noise normal: from noise), sees
+    how the hand's width changes, has a closing that lasts (--student.head.closing-steps 0), and its loop has
+    the rules of deploy.retry.
 crops: shifted by up to 12 pixels around the window's place, since the camera's place is known here.
 teacher: networks, number of environments and steps are not in the paper; ours for its 95 %. A fifth of the
     episodes begin with the object in the hand and half of the others above it, and the reward is ours; the
     paper's own five terms are those of preset `ppo_paper` (docs/teacher.md has both, learnt from nothing).
+trials: some 50 of each object for the teacher and 17 for the student in simulation, where the paper has 100,
+    and 25 of each on the rig (its 20 are a real robot's).
 """
 
 PRESETS = {

@@ -105,6 +105,17 @@ def test_the_loss_weighs_errors_of_the_clean_map(hole_loss):
     np.testing.assert_allclose(train.noise_loss(config, params, x_0, c, k, eps), expected, rtol=2e-3)
 
 
+def test_uniform_weights_are_equation_4_as_the_paper_has_it():
+    training = dataclasses.replace(TINY.training, loss_weight="uniform", hole_loss="squared")
+    config = dataclasses.replace(TINY, training=training)
+    rng = np.random.default_rng(0)
+    x_0, eps, c = (np.float32(rng.normal(size=(4, 16, 24, 2)[:n])) for n in (4, 4, 3))
+    k, params = np.array([3, 40, 70, 95]), train.init_params(config, jax.random.key(0))
+    x_k = schedule.q_sample(train.config_schedule(config), x_0, k, eps)
+    off = eps - np.asarray(train.predict_noise(config, params, x_k, c, k), np.float64)
+    np.testing.assert_allclose(train.noise_loss(config, params, x_0, c, k, eps), np.mean(off**2), rtol=2e-3)
+
+
 @pytest.mark.parametrize(
     ("section", "change", "message"),
     [

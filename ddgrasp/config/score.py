@@ -21,7 +21,8 @@ class ScoreConfig(Section, name="score"):
 
     trajectories: _TwoOrMore = 84
     """Rig trajectories recorded for scoring per side: as many give real depth, as many others simulated. With
-    16 frames each of the t-SNE's six sets has its share of 8,000 maps, as in the paper."""
+    16 frames each the t-SNE's sets, six without monocular depth and eight with it, share 8,000 maps, as many
+    as the paper's."""
     frames: _TwoOrMore = 16
     """Consecutive frames of each, from a random step on."""
     columns: tuple[ScoreColumn, ...] = SCORE_COLUMNS
