@@ -150,20 +150,29 @@ def _one_line(error: BaseException) -> str | None:
         if full or os.strerror(errno.ENOSPC) in str(cause):
             where = f" at {cause.filename}" if isinstance(cause, OSError) and cause.filename else ""
             return (
-                f"No space left on the disk{where}: free some and go on with --resume. "
-                "What was finished before is intact."
+                f"No space left on the disk{where}: free some and give the same command again, with --resume "
+                "if it has that. What was finished before is intact."
             )
         cause = cause.__cause__ or cause.__context__
     if not isinstance(error, OSError):
         return _open_gl(error) or _platforms(error)
     place = error.filename2 or error.filename  # of a renaming the second is what was asked for
     if place is None:
-        return None
+        gone = error.errno == errno.ENOENT and not _is_somewhere()
+        return "The working directory is not there any more: go to another one." if gone else None
     if isinstance(error, PermissionError):
-        return f"No permission for {place}: choose another --out, or change its owner."
+        return f"No permission for {place}: change its owner, or have it written elsewhere."
     if isinstance(error, (FileExistsError, NotADirectoryError, IsADirectoryError)):
-        return f"{place} cannot be written ({error.strerror}): choose another --out."
+        return f"{place} cannot be written ({error.strerror}): have it written elsewhere."
     return f"{place} cannot be read or written ({error.strerror}): mend that, or give another path."
+
+
+def _is_somewhere() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _open_gl(error: BaseException) -> str | None:

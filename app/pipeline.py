@@ -27,10 +27,10 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
+from ddgrasp.signals import ending, forget_terminal
 from ddgrasp.stages import STAGES, Stage
 from ddgrasp.versions import commit
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
 _REPEAT_S = 0.5
 _SOON_S = 0.001
 _NO_SUCH_PLACE = (
@@ -176,7 +176,8 @@ def _check_parents(artifact: Artifact, parents: Mapping[str, Artifact]) -> None:
 
 @contextmanager
 def _interruptible(name: str) -> Iterator[None]:
-    """Turns Ctrl-C and SIGTERM into KeyboardInterrupt with a message, wherever in the stage they arrive.
+    """Turns Ctrl-C, SIGTERM and a hang-up into KeyboardInterrupt with a message, wherever in the stage they
+    arrive.
 
     A KeyboardInterrupt raised inside a JAX host callback surfaces as some other error; the flag tells. Raised
     in a destructor it is dropped, and in the garbage collector's callbacks (JAX has one), where it would be
@@ -189,13 +190,15 @@ def _interruptible(name: str) -> Iterator[None]:
         if signum == signal.SIGALRM and _is_unwinding():
             return
         arrived = True
+        forget_terminal(signum)
         put_off = _in_gc_callback(frame)
         signal.setitimer(signal.ITIMER_REAL, _SOON_S if put_off else _REPEAT_S, _REPEAT_S)
         if not put_off:
             raise KeyboardInterrupt
 
     try:
-        previous = {number: signal.signal(number, interrupt) for number in _SIGNALS}
+        kinds = (*ending(), signal.SIGALRM)
+        previous = {number: signal.signal(number, interrupt) for number in kinds}
     except ValueError:  # not in the main thread: signals are someone else's
         previous = {}
     message = f"Interrupted in stage {name!r}. Finished work is kept: the same command with --resume goes on."

@@ -258,9 +258,8 @@ def _read(
     size = (config.depth.height_px, config.depth.width_px)
     frames = np.stack([crop_nearest(recording.depth_m(i), size) for i in range(count)])
     seen = np.asarray((frames > 0).any(axis=(1, 2)))
-    again = np.zeros(len(frames), bool)
-    if recording.meta.get("repeated_frames"):  # a deployment keeps a picture for every step
-        again[1:] = seen[1:] & (frames[1:] == frames[:-1]).all(axis=(1, 2))
+    again = seen & [recording.repeats(i) for i in range(count)]
+    if again.any():
         progress.note(f"{recording.path}: left out {again.sum()} frame(s) that came again")
     usable = np.flatnonzero(seen & ~again)
     blind = int((~seen).sum())

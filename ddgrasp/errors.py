@@ -11,6 +11,10 @@ class UserError(Exception):
     """
 
 
+class Trouble(UserError):
+    """What went wrong with right input, as a device that failed: the command line exits with 1."""
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """Error for a name that is not in `known`; suggests the nearest right one."""
     known = sorted(known)

@@ -9,6 +9,7 @@ import dataclasses
 import json
 import os
 import shutil
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -103,7 +104,12 @@ def user_cache(name: str) -> Path:
     """Where what can be made again is kept: `name` in DDGRASP_CACHE, or in ddgrasp/ of the user's caches."""
     if own := os.environ.get("DDGRASP_CACHE"):
         return Path(own) / name
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ddgrasp" / name
+    if caches := os.environ.get("XDG_CACHE_HOME"):
+        return Path(caches) / "ddgrasp" / name
+    try:
+        return Path.home() / ".cache" / "ddgrasp" / name
+    except RuntimeError:  # in a container, for a user whom nobody knows
+        return Path(tempfile.gettempdir()) / f"ddgrasp-{os.getuid()}" / name
 
 
 def atomic_write_bytes(path: Path | str, data: bytes) -> None:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+from ddgrasp.events import ScalarEvents
 from ddgrasp.files import atomic_path, atomic_write_json, to_json
 
 CURVES = "curves.jsonl"
@@ -75,7 +76,8 @@ class Progress:
         self._start = time.monotonic()
         self._before_s = self._read_clock()
         self._clock_saved = time.monotonic()
-        self._writer, self._again = None, False
+        self._events: ScalarEvents | None = None
+        self._again = False
         self._live = None
         self._plain_last = -_PLAIN_PERIOD_S
         self._tty = sys.stderr.isatty()
@@ -121,16 +123,14 @@ class Progress:
             return
         plain = {name: float(value) for name, value in values.items()}
         self.directory.mkdir(parents=True, exist_ok=True)
-        if self._writer is None:
-            from tensorboardX import SummaryWriter
-
+        if self._events is None:
             _end_line(self.directory / CURVES)
             self._again = (self.directory / EVENTS).exists()
-            self._writer = SummaryWriter(str(self.directory / EVENTS))
+            self._events = ScalarEvents(self.directory / EVENTS)
         with open(self.directory / CURVES, "a") as file:
             file.write(json.dumps(to_json({"step": int(step), **plain})) + "\n")
         for name, value in plain.items():
-            self._writer.add_scalar(name, value, int(step))
+            self._events.add(int(step), name, value)
 
     def picture(self, name: str, **panels: Any) -> None:
         """Keeps images for the report, to be drawn side by side (see `evaluation/report/figures.py`).
@@ -152,25 +152,26 @@ class Progress:
     def close(self) -> None:
         """Flushes the events and keeps the time spent, so that a later attempt adds to it."""
         self._save_clock()
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        if self._events is not None:
+            self._events.close()
+            if self._events.trouble:
+                self.note(f"TensorBoard's events are not whole ({self._events.trouble}); {CURVES} has all.")
+            self._events = None
             if self._again:
                 self._rewrite_events()
 
     def _rewrite_events(self) -> None:
         """TensorBoard's events of all attempts, a step that was done twice once, as `read_curves` has it; all
         have the time of now. What is left if it fails is `curves.jsonl`, and events that repeat steps."""
-        from tensorboardX import SummaryWriter
-
         assert self.directory is not None
         with contextlib.suppress(OSError):
             before = list((self.directory / EVENTS).iterdir())
-            with SummaryWriter(str(self.directory / EVENTS), filename_suffix=f".{time.time_ns()}") as writer:
-                for name, points in read_curves(self.directory).items():
-                    for step, value in points:
-                        writer.add_scalar(name, value, step)
-            for path in before:
+            events = ScalarEvents(self.directory / EVENTS, f".{time.time_ns()}")
+            for name, points in read_curves(self.directory).items():
+                for step, value in points:
+                    events.add(step, name, value)
+            events.close()
+            for path in () if events.trouble else before:
                 path.unlink()
 
     # --- drawing ---

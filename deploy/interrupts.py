@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
+from ddgrasp.signals import ending
+
 _late: list[int] = []
 """Signals that came while a session ended."""
 
@@ -25,7 +27,7 @@ def terminable() -> AbstractContextManager[None]:
     _late.clear()
 
     def interrupt(signum: int, frame: Any) -> None:
-        for number in _ending():
+        for number in ending():
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
@@ -38,21 +40,15 @@ def unbroken() -> AbstractContextManager[None]:
     return _handled_by(lambda signum, frame: note(signum))
 
 
-def _ending() -> list[signal.Signals]:
-    """Signals that end a session; what runs under nohup goes on without its terminal."""
-    hangs_up = signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
-    return [signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hangs_up else [])]
-
-
 @contextmanager
 def _handled_by(handler: Callable[[int, Any], Any]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # signals are someone else's
         yield
         return
-    ending = _ending()
-    previous = [signal.signal(number, handler) for number in ending]
+    numbers = ending()
+    previous = [signal.signal(number, handler) for number in numbers]
     try:
         yield
     finally:
-        for number, before in zip(ending, previous, strict=True):
+        for number, before in zip(numbers, previous, strict=True):
             signal.signal(number, before)

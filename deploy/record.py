@@ -6,6 +6,7 @@ generator to what the robot just saw.
 
 import json
 import math
+import os
 import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -177,6 +178,8 @@ class DeploymentRecord:
                 folder.mkdir(parents=True, exist_ok=True)
                 with open(path, mode) as file:
                     file.write(_line(row))
+                    file.flush()
+                    os.fsync(file.fileno())
                 mode = "a"
             if frame is not None:
                 yield frame

@@ -112,9 +112,9 @@ def _run(
         if not begun:  # interrupted, or a device failed in its start: nothing was tried
             _drop(folder)
             return report
+        if success is not None:  # before the disk is written to, which may be full
+            say(f"verdict: {ENDED[success]}")
         kept.finish(folder, report.as_dict(), success, about | _object(camera, name))
-    if success is not None:
-        say(f"verdict: {ENDED[success]}")
     say(f"report: {folder / REPORT_FILE}")
     if isinstance(driven, DryRun):
         path = folder / "dry-run.png"

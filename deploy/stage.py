@@ -9,9 +9,10 @@ from ddgrasp import artifacts, contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_bytes
+from ddgrasp.files import atomic_write_bytes, to_json
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
+from ddgrasp.trained import trained_objects
 from deploy.policy import POLICY_FILE
 from deploy.timing import Timings
 from deploy.trial_log import TrialLog
@@ -42,7 +43,7 @@ def run(job: Job) -> Artifact:
                 done = [r for r in log.results.values() if not r.realtime]
                 task.advance(success=sum(r.success for r in done) / max(len(done), 1))
     results = [log.results[(trial.index, trial.realtime)] for trial in trials]
-    return job.finish(metrics(results, config.world.objects))
+    return job.finish(metrics(results, trained_objects(to_json(config), "student")))
 
 
 def metrics(results: Sequence[TrialResult], trained: Sequence[str]) -> dict[str, Any]:

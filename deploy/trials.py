@@ -19,7 +19,7 @@ from jaxtyping import Float, UInt8
 
 from ddgrasp import contract
 from ddgrasp.config import Config
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble, UserError
 from deploy.changes import AS_IT_IS, Change
 from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
@@ -245,7 +245,7 @@ def run_trials(
             waiting.discard(future)  # its film is megabytes
             yield future.result()
     except BrokenProcessPool:
-        raise UserError(
+        raise Trouble(
             "a worker was killed, often for want of memory: finished trials are kept, the same command (with "
             "--resume where it has one) goes on; fewer workers need less."
         ) from None

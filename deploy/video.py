@@ -137,15 +137,15 @@ class _Codec:
 
     def close(self, whole: bool) -> None:
         self._writer.release()
-        with contextlib.suppress(_BrokenOff), self._files:
+        with contextlib.suppress(BrokenOff), self._files:
             if not whole:
-                raise _BrokenOff
+                raise BrokenOff
             if (kept := _frame_count(self._temporary)) < self._written:
                 why = f"{kept} of {self._written} pictures were written: is the disk full?"
                 raise OSError(errno.EIO, why, str(self._path))
 
 
-class _BrokenOff(Exception):
+class BrokenOff(Exception):
     """Takes a half-made film away."""
 
 

@@ -6,6 +6,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,10 +14,11 @@ from urllib.parse import quote
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_path
 from ddgrasp.install import pip_install
 from deploy.interfaces import Filmed, Staged
 from deploy.loop import Step
-from deploy.video import millimetres
+from deploy.video import BrokenOff, millimetres
 
 WEB_PORT, GRPC_PORT = 9090, 9876
 """Rerun's own, of its web viewer and of what that is fed from."""
@@ -56,12 +58,12 @@ class Rerun:
         except ImportError as error:
             raise UserError(f"Rerun is not installed ({error}): {pip_install('view')}.") from error
         self._rr: Any = rerun
+        self._files = ExitStack()
         self.url = ""
         """Where a browser finds it."""
         rerun.init("ddgrasp play")
         if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            rerun.save(file)
+            rerun.save(self._files.enter_context(atomic_path(file)))
         elif browser:
             address, port = rerun.serve_grpc(grpc_port=_free_port(GRPC_PORT)), _free_port(WEB_PORT)
             rerun.serve_web_viewer(web_port=port, open_browser=False, connect_to=address)
@@ -98,8 +100,12 @@ class Rerun:
         return True
 
     def close(self, whole: bool = True) -> None:
-        """What was shown has been sent or is in the file, what was broken off as well."""
+        """What was shown has been sent or is in the file, what was broken off as well; where nothing was
+        shown a file of that name stays as it was."""
         self._rr.disconnect()
+        with suppress(BrokenOff), self._files:
+            if not self._steps:
+                raise BrokenOff
 
     def _note(self, text: str) -> None:
         self._rr.set_time("step", sequence=self._steps)

@@ -36,16 +36,20 @@ def load(directory: Path) -> list[dict[str, Any]]:
 
 
 def table(directory: Path, trained_on: str) -> list[dict[str, Any]]:
-    """For the report: backend, success, drop in points from the backend trained on (None if that one was
-    not measured), contacts dropped (None if they were not kept), and the success of each object."""
+    """For the report: backend, success, drop in points from the backend trained on (None if that one was not
+    measured, or on episodes of another seed), the seed, contacts dropped (None if they were not kept), and
+    the success of each object."""
     rows = {row["backend"]: row for row in load(directory)}
     rates = {name: _success(row["success"]) for name, row in rows.items()}
-    home = rates.get(trained_on)
+    home = rows.get(trained_on)
     return [
         {
             "backend": name + (" (trained on)" if name == trained_on else ""),
             "success": rates[name],
-            "drop_points": None if home is None else 100 * (home["rate"] - rates[name]["rate"]),
+            "drop_points": 100 * (rates[trained_on]["rate"] - rates[name]["rate"])
+            if home is not None and home["seed"] == row["seed"]
+            else None,
+            "seed": row["seed"],
             "contacts_dropped": row.get("contacts_dropped"),
             **{key: _success(counts) for key, counts in row["objects"].items()},
         }

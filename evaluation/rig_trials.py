@@ -15,6 +15,7 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from ddgrasp.progress import Progress
+from ddgrasp.trained import trained_objects
 from deploy.changes import Change
 from deploy.fr3_lab import Shapes, stopping_at
 from deploy.fr3_trials import Fr3Bench, Sight
@@ -203,8 +204,10 @@ def check_log(out: Path, header: dict[str, Any]) -> None:
 
 
 def _as_begun(out: Path, header: dict[str, Any]) -> dict[str, Any]:
-    """`header` without what that of `out`'s log, begun before, does not name yet."""
+    """`header` without what that of `out`'s log, begun before, does not name yet; what the policy was trained
+    on is not told anew."""
     had, results = read_log(out / TRIALS_FILE)
+    header = header | {key: had[key] for key in (_TRAINED,) if results and key in had}
     return {key: value for key, value in header.items() if not results or key in had or key not in _ADDED}
 
 
@@ -280,9 +283,9 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     """What the trials belong to; how many of which objects may grow.
 
     Args:
-      config: the policy's own, with the objects that it was trained on.
+      config: the policy's own, with the objects of its run.
     """
-    trained, config = config.world.objects, series.configured(config, policy)
+    trained, config = trained_objects(to_json(config), "student"), series.configured(config, policy)
     config = replace(config, world=replace(config.world, objects=_listed()))
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}

@@ -12,6 +12,7 @@ from ddgrasp.artifacts import Artifact
 from ddgrasp.config import WorldConfig
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, read_json, to_json
 from ddgrasp.progress import PICTURES
+from ddgrasp.trained import trained_objects
 from evaluation import wilson
 from evaluation.report import figures
 
@@ -28,12 +29,12 @@ def summarise(result: Mapping[str, Any], teacher: Artifact, world: WorldConfig, 
       world: where it was measured.
       seed: of the episodes.
 
-    Keys: teacher (its hash), seed, world; success, and the same of the objects of its own run (`seen`) and of
-    the others (`unseen`), if there are any: {rate, n, successes, low, high}; objects: a row per object and
-    one for all, {object, success, motion and visibility}.
+    Keys: teacher (its hash), seed, world; success, and the same of the objects that it was trained on
+    (`seen`) and of the others (`unseen`), if there are any: {rate, n, successes, low, high}; objects: a row
+    per object and one for all, {object, success, motion and visibility}.
     """
     counts = {**result["objects"], "all": result["success"]}
-    trained = teacher.manifest.config["world"]["objects"]
+    trained = trained_objects(teacher.manifest.config, "teacher")
     groups = {
         "seen": [c for name, c in result["objects"].items() if name in trained],
         "unseen": [c for name, c in result["objects"].items() if name not in trained],

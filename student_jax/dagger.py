@@ -7,7 +7,6 @@ stopped while it put away the episodes of a round of DAgger: those that are miss
 """
 
 import contextlib
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,8 @@ import jax
 import numpy as np
 
 from ddgrasp.config import Config, StudentConfig
-from ddgrasp.files import atomic_write_json
+from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json, read_json
 from ddgrasp.progress import Progress
 from demos.rollout import Roller
 from demos.store import EpisodeStore
@@ -111,7 +111,9 @@ class Trainer:
     def _restore(self) -> None:
         plan = self._directory / PLAN
         if plan.exists():
-            state = json.loads(plan.read_text())
+            state = read_json(plan)
+            if not isinstance(state, dict) or not {"done", "history"} <= state.keys():
+                raise UserError(f"{plan} is damaged: delete {self._directory} and begin anew.")
             self._done, self.history = state["done"], state["history"]
             self._take_over(self._done[-1])
             self.params = load_params(self._directory / PARAMS_FILE)
@@ -172,7 +174,7 @@ class Trainer:
     def _acted(self, number: int) -> dict[str, float]:
         """Success of round `number`'s episodes, by this attempt or the one before; nothing if it is lost."""
         path = self._directory / ACTED
-        last = json.loads(path.read_text()) if path.exists() else {}
+        last = read_json(path) if path.exists() else {}
         return {"rollout_success": last["rollout_success"]} if last.get("round") == number else {}
 
     def _fit(self, phase: str, steps: int) -> dict[str, float]:

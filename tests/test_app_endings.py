@@ -18,7 +18,7 @@ from app import cli, commands, pipeline
 from app.commands import parse
 from app.commands.checks import check_file, check_folder
 from ddgrasp import install
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble, UserError
 from ddgrasp.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
@@ -51,6 +51,29 @@ def test_an_error_that_names_no_file_keeps_its_traceback(monkeypatch):
     for error in (OSError(errno.EIO, "no file"), PermissionError(errno.EPERM, "of a process"), KeyError("a")):
         with pytest.raises(type(error)):
             ran(partial(_raise, error), monkeypatch)
+
+
+def test_a_folder_that_is_gone_is_told_in_one_line(tmp_path):
+    (tmp_path / "gone").mkdir()
+    script = "import os, sys; os.rmdir(os.getcwd()); from app.cli import main; sys.exit(main())"
+    line = [sys.executable, "-c", script, "run", "--preset", "debug"]
+    done = subprocess.run(
+        line,
+        cwd=tmp_path / "gone",
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (
+        1,
+        "ddgrasp: The working directory is not there any more: go to another one.\n",
+    )
+
+
+def test_what_failed_by_itself_is_no_wrong_input(monkeypatch, capsys):
+    assert ran(partial(_raise, Trouble("the arm stopped")), monkeypatch) == 1
+    assert ran(partial(_raise, UserError("no such object")), monkeypatch) == 2
+    assert capsys.readouterr().err == "ddgrasp: the arm stopped\nddgrasp: no such object\n"
 
 
 @pytest.mark.parametrize("out", ["a" * 300, "README.md/a"])
@@ -206,8 +229,8 @@ def test_output_that_nobody_takes_is_told_once_or_not_at_all(command):
         (writer, ""),
         (
             os.open("/dev/full", os.O_WRONLY),
-            "ddgrasp: No space left on the disk: free some and go on with --resume. What was finished before "
-            "is intact.\n",
+            "ddgrasp: No space left on the disk: free some and give the same command again, with --resume if "
+            "it has that. What was finished before is intact.\n",
         ),
     ):
         done = subprocess.run(

@@ -3,11 +3,13 @@
 The robot is an arm without inertia, the imager draws the board where the arm holds it.
 """
 
+import errno
 import json
 import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -298,6 +300,21 @@ def test_a_log_that_nobody_writes_any_more_costs_no_calibration(tmp_path, bench)
         raise BrokenPipeError
 
     assert session.run(fast(), options(tmp_path), gone) is not None and (tmp_path / "cal.json").exists()
+
+
+def test_a_picture_that_cannot_be_written_costs_no_calibration(tmp_path, bench, monkeypatch):
+    monkeypatch.setattr(session, "atomic_write_bytes", Mock(side_effect=OSError(errno.ENOSPC, "full")))
+    said: list[str] = []
+    with pytest.raises(OSError, match="full"):
+        session.run(fast(), options(tmp_path), said.append)
+    assert (tmp_path / "cal.json").exists() and said[-1] == "the hand keeps the board"
+
+
+def test_where_calibrate_writes_by_itself_is_tried_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").touch()
+    with pytest.raises(UserError, match=r"calibration\.json, and \S+runs is no folder"):
+        parse("calibrate", []).run()
 
 
 def test_an_arm_that_does_not_stop_is_said(tmp_path, bench, monkeypatch):

@@ -5,7 +5,9 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -162,6 +164,20 @@ def test_depth_has_one_colour_scale_for_all_frames():
 def test_another_ending_is_refused_before_anything_runs(tmp_path):
     with pytest.raises(UserError, match="ends with .mp4 or .webm or .webp"):
         Video(tmp_path / "film.avi")
+
+
+def test_a_recording_of_rerun_s_takes_its_name_once_it_shows_something(tmp_path, monkeypatch):
+    file = tmp_path / "a.rrd"
+    file.write_bytes(b"before")
+    stand_in = Mock(save=lambda path: Path(path).write_bytes(b"new"))
+    monkeypatch.setitem(sys.modules, "rerun", stand_in)
+    monkeypatch.setitem(sys.modules, "rerun.blueprint", stand_in)
+    Rerun(browser=False, file=file).close(whole=False)  # as where the policy turned out to be absent
+    assert file.read_bytes() == b"before" and [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
+    shown = Rerun(browser=False, file=file)
+    shown.look(_step(0, 700), _RedCamera())
+    shown.close(whole=False)
+    assert file.read_bytes() == b"new" and [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
 
 
 def test_without_rerun_the_remedy_is_named(monkeypatch):

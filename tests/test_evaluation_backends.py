@@ -43,6 +43,8 @@ def test_the_drop_is_the_difference_of_rates_and_each_rate_has_its_interval(teac
         pytest.approx(0.7864, abs=1e-4), pytest.approx(0.9565, abs=1e-4)
     )  # fmt: skip
     assert jax["cube"]["n"] == 25
+    backends.save(teacher, {"jax": result(45, 50)}, seed=4)
+    assert [row["drop_points"] for row in backends.table(teacher, "cpu")] == [0, None], "other episodes"
 
 
 def test_backends_add_up_until_the_teacher_is_made_anew(teacher):

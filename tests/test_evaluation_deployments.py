@@ -13,6 +13,7 @@ REFLEX = "the arm stopped itself: reflex"
 
 def deployment(success: bool | None = None, fault: str = "", **about) -> Deployment:
     report = {"steps": 10, "holds": 0, "missed_deadlines": 0, "events": [], "interrupted": False}
+    report |= {"policy": "p.onnx", "robot": "sim", "camera": "stereo"}
     report |= {"success": success, "fault": fault, "latency_ms": {"p50": None, "p99": None}}
     return Deployment(Path("20261128-120000"), {**report, **about})
 
@@ -56,9 +57,17 @@ def test_practice_on_the_rig_is_no_trial_of_the_arm():
     on_arm, on_rig = ({"robot": "franka", "camera": camera} for camera in ("realsense", "rig"))
     made = [deployment(False, **on_arm), deployment(True, **on_rig), deployment(True, **on_rig)]
     said = deployments.verdict(made)
-    assert said.startswith("Success franka with realsense: 0.0 % of 1 (")
-    assert "; franka with rig: 100.0 % of 2 (" in said and ". Ended by a fault: 0. " in said
+    assert said.startswith("Success p.onnx on franka with realsense: 0.0 % of 1 (")
+    assert "; p.onnx on franka with rig: 100.0 % of 2 (" in said and ". Ended by a fault: 0. " in said
     assert deployments.verdict(made[1:]).startswith("Success 100.0 % of 2 (")
+
+
+def test_two_policies_have_a_rate_each():
+    made = [deployment(False, policy="old.onnx"), deployment(True, policy="new.onnx")]
+    said = deployments.verdict(made)
+    assert (
+        "new.onnx on sim with stereo: 100.0 % of 1 (" in said and "; old.onnx on sim with stereo: 0.0" in said
+    )
 
 
 def test_the_page_says_what_counts(tmp_path):

@@ -216,6 +216,15 @@ def test_recordings_of_frames_that_may_not_follow_each_other_are_known(tmp_path)
     assert score_data.load_real(tmp_path / "b", 32, 7).apart == {0: tmp_path / "b"}
 
 
+def test_a_picture_that_came_again_stands_on_one_side_alone(tmp_path):
+    with RecordingWriter(tmp_path / "a", {"fx_px": 40.0, "baseline_m": 0.05, "repeated_frames": 4}) as writer:
+        for number in range(20):
+            depth_mm = 800 + (number - number % 2 if number < 8 else number)
+            writer.add(np.zeros((48, 64, 3), np.uint8), np.full((48, 64), depth_mm, np.uint16))
+    real = score_data.load_real(tmp_path / "a", 32, 18)
+    assert real.total == 20 and (real.depth_mm[:, 0, 0] - 800).tolist() == [2, 4, 6, *range(8, 20)]
+
+
 def test_blocks_are_of_one_recording_each(tmp_path):
     for name, frames in (("a", 11), ("b", 13), ("c", 16), ("d", 7)):
         write_recording(tmp_path / name, frames, (48, 64))
@@ -286,6 +295,11 @@ def test_sides_that_show_the_same_scenes_are_resampled_together():
         score_table.hole_figures(s, 20, 0)[FLOOR]["figures"]["gap_depth_m"] for s in (both, apart)
     )
     assert together["low"] == together["high"] == 0 < alone["high"] - alone["low"]
+    two = {"sim_gt": scenes, "sim_ddg": scenes}
+    alike = dict.fromkeys(two, [3, 4, 5])
+    twice = Scored(sums={**both.sums, **two}, groups={**both.groups, **alike})
+    made = score_table.hole_figures(twice, 20, 0)
+    np.testing.assert_equal(made["sim_gt"]["figures"], made["sim_ddg"]["figures"])  # drawn alike
 
 
 def test_the_curve_fits_and_scores_every_size_and_keeps_finished_points(run_dir, tmp_path, capsys):

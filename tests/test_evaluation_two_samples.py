@@ -52,6 +52,14 @@ def test_alike_and_different_sets():
     assert abs(same["kid_x100"]["value"]) < 0.1 * other["kid_x100"]["value"]
 
 
+def test_neighbours_of_alike_sets_may_mix_more_than_by_chance():
+    real, alike = sample(3, groups=40), sample(53, groups=40, first=100)
+    rng = np.random.default_rng(3)
+    drawn = list(zip(draws(real.groups, 20, rng), draws(alike.groups, 20, rng), strict=True))
+    mixing = two_samples.compare(real, alike, CONFIG, drawn)["mixing"]
+    assert mixing["low"] < mixing["value"] < mixing["high"] and mixing["high"] > 1
+
+
 def test_a_classifier_never_trains_on_the_scene_it_is_tested_on():
     # Within a group the sets differ by a constant that is another in every group: only a leak could use it.
     rng = np.random.default_rng(0)

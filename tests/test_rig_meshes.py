@@ -177,6 +177,11 @@ def test_coacd_is_asked_once_for_a_shape_of_one_s_own(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "coacd", None)
     again = convex.convex_parts(part)
     assert [hull.tolist() for hull in again] == [hull.tolist() for hull in hulls]
+    monkeypatch.undo()
+    monkeypatch.setenv("DDGRASP_CACHE", str(tmp_path))
+    (kept,) = (tmp_path / "meshes").iterdir()
+    kept.write_bytes(kept.read_bytes()[:100])  # as a bad disk leaves it
+    assert len(convex.convex_parts(part)) == len(hulls)
 
 
 def test_without_coacd_the_remedy_is_named(monkeypatch, tmp_path):

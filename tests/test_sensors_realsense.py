@@ -29,7 +29,7 @@ from sensors.recordings import realsense
 from sensors.recordings import writer as writing
 from sensors.recordings.realsense import Gaps, once
 from sensors.recordings.realsense_live import Pace, Take, frame_count
-from sensors.recordings.recording import Recording, check_fields
+from sensors.recordings.recording import Recording, check_fields, find_recordings
 from sensors.recordings.sources import RawFrame
 
 SMALL = ("--width", str(SIZE[1]), "--height", str(SIZE[0]))
@@ -201,19 +201,32 @@ def test_the_rate_that_is_left_is_never_none(take, hz, kept):
     check_fields(Path("meta.json"), meta)
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_keeps_what_was_recorded(tmp_path, monkeypatch, capsys, kind):
     def interrupted():
         os.kill(os.getpid(), kind)
         return 22
 
     before = signal.getsignal(kind)
+    if before is signal.SIG_IGN:
+        pytest.skip("these tests run under nohup, where a closed terminal ends nothing")
     scripted(monkeypatch, [*range(1, 22), interrupted, 25, 28])
     with pytest.raises(KeyboardInterrupt):
         record(tmp_path, "--seconds", 60)
     assert numbers_in(tmp_path / "take") == [16, 19, 22]
     assert capsys.readouterr().out.endswith("take: 3 frames, stopped before the 600 asked for\n")
     assert signal.getsignal(kind) is before
+
+
+def test_frames_that_a_killed_recording_left_are_not_recorded_over(tmp_path, monkeypatch, capsys):
+    scripted(monkeypatch, list(range(1, 60)))
+    record(tmp_path, "--frames", 2)
+    (tmp_path / "take").rename(tmp_path / ".take.partial")
+    (tmp_path / ".take.partial" / "meta.json").unlink()
+    with pytest.raises(UserError, match=r"\.take\.partial has 2 frames of a recording that did not end"):
+        record(tmp_path, "--frames", 2)
+    parse("record import", [str(tmp_path / ".take.partial"), "--out", str(tmp_path / "kept")]).run()
+    assert "2 frames" in capsys.readouterr().out and len(find_recordings(tmp_path / "kept")) == 1
 
 
 def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import os
 import resource
 import subprocess
 import sys
+import tempfile
 import textwrap
 from importlib.metadata import version
 from pathlib import Path
@@ -101,6 +102,7 @@ def test_who_is_interrupted_between_two_renames_keeps_the_old_folder(tmp_path, m
         ({"XDG_CACHE_HOME": "/b"}, "/b/ddgrasp/jax"),
         ({"HOME": "/c"}, "/c/.cache/ddgrasp/jax"),
         ({"XDG_CACHE_HOME": "", "DDGRASP_CACHE": "", "HOME": "/c"}, "/c/.cache/ddgrasp/jax"),
+        ({}, "/tmp/ddgrasp-1234/jax"),
     ],
 )
 def test_caches_are_where_the_environment_says(environment, expected, monkeypatch):
@@ -108,6 +110,8 @@ def test_caches_are_where_the_environment_says(environment, expected, monkeypatc
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
+    monkeypatch.setattr(os, "getuid", lambda: 1234)
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: "/tmp")
     if "HOME" not in environment:  # as in a container whose user has no home
 
         def nowhere():

@@ -210,8 +210,8 @@ def test_a_file_that_cannot_be_written_is_named_in_one_line_and_no_temporary_one
     (tmp_path / "file").touch()
     (tmp_path / "a.png").mkdir()
     for out, trouble in (
-        ("file/a.png", "file cannot be written (File exists): choose another --out."),
-        ("a.png", "a.png cannot be written (Is a directory): choose another --out."),
+        ("file/a.png", "file cannot be written (File exists): have it written elsewhere."),
+        ("a.png", "a.png cannot be written (Is a directory): have it written elsewhere."),
         ("a" * 250, "cannot be read or written (File name too long): mend that, or give another path."),
     ):
         writes = SimpleNamespace(run=partial(atomic_write_bytes, tmp_path / out, b""))

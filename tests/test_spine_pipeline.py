@@ -9,12 +9,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboardX.record_writer import RecordWriter
 
 from app import pipeline
-from ddgrasp import artifacts
+from ddgrasp import artifacts, events
 from ddgrasp.alone import alone_in
 from ddgrasp.config import Config, WorldConfig
 from ddgrasp.errors import UserError
@@ -258,6 +260,7 @@ def _interrupt(work: str, run_dir: Path, number: int) -> tuple[str, list[str]]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # nohup has it ignored
     )
     assert process.stdout and process.stdout.readline() == "working\n"
     time.sleep(0.3)
@@ -267,7 +270,7 @@ def _interrupt(work: str, run_dir: Path, number: int) -> tuple[str, list[str]]:
     return out, errors.splitlines()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_says_how_to_go_on_and_keeps_the_time_spent(tmp_path, number):
     _, errors = _interrupt(WRAPS_THE_INTERRUPT, tmp_path, number)
     assert errors == [INTERRUPTED]
@@ -402,9 +405,26 @@ def test_curves_count_a_repeated_step_once_and_skip_a_torn_line(tmp_path):
     third.scalars(3, loss=1.0)
     third.close()
     assert read_curves(tmp_path)["loss"] == [(1, 3.0), (2, 1.5), (3, 1.0)]
-    (events,) = (tmp_path / "tb").glob("events*")
-    seen = EventAccumulator(str(events)).Reload().Scalars("loss")
+    (file,) = (tmp_path / "tb").glob("events*")
+    seen = EventAccumulator(str(file)).Reload().Scalars("loss")
     assert [(point.step, point.value) for point in seen] == [(1, 3.0), (2, 1.5), (3, 1.0)]
+
+
+def test_a_disk_that_takes_no_events_stops_nothing(tmp_path, monkeypatch, capsys):
+    """tensorboardX's own writer hands them to a thread, for which a training would wait for ever."""
+    for _ in range(2):  # the second time TensorBoard's events of both are written anew
+        with monkeypatch.context() as patch:
+            progress = Progress(tmp_path, "fit")
+            progress.scalars(1, loss=3.0)
+            full = OSError(errno.ENOSPC, "No space left on device")
+            patch.setattr(RecordWriter, "flush", Mock(side_effect=full))
+            patch.setattr(events, "_FLUSH_PERIOD_S", -1.0)
+            for step in range(2, 40):
+                progress.scalars(step, loss=1.0)
+            progress.close()
+        said = capsys.readouterr().err
+        assert "[fit] TensorBoard's events are not whole ([Errno 28] No space left" in said
+    assert len(read_curves(tmp_path)["loss"]) == 39
 
 
 def test_progress_prints_plain_lines_with_an_estimate_outside_a_terminal(capsys):

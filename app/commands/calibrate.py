@@ -69,15 +69,15 @@ class Calibrate:
 
     def run(self) -> None:
         """Drives the poses, prints the errors, writes the calibration."""
-        if self.out is not None:
-            check_file("--out", self.out)
         from deploy.calibration.session import CalibrationOptions, run
         from deploy.interrupts import ended_late
 
-        run(self.config, CalibrationOptions(
+        options = CalibrationOptions(
             self.camera, self.host, self.board.made(), self.poses, self.speed,
             dry_run=self.dry_run, yes=self.yes, out=self.out,
-        ), say)  # fmt: skip
+        )  # fmt: skip
+        check_file("--out", options.file)
+        run(self.config, options, say)
         if ended_late():
             raise KeyboardInterrupt
 

@@ -11,7 +11,7 @@ from app.commands.checks import check_folder
 from ddgrasp import contract
 from ddgrasp.config import CameraScale, RecordConfig, StereoConfig
 from ddgrasp.config.checks import Count, Range, Seed, Share
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble
 from ddgrasp.presets import get_preset
 
 
@@ -101,7 +101,7 @@ class RecordRealsense:
         imported, take = live.record(options, path, Progress(name="record realsense"))
         print(live.summary(imported, take, frames))
         if take.trouble:
-            raise UserError(take.trouble)
+            raise Trouble(take.trouble)
         if take.stopped:
             raise KeyboardInterrupt
 

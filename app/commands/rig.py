@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from app.commands.checks import check_file
 from ddgrasp.config.checks import Range, Seed
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.install import FR3, check_fr3
 from deploy.devices.options import RIG_HOST
@@ -44,7 +44,7 @@ class RigFr3:
             print(f"FR3 at {self.host} before {self.object_name!r}. Drive it: {drive}", flush=True)
             while rig.running():
                 time.sleep(0.2)
-            raise UserError(f"the FR3 rig at {self.host} has ended; what it said is above.")
+            raise Trouble(f"the FR3 rig at {self.host} has ended; what it said is above.")
 
 
 def drive_command(host: str, board: bool) -> str:

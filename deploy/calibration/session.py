@@ -13,7 +13,7 @@ import numpy as np
 from ddgrasp import policy_metadata
 from ddgrasp.config import Config
 from ddgrasp.contract import HOME_RAD
-from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.errors import Trouble, UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes
 from deploy import kinematics
 from deploy.calibration import picture, poses, standing
@@ -119,7 +119,7 @@ def run(
         taken = _take(driver, imager, bench, ways, options, give, say)
         try:  # before a person touches the arm, which may fail: it costs none of the views
             found = _solved(taken, bench.lens, options, config, _truth(imager), say)
-        except UserError:
+        except (UserError, OSError):
             _give_back(driver, options, say)
             raise
         _give_back(driver, options, say)
@@ -185,7 +185,7 @@ def _take(
     except RobotError as error:
         ended = f"calibration ended at pose {number} of {len(ways)}: {error}"
         if taken.seen < MIN_VIEWS:
-            raise UserError(f"{ended}.") from error
+            raise Trouble(f"{ended}.") from error
         say(f"{ended}; goes on with the views before it")
     if not taken.views:
         raise UserError(f"none of {len(ways)} poses gave a picture; what happened is said above.")
@@ -250,7 +250,7 @@ def _look_once(
     try:
         gray = imager.picture()
     except CameraError as error:
-        raise UserError(f"camera {options.camera!r} gives no picture: {error}.") from error
+        raise Trouble(f"camera {options.camera!r} gives no picture: {error}.") from error
     corners: Corners = options.board.find(gray)
     path = options.file.with_name("dry-run.png")
     atomic_write_bytes(path, picture.encode(gray))
@@ -272,9 +272,10 @@ def _solved(
     host = config.deploy.franka.host
     result = Calibration(standing.now(), options.camera, host, found.T_base_cam, found.rms_px, details)
     sheet = options.file.with_suffix(".png")
+    if found.rms_px <= MOST_RMS_PX:  # before the picture, which takes more room
+        standing.save(options.file, result)
     atomic_write_bytes(sheet, picture.sheet(taken.pictures, taken.views, found, lens, options.board))
     _check_fit(found.rms_px, 1e3 * options.board.square_m, sheet, say)
-    standing.save(options.file, result)
     reads = "`ddgrasp deploy`" if options.out is None else f"`ddgrasp deploy --calibration {options.file}`"
     say(f"{options.file}, {sheet}: {reads} reads the first, look at the second")
     away = standing.offset(found.T_base_cam, standing.nominal_pose())
@@ -351,7 +352,7 @@ def _started(imager: Imager, robot: Robot, say: Callable[[str], None]):
         imager.start()
         yield start_robot
     except (CameraError, RobotError) as error:
-        raise UserError(f"{error}.") from error
+        raise Trouble(f"{error}.") from error
     finally:
         with unbroken():
             try:

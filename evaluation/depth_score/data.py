@@ -213,19 +213,23 @@ def real_size(root: Path, width_px: int) -> tuple[int, int]:
 
 
 def load_real(root: Path, width_px: int, last: int) -> RealFrames:
-    """The `last` frames of the recordings at or below `root`, at `width_px` (nearest neighbours).
+    """The `last` frames of the recordings at or below `root`, at `width_px` (nearest neighbours), without
+    those that only came again: they would stand on both sides.
 
     Raises UserError for recordings of different sizes, or none, or if those that the frames are of have
     different optics, or unknown ones.
     """
     recordings = _of_one_size(root)
     frames = [(number, i) for number, r in enumerate(recordings) for i in range(len(r))]
-    numbers = np.array([number for number, _ in frames[-last:]])
+    taken = [(number, i) for number, i in frames[-last:] if not recordings[number].repeats(i)]
+    if not taken:
+        raise UserError(f"{root}: its last {last} frames are one picture, come again: record a moving view.")
+    numbers = np.array([number for number, _ in taken])
     scored = [recordings[number] for number in np.unique(numbers)]
     focal_px, baseline_m = _optics(scored)
     unaligned = tuple(r.path for r in scored if not r.color_aligned)
     apart = {int(n): r.path for n, r in zip(np.unique(numbers), scored, strict=True) if not r.consecutive}
-    size, chosen = _size(recordings[0], width_px), [(recordings[number], i) for number, i in frames[-last:]]
+    size, chosen = _size(recordings[0], width_px), [(recordings[number], i) for number, i in taken]
     depth_mm = np.stack([depth.crop_nearest(r.depth_mm(i), size) for r, i in chosen])
     rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
     focal_px *= width_px / recordings[0].width_px

@@ -71,13 +71,14 @@ def _ratio(figures: Table, base: Table) -> dict[str, float]:
 def hole_figures(scored: Scored, bootstrap: int, seed: int) -> dict[str, Any]:
     """Domain -> figures with intervals, distances of its hole-rate curves from the recorded ones, curves."""
     rng = np.random.default_rng(seed)
-    real_draws = [rng.integers(len(scored.sums[RAW]), size=len(scored.sums[RAW])) for _ in range(bootstrap)]
+    draws: dict[tuple[int, ...], list[np.ndarray]] = {}  # domains of the same scenes are drawn together
     made = {}
-    for name in (n for n in DOMAINS if n in scored.sums):
-        mine = scored.sums[name]
-        paired = scored.groups[name] == scored.groups[RAW]  # the same scenes: drawn together
-        own = real_draws if paired else [rng.integers(len(mine), size=len(mine)) for _ in real_draws]
-        made[name] = _domain_figures(mine, scored.sums[RAW], list(zip(own, real_draws, strict=True)))
+    for name in (RAW, *(n for n in DOMAINS if n in scored.sums and n != RAW)):
+        mine, scenes = scored.sums[name], tuple(scored.groups[name])
+        if scenes not in draws:
+            draws[scenes] = [rng.integers(len(mine), size=len(mine)) for _ in range(bootstrap)]
+        drawn = list(zip(draws[scenes], draws[tuple(scored.groups[RAW])], strict=True))
+        made[name] = _domain_figures(mine, scored.sums[RAW], drawn)
     return made
 
 

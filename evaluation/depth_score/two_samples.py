@@ -30,7 +30,7 @@ def compare(real: Sample, sim: Sample, config: ScoreConfig, drawn: Drawn) -> dic
         "fid": interval(fid, fids, least=0.0),
         "kid_x100": interval(KID_SCALE * kid, [KID_SCALE * v for v in _kid_draws(real, sim, drawn)]),
         "auc": interval(auc, aucs, 0.0, 1.0),
-        "mixing": interval(mixing, mixings, 0.0, 1.0),
+        "mixing": interval(mixing, mixings, least=0.0),
         "resampled_fid": fids,
     }
 

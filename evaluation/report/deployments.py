@@ -99,8 +99,8 @@ def render(deployments: Sequence[Deployment]) -> str:
 
 
 def verdict(deployments: Sequence[Deployment]) -> str:
-    """How many succeeded of those that count, for each robot and camera apart, how many nobody judged, what
-    ended by a fault, deadlines missed; without dry runs."""
+    """How many succeeded of those that count, for each policy, robot and camera apart, how many nobody
+    judged, what ended by a fault, deadlines missed; without dry runs."""
     driven = [deployment for deployment in deployments if deployment.is_driven]
     setups = sorted({_setup(deployment) for deployment in driven})
     rates = [_rate([one for one in driven if _setup(one) == setup]) for setup in setups]
@@ -116,7 +116,8 @@ def verdict(deployments: Sequence[Deployment]) -> str:
 
 
 def _setup(deployment: Deployment) -> str:
-    return f"{deployment.report.get('robot', '')} with {deployment.report.get('camera', '')}"
+    policy, robot, camera = (deployment.report.get(name, "") for name in ("policy", "robot", "camera"))
+    return f"{policy} on {robot} with {camera}"
 
 
 def _rate(driven: Sequence[Deployment]) -> str:

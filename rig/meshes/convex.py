@@ -6,6 +6,7 @@ named by a hash of the mesh and the settings. `python -m rig.meshes.convex` make
 """
 
 import hashlib
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import trimesh
 from jaxtyping import Float64
 
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_path, user_cache
+from ddgrasp.files import DAMAGED_NPZ, atomic_path, user_cache
 from ddgrasp.install import pip_install
 from rig.meshes.solids import Part
 
@@ -95,13 +96,12 @@ def _cached(key: str) -> Path:
 
 
 def _read(file: Path, key: str) -> list[Hull] | None:
-    if not file.exists():
-        return None
-    with np.load(file) as stored:
-        if key not in stored:
-            return None
-        ends = np.cumsum(stored[f"{key}-counts"])[:-1]
-        return np.split(_STORED_MM * stored[key], ends)
+    """What is stored; None where nothing is, or a file that is damaged and can be made again."""
+    with suppress(FileNotFoundError, *DAMAGED_NPZ), np.load(file) as stored:
+        if key in stored:
+            ends = np.cumsum(stored[f"{key}-counts"])[:-1]
+            return np.split(_STORED_MM * stored[key], ends)
+    return None
 
 
 def _write(file: Path, found: dict[str, list[Hull]]) -> None:

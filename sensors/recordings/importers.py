@@ -146,7 +146,8 @@ def import_all(
 def _name(source: Path) -> str:
     """The name of the recording made of it: a folder's own, a file's without what says its type."""
     source = Path(os.path.abspath(source))  # a link keeps its name
-    return source.stem if source.suffix.lower() in REALSENSE_SUFFIXES else source.name
+    name = source.stem if source.suffix.lower() in REALSENSE_SUFFIXES else source.name
+    return name.lstrip(".") or name  # what a killed recording left has a dot, which a finished one has not
 
 
 def summary(done: list[Imported], refused: list[str]) -> str:

@@ -15,8 +15,10 @@ from typing import Any
 from ddgrasp import contract
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.progress import Progress, Task
+from ddgrasp.signals import ending, forget_terminal
 from sensors.recordings.importers import Imported, RawFrame, Source, import_recording
 from sensors.recordings.realsense import describe, load_pyrealsense2, project, raw_frame
+from sensors.recordings.writer import partial_folder
 
 STREAM_HZ = 30
 """The camera's own rate; a recording keeps every frame or every n-th."""
@@ -108,10 +110,17 @@ def frame_count(frames: int, seconds: float, hz: int) -> int:
 
 
 def new_path(out: Path, name: str) -> Path:
-    """`out`/`name` if it can become a recording. Raises UserError if it is taken, or no plain name."""
+    """`out`/`name` if it can become a recording. Raises UserError if it is taken, no plain name, or if frames
+    of a recording of that name are left that was killed."""
     if not name or name.startswith(".") or Path(name).name != name:
         raise UserError(f"--name is {name!r}; expected a folder's name, for example desk (--out says where).")
     if not (out / name).exists():
+        partial = partial_folder(out / name)
+        if left := len(list((partial / "depth").glob("*"))):
+            raise UserError(
+                f"{partial} has {left} frames of a recording that did not end, or has not yet: choose "
+                f"another --name, keep them by `ddgrasp record import {partial}`, or delete that folder."
+            )
         return out / name
     free = next(i for i in range(2, 10**6) if not (out / f"{name}_{i}").exists())
     raise UserError(f"{out / name} exists already: choose another, for example --name {name}_{free}.")
@@ -120,8 +129,8 @@ def new_path(out: Path, name: str) -> Path:
 def record(options: LiveOptions, path: Path, progress: Progress) -> tuple[Imported, Take]:
     """Records the camera to `path`, which appears only when complete.
 
-    Ctrl-C or SIGTERM end the recording and keep what it has; so do a camera that stops after its first
-    frame, and a disk that is full then.
+    Ctrl-C, SIGTERM or a closed terminal end the recording and keep what it has; so do a camera that stops
+    after its first frame, and a disk that is full then.
 
     Raises:
         UserError: pyrealsense2 or the camera is missing, has no such streams, or gives no usable frame.
@@ -223,13 +232,19 @@ def _not_started(rs: Any, options: LiveOptions, error: RuntimeError) -> UserErro
 
 @contextmanager
 def _stoppable() -> Iterator[threading.Event]:
-    """Set by Ctrl-C and SIGTERM, which otherwise do nothing: a frame is written to its end."""
+    """Set by Ctrl-C, SIGTERM and a closed terminal, which otherwise do nothing: a frame is written to its
+    end."""
     stop = threading.Event()
+
+    def end(number: int, frame: Any) -> None:
+        forget_terminal(number)
+        stop.set()
+
     if threading.current_thread() is not threading.main_thread():  # signals are someone else's
         yield stop
         return
-    kinds = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(kind, lambda signum, frame: stop.set()) for kind in kinds]
+    kinds = ending()
+    previous = [signal.signal(kind, end) for kind in kinds]
     try:
         yield stop
     finally:

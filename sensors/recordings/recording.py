@@ -152,6 +152,13 @@ class Recording:
         """(H, W) float32 planar depth in metres, 0 = invalid; as fine as `depth_unit_m`."""
         return depth.metres_from_counts(self._counts(index), self.meta["depth_unit_m"])
 
+    def repeats(self, index: int) -> bool:
+        """Whether a frame is the one before, come again: a deployment keeps a picture for every step, the
+        same one while its camera has no other."""
+        if not self.meta.get("repeated_frames") or index == 0:
+            return False
+        return np.array_equal(self._counts(index), self._counts(index - 1))
+
     def _counts(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
         file = self.depth_files[index]
         raw = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)

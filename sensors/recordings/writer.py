@@ -20,6 +20,11 @@ JPEG_QUALITY = 95
 PNG_COMPRESSION = 3
 
 
+def partial_folder(path: Path) -> Path:
+    """Where the frames of the recording `path` are until it is complete."""
+    return path.parent / f".{path.name}.partial"
+
+
 class RecordingWriter:
     """Writes one recording; it appears under its name only when complete.
 
@@ -33,7 +38,7 @@ class RecordingWriter:
     def __init__(self, path: str | os.PathLike, meta: dict[str, Any]):
         self.path = Path(path)
         self.meta = dict(meta)
-        self._temporary = self.path.parent / f".{self.path.name}.partial"
+        self._temporary = partial_folder(self.path)
         self._alone = ExitStack()
         self._size: tuple[int, int] | None = None
         self._frames = 0

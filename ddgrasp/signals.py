@@ -1,0 +1,24 @@
+"""Signals by which people and machines end a command."""
+
+import contextlib
+import os
+import signal
+import stat
+
+
+def ending() -> list[signal.Signals]:
+    """Those that end what runs: Ctrl-C, SIGTERM, and the end of the terminal, but for what runs under nohup
+    and goes on without it."""
+    hangs_up = signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+    return [signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hangs_up else [])]
+
+
+def forget_terminal(number: int) -> None:
+    """After a hang-up what would be printed on the terminal goes nowhere: it would be an error in the midst
+    of what saves the work. Does nothing for other signals, or where output goes to a file."""
+    if number != signal.SIGHUP:
+        return
+    for stream in (1, 2):
+        with contextlib.suppress(OSError):
+            if stat.S_ISCHR(os.fstat(stream).st_mode):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)

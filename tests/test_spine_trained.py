@@ -1,0 +1,52 @@
+"""Which objects count as seen in training: the run's own, and those of what it started from."""
+
+from dataclasses import replace
+
+import pytest
+
+from ddgrasp import artifacts
+from ddgrasp.config import Config
+from ddgrasp.files import to_json
+from ddgrasp.presets import get_preset
+from ddgrasp.trained import trained_objects
+
+DEBUG = get_preset("debug")
+
+
+def of(objects: tuple[str, ...], start: str = "", **teacher) -> Config:
+    """A configuration whose teacher and student start from `start`."""
+    teachers = replace(DEBUG.teacher, start=start or "nothing", **teacher)
+    return replace(
+        DEBUG,
+        world=replace(DEBUG.world, objects=objects),
+        teacher=teachers,
+        student=replace(DEBUG.student, init_from=start),
+    )
+
+
+@pytest.fixture
+def earlier(tmp_path):
+    """Two runs, the second begun from the first; the second's folder."""
+    for name, config in (("a", of(("apple",))), ("b", of(("can",), str(tmp_path / "a")))):
+        for stage in ("teacher", "student"):
+            artifacts.finish(tmp_path / name / stage, stage, config, seconds=1, metrics={}, origin="trained")
+    return tmp_path / "b"
+
+
+@pytest.mark.parametrize("stage", ["teacher", "student"])
+def test_objects_of_all_starts_were_trained_on(earlier, stage):
+    assert trained_objects(to_json(of(("cube", "can"), str(earlier))), stage) == ("cube", "can", "apple")
+    assert trained_objects(to_json(of(("cube",), str(earlier / stage))), stage) == ("cube", "can", "apple")
+    assert trained_objects(to_json(of(("cube",))), stage) == ("cube",)
+    assert trained_objects(to_json(of(("cube",), "runs/gone")), stage) == ("cube",)
+
+
+def test_a_teacher_that_is_taken_as_it_is_was_not_trained_on_the_run_s(earlier):
+    taken = to_json(of(("lemon",), str(earlier), total_steps=0))
+    assert trained_objects(taken, "teacher") == ("can", "apple")
+    assert trained_objects(taken, "student") == ("lemon", "can", "apple"), "its student is"
+
+
+def test_what_demo_starts_from_is_known():
+    trained = trained_objects(to_json(get_preset("demo")), "student")
+    assert trained[:6] == get_preset("demo").world.objects and "puck" in trained and "can" not in trained
