@@ -172,7 +172,7 @@ def _distance(
 
 
 def _regions(depth_m: np.ndarray) -> float:
-    return float(np.mean([len(hole_sizes_px((frame > 0).astype(np.uint16))) for frame in depth_m]))
+    return float(np.mean([len(hole_sizes_px(frame)) for frame in depth_m]))
 
 
 def main() -> None:

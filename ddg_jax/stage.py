@@ -145,15 +145,8 @@ def hole_statistics(depth_m: Float[np.ndarray, "N H W"], stretch: Int[np.ndarray
     """Share of invalid pixels, regions per frame, median region, left band and validity flicker of (N, H, W)
     metres; frames of one `stretch` (N,) follow each other.
     """
-    sizes = [stats.hole_sizes_px(frame) for frame in (depth_m > 0).astype(np.uint16)]
-    every = np.concatenate(sizes)
-    return {
-        "invalid_fraction": float(np.mean(depth_m == 0)),
-        "hole_components": float(np.mean([len(s) for s in sizes])),
-        "hole_median_px": float(np.median(every)) if len(every) else 0.0,
-        "left_band_px": float(np.mean([stats.left_band_px(frame) for frame in depth_m])),
-        "flicker_fraction": flicker_fraction(depth_m > 0, stretch),
-    }
+    holes = stats.hole_statistics(depth_m)
+    return {**holes, "flicker_fraction": flicker_fraction(depth_m > 0, stretch)}
 
 
 def flicker_fraction(valid: Bool[np.ndarray, "N H W"], stretch: Int[np.ndarray, " N"]) -> float:

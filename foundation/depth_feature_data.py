@@ -151,7 +151,7 @@ def measure(pool: Pool, at: int, depth_m: Float[np.ndarray, "H W"]) -> Float[np.
     edges = depth_edges(clean_m)
     layout = cv2.resize(inverse, GRID[::-1], interpolation=cv2.INTER_AREA)
     holes = depth_m <= 0
-    sizes = stats.hole_sizes_px((depth_m > 0).astype(np.uint16))
+    sizes = stats.hole_sizes_px(depth_m)
     both = ~holes & (clean_m > 0)
     noise = np.median(np.abs(_inverse(depth_m)[both] - inverse[both])) if both.any() else 0.0
     near = cv2.dilate(edges.astype(np.uint8), np.ones((2 * EDGE_NEAR_PX + 1,) * 2, np.uint8)) > 0

@@ -61,17 +61,13 @@ def measure(camera: str, stream: Stream, steps_per_px: float) -> Figures:
     """All figures of a stream; `steps_per_px` is the camera's disparity grid at this picture size."""
     depth = stream.depth_mm
     conditional, shadow_invalid = curves.by_surface(stream)
-    sizes = [stats.hole_sizes_px(frame) for frame in depth]
-    count = float(np.mean([len(s) for s in sizes]))
+    holes = stats.hole_statistics(depth)
     height, width = depth.shape[1:]
-    band = float(np.mean([stats.left_band_px(frame) for frame in depth]))
+    band = holes["left_band_px"]
     deviations = [stats.temporal_deviation_mm(depth[run]) for run in stream.static]
     scalars = {
-        "invalid_fraction": float(np.mean(depth == 0)),
-        "hole_components": count,
-        "holes_per_10k_px": 1e4 * count / (height * width),
-        "hole_median_px": float(np.median(np.concatenate(sizes))) if count else 0.0,
-        "left_band_px": band,
+        **holes,
+        "holes_per_10k_px": 1e4 * holes["hole_components"] / (height * width),
         "left_band_excess_px": band - _left_disparity_px(stream, round(band)),
         "shadow_invalid": shadow_invalid,
         "temporal_deviation_mm": _mean(deviations),

@@ -48,18 +48,27 @@ class DepthStatistics:
 
 def measure(depth_mm: Stream, range_mm: float = RANGE_MM) -> DepthStatistics:
     """Statistics of a (T, H, W) stream; the temporal ones assume a static scene and camera."""
-    sizes = [hole_sizes_px(frame) for frame in depth_mm]
-    every = np.concatenate(sizes) if sizes else np.zeros(0)
     return DepthStatistics(
         frames=len(depth_mm),
-        invalid_fraction=float(np.mean(depth_mm == 0)),
-        hole_components=float(np.mean([len(s) for s in sizes])),
-        hole_median_px=float(np.median(every)) if len(every) else 0.0,
-        left_band_px=float(np.mean([left_band_px(frame) for frame in depth_mm])),
+        **hole_statistics(depth_mm),
         temporal_deviation_mm=temporal_deviation_mm(depth_mm, range_mm),
         flicker_fraction=flicker_fraction(depth_mm),
         temporal_range_mm=range_mm,
     )
+
+
+def hole_statistics(depth: Stream) -> dict[str, float]:
+    """Share of invalid pixels, regions per frame, median region and left band of a (T, H, W) stream, named
+    as in `DepthStatistics`.
+    """
+    sizes = [hole_sizes_px(frame) for frame in depth]
+    every = np.concatenate(sizes) if sizes else np.zeros(0)
+    return {
+        "invalid_fraction": float(np.mean(depth == 0)),
+        "hole_components": float(np.mean([len(s) for s in sizes])),
+        "hole_median_px": float(np.median(every)) if len(every) else 0.0,
+        "left_band_px": float(np.mean([left_band_px(frame) for frame in depth])),
+    }
 
 
 def hole_sizes_px(depth_mm: Frame, connectivity: int = 8) -> Int[np.ndarray, " holes"]:
