@@ -1,7 +1,10 @@
 """Errors a person can act on."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 class UserError(Exception):
@@ -21,3 +24,10 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     near = difflib.get_close_matches(name, known, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return UserError(f"Unknown {kind} {name!r}.{hint} Known: {', '.join(known)}.")
+
+
+def looked_up(kind: str, name: str, table: Mapping[str, T]) -> T:
+    """What `table` has for `name`; UserError with the nearest right name if it has nothing."""
+    if name not in table:
+        raise unknown_name(kind, name, table)
+    return table[name]

@@ -30,7 +30,7 @@ from ddgrasp.config import (
     UNetConfig,
     WorldConfig,
 )
-from ddgrasp.errors import unknown_name
+from ddgrasp.errors import looked_up
 
 _DEBUG_DDG = DDGConfig(
     depth=DDGDepthConfig(height_px=45, width_px=80),
@@ -281,6 +281,4 @@ PRESETS = {
 
 def get_preset(name: str) -> Config:
     """The preset of that name; UserError with the nearest right name otherwise."""
-    if name not in PRESETS:
-        raise unknown_name("preset", name, PRESETS)
-    return PRESETS[name]
+    return looked_up("preset", name, PRESETS)

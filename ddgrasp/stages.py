@@ -14,7 +14,7 @@ from ddgrasp.config import (
     RealSenseConfig,
     TeacherConfig,
 )
-from ddgrasp.errors import unknown_name
+from ddgrasp.errors import looked_up
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,7 @@ _BY_NAME = {stage.name: stage for stage in (*STAGES, *ON_REQUEST)}
 
 def get_stage(name: str) -> Stage:
     """The stage of that name; UserError with the nearest right name otherwise."""
-    if name not in _BY_NAME:
-        raise unknown_name("stage", name, _BY_NAME)
-    return _BY_NAME[name]
+    return looked_up("stage", name, _BY_NAME)
 
 
 INDIFFERENT = {

@@ -4,7 +4,7 @@ licence.
 
 from dataclasses import dataclass
 
-from ddgrasp.errors import unknown_name
+from ddgrasp.errors import looked_up
 from foundation.sizes import SIZES
 
 IMAGE_DEPTH = "depth_anything_v2"
@@ -78,9 +78,7 @@ ENTRIES = {
 
 def get_entry(name: str) -> Entry:
     """The entry called `name`; UserError with the nearest name otherwise."""
-    if name not in ENTRIES:
-        raise unknown_name("network", name, ENTRIES)
-    return ENTRIES[name]
+    return looked_up("network", name, ENTRIES)
 
 
 METRIC_NOTE = "weights for metric depth: licence as stated on their own page"

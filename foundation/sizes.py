@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ddgrasp.errors import unknown_name
+from ddgrasp.errors import looked_up
 
 PATCH_PX = 14
 """Side of a ViT patch; picture sides are multiples of it."""
@@ -44,6 +44,4 @@ SIZES = {
 
 def get_size(name: str) -> DepthSize:
     """The size called `name`; UserError with the nearest name otherwise."""
-    if name not in SIZES:
-        raise unknown_name("size", name, SIZES)
-    return SIZES[name]
+    return looked_up("size", name, SIZES)

@@ -23,7 +23,7 @@ from jaxtyping import Float, Float32, Float64, Int, Int32
 
 from ddgrasp.config import SPACINGS
 from ddgrasp.config.ddg import COSINE_OFFSET, FIRST_LINEAR_BETA, LAST_LINEAR_BETA, MAX_BETA
-from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.errors import UserError, looked_up, unknown_name
 
 VARIANCE_FLOOR = 1e-20
 PREDICTED, CONSISTENT = "predicted", "consistent"
@@ -77,11 +77,10 @@ _BETAS = {"linear": linear_betas, "cosine": cosine_betas}
 
 def make_schedule(name: str, steps: int, log_snr_shift: float = 0.0) -> Schedule:
     """Schedule "linear" or "cosine" with `steps` steps; UserError for another name or fewer than 2 steps."""
-    if name not in _BETAS:
-        raise unknown_name("noise schedule", name, _BETAS)
+    betas_of = looked_up("noise schedule", name, _BETAS)
     if steps < 2:
         raise UserError(f"A noise schedule needs at least 2 steps, not {steps}.")
-    betas = _BETAS[name](steps)
+    betas = betas_of(steps)
     if log_snr_shift:
         betas = shifted_betas(betas, log_snr_shift)
     return schedule_of(betas)

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from ddgrasp.errors import unknown_name
+from ddgrasp.errors import looked_up
 from mjx_envs.object_spec import Box, Capsule, Cylinder, ObjectSpec, Plate, RestPose, Vector
 
 
@@ -215,7 +215,4 @@ of the twelve, and none is tried."""
 
 def get_object(name: str) -> ObjectSpec:
     """The object or shape of that name; UserError with the nearest right name otherwise."""
-    known = OBJECTS | SHAPES
-    if name not in known:
-        raise unknown_name("object", name, known)
-    return known[name]
+    return looked_up("object", name, OBJECTS | SHAPES)

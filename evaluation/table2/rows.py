@@ -11,7 +11,7 @@ from typing import Any
 from ddgrasp import artifacts
 from ddgrasp.config import DDIM, DEPTH, SQUARED, UNIFORM, Config, DDGConfig
 from ddgrasp.config.student import Source
-from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.errors import UserError, looked_up, unknown_name
 from ddgrasp.shipped import holding, shipped
 from evaluation.treatments import RECORDED, TreatmentName
 
@@ -131,12 +131,10 @@ def chosen(rows: Sequence[str], tables: Sequence[str]) -> tuple[str, ...]:
     for name in rows:
         if name not in ROWS:
             raise unknown_name("row", name, ROWS)
-    for name in tables:
-        if name not in TABLES:
-            raise unknown_name("table", name, TABLES)
+    found = [looked_up("table", name, TABLES) for name in tables]
     if not rows and not tables:
         raise UserError(f"--table names none, and --rows neither: give tables ({', '.join(TABLES)}) or rows.")
-    return tuple(dict.fromkeys(rows or (row for name in tables for row in TABLES[name].rows)))
+    return tuple(dict.fromkeys(rows or (row for table in found for row in table.rows)))
 
 
 def shared_config(config: Config) -> Config:

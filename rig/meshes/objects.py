@@ -7,7 +7,7 @@ All shapes are made here by code, so their licence is the project's; docs/object
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ddgrasp.errors import unknown_name
+from ddgrasp.errors import looked_up
 from mjx_envs.object_spec import check_symmetry
 from mjx_envs.objects import OBJECTS
 from rig.meshes import fruit, things
@@ -91,6 +91,4 @@ MESH_OBJECTS: dict[str, MeshObject] = {
 
 def get_mesh_object(name: str) -> MeshObject:
     """The mesh object of that name; UserError with the nearest right name otherwise."""
-    if name not in MESH_OBJECTS:
-        raise unknown_name("mesh object", name, MESH_OBJECTS)
-    return MESH_OBJECTS[name]
+    return looked_up("mesh object", name, MESH_OBJECTS)
