@@ -7,7 +7,9 @@ file alone takes is named in its metadata (`policy_metadata.STATE_LAYOUT`), whic
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
+from typing import Any
 
 from ddgrasp.layout import ACTION, OBSERVATION, POLICY_STATE, STATE
 
@@ -194,3 +196,9 @@ ONNX_OUTPUT_ACTION = "action"
 """(B, chunk, 8) float32 in [-1, 1]; row 0 is to be executed now."""
 ONNX_METADATA_KEY = "ddgrasp"
 """metadata_props key whose value is a JSON object (see ddgrasp/policy_metadata.py)."""
+
+
+# --- manifests -------------------------------------------------------------------------------
+def counted(outcomes: Collection[Any]) -> dict[str, int]:
+    """{"successes", "n"} of n outcomes, true or false (or of an array (n,)): how success is written down."""
+    return {"successes": int(sum(outcomes)), "n": len(outcomes)}

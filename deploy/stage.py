@@ -93,8 +93,7 @@ def _keep_film(directory: Path, result: TrialResult, film: Film, progress: Progr
 
 
 def _success(results: Iterable[TrialResult]) -> dict[str, int]:
-    outcomes = [result.success for result in results]
-    return {"successes": sum(outcomes), "n": len(outcomes)}
+    return contract.counted([result.success for result in results])
 
 
 def _total(counts: Iterable[dict[str, int]]) -> dict[str, int]:

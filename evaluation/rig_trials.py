@@ -275,8 +275,7 @@ def _listed() -> tuple[str, ...]:
 
 
 def _success(results: Iterable[TrialResult]) -> dict[str, Any]:
-    outcomes = [result.success for result in results]
-    return wilson.success(sum(outcomes), len(outcomes))
+    return wilson.success(**contract.counted([result.success for result in results]))
 
 
 def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import jax
 from mujoco_playground import State
 
+from ddgrasp.contract import counted
 from ddgrasp.layout import QVEL
 from mjx_envs.grasp_env import GraspEnv
 from ppo.motion import motion_metrics
@@ -33,13 +34,9 @@ def evaluate(env: GraspEnv, policy: TeacherPolicy, trials: int, seed: int) -> di
         for name, which in chosen.items()
         if which.any()
     ]
-    objects = {
-        name: {"successes": int(success[index == i].sum()), "n": int((index == i).sum())}
-        for i, name in enumerate(env.table.names)
-    }
     return {
-        "success": {"successes": int(success.sum()), "n": trials},
-        "objects": objects,
+        "success": counted(success),
+        "objects": {name: counted(success[index == i]) for i, name in enumerate(env.table.names)},
         "saturated_actions": rows[-1]["saturated_actions"],
         "motion": rows,
         "contacts_dropped": seen.dropped,

@@ -11,6 +11,7 @@ from flax import struct
 from jaxtyping import Bool, Float, UInt32
 from mujoco_playground import State
 
+from ddgrasp.contract import counted
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import TOUCH_N, GraspEnv
 from mjx_envs.physics.interface import ModelParams
@@ -108,9 +109,9 @@ def measure(
     names = env.table.names
     rows = [_row(name, [r], [p]) for name, r, p in zip(names, recorded, pixels, strict=True)]
     rows.append(_row("all", recorded, pixels))
-    counts = {name: _count(some.success) for name, some in zip(names, recorded, strict=True)}
+    counts = {name: counted(some.success) for name, some in zip(names, recorded, strict=True)}
     result = {
-        "success": _count(np.concatenate([some.success for some in recorded])),
+        "success": counted(np.concatenate([some.success for some in recorded])),
         "objects": counts,
         "saturated_actions": rows[-1]["saturated_actions"],
         "motion": rows,
@@ -148,7 +149,3 @@ def _row(name: str, recorded: Sequence[Trials], pixels: Sequence[np.ndarray]) ->
     pixels_by_name = {f"visible_object_pixels_{k}": v for k, v in visible.items()}
     dropped = sum(some.dropped for some in recorded)
     return {"object": name} | motion | pixels_by_name | {"contacts_dropped": dropped}
-
-
-def _count(success: np.ndarray) -> dict[str, int]:
-    return {"successes": int(success.sum()), "n": len(success)}

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from ddgrasp.config import Config
+from ddgrasp.contract import counted
 from ddgrasp.progress import Progress
 from demos.rollout import Episodes, Roller
 from demos.spool import Spool
@@ -72,7 +73,6 @@ def position_error_mm(config: Config, params: Any, episodes: Episodes, seen: Spo
 
 
 def _counts(episodes: Episodes, names: tuple[str, ...]) -> dict[str, Any]:
-    success = {"successes": int(episodes.success.sum()), "n": len(episodes.success)}
     of = {name: episodes.success[episodes.object_index == i] for i, name in enumerate(names)}
-    objects = {name: {"successes": int(won.sum()), "n": len(won)} for name, won in of.items()}
-    return {"success": success, "per_object": objects}
+    objects = {name: counted(won) for name, won in of.items()}
+    return {"success": counted(episodes.success), "per_object": objects}
