@@ -11,7 +11,6 @@ from ddgrasp.config import Config
 from deploy.interfaces import Filmed
 from deploy.loop import Step
 from deploy.record import DeploymentRecord
-from deploy.timing import Timings
 from deploy.trials import Bench, Trial, TrialResult, Watch
 from rig.film import Film
 
@@ -77,14 +76,6 @@ def episode_folder(folder: Path, index: int, object_name: str) -> Path:
 
 def _report(result: TrialResult) -> dict[str, Any]:
     """What `LoopReport.as_dict` says of a deployment, as far as a trial's result knows it."""
-    timings = Timings(
-        result.sense_s,
-        result.infer_s,
-        result.act_s,
-        result.latency_s,
-        result.period_s,
-        result.missed_deadlines,
-    )
     return {
         "steps": result.steps,
         "holds": result.holds,
@@ -92,5 +83,5 @@ def _report(result: TrialResult) -> dict[str, Any]:
         "interrupted": False,
         "safety": result.safety,
         "events": result.events,
-        **timings.summary(contract.CONTROL_DT_S),
+        **result.timings.summary(contract.CONTROL_DT_S),
     }

@@ -1,6 +1,7 @@
 """Stage `deploy`: the exported student in the pseudo-real rig at 10 Hz."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -97,15 +98,14 @@ def _success(results: Iterable[TrialResult]) -> dict[str, int]:
 
 
 def _total(counts: Iterable[dict[str, int]]) -> dict[str, int]:
-    total: dict[str, int] = {}
+    total: Counter[str] = Counter()
     for count in counts:
-        for name, value in count.items():
-            total[name] = total.get(name, 0) + value
-    return total
+        total.update(count)
+    return dict(total)
 
 
 def _timings(results: Iterable[TrialResult]) -> Timings:
     total = Timings()
     for r in results:
-        total.extend(Timings(r.sense_s, r.infer_s, r.act_s, r.latency_s, r.period_s, r.missed_deadlines))
+        total.extend(r.timings)
     return total

@@ -5,6 +5,9 @@ from typing import Any
 
 import numpy as np
 
+SECONDS = ("sense_s", "infer_s", "act_s", "latency_s", "period_s")
+"""The lists of `Timings`."""
+
 
 @dataclass
 class Timings:
@@ -25,7 +28,7 @@ class Timings:
 
     def extend(self, other: "Timings") -> None:
         """Add another run's entries."""
-        for name in ("sense_s", "infer_s", "act_s", "latency_s", "period_s"):
+        for name in SECONDS:
             getattr(self, name).extend(getattr(other, name))
         self.missed_deadlines += other.missed_deadlines
 

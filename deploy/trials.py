@@ -28,6 +28,7 @@ from deploy.interfaces import Depth, Filmed, RigCamera
 from deploy.loop import ControlLoop, LoopReport, Step
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
+from deploy.timing import SECONDS, Timings
 from deploy.treatment import Replacement, Treatment, treated
 from rig.film import Film
 
@@ -73,6 +74,12 @@ class TrialResult:
     def key(self) -> tuple[int, bool]:
         """Identifies the trial."""
         return self.index, self.realtime
+
+    @property
+    def timings(self) -> Timings:
+        """How well its loop kept its time."""
+        seconds = {name: getattr(self, name) for name in SECONDS}
+        return Timings(**seconds, missed_deadlines=self.missed_deadlines)
 
     @property
     def fault(self) -> str:
@@ -304,8 +311,7 @@ def result(
     """What came of `trial`, from the loop's report, the rig's verdict and the object's trajectory."""
     timings = report.timings
     seconds: dict[str, Any] = {
-        name: [round(value, 6) for value in getattr(timings, name)]
-        for name in ("sense_s", "infer_s", "act_s", "latency_s", "period_s")
+        name: [round(value, 6) for value in getattr(timings, name)] for name in SECONDS
     }
     return TrialResult(
         **asdict(trial),
