@@ -19,11 +19,10 @@ import jax
 import numpy as np
 from jaxtyping import Float, Float32
 
-from ddg_jax.inverse_depth import invert
 from ddgrasp import contract
 from ddgrasp.config import DextrahConfig, KinectConfig, StereoConfig
 from ddgrasp.contract import CameraProfile
-from ddgrasp.depth import to_metres, to_millimetres
+from ddgrasp.depth import inverse_depth, to_metres, to_millimetres
 from ddgrasp.errors import UserError
 from deploy.depth_noise import DepthGenerator
 from evaluation.depth_score import features as score_features
@@ -70,11 +69,11 @@ def gaussian_and_dropout(recorded: Sequence[Episode]) -> Noise:
     """Independent noise with the recording's own strengths: share of holes, and spread of inverse depth."""
     sensed, clean = (to_metres(np.concatenate([getattr(e, n) for e in recorded])) for n in _PAIR)
     valid = sensed > 0
-    spread = np.median(np.abs(invert(sensed) - invert(clean))[valid]) / NORMAL_MEDIAN
+    spread = np.median(np.abs(inverse_depth(sensed) - inverse_depth(clean))[valid]) / NORMAL_MEDIAN
     holes, rng = 1 - valid.mean(), np.random.default_rng(0)
 
     def add(depth_m: np.ndarray) -> np.ndarray:
-        inverse = np.maximum(invert(depth_m) + rng.normal(0, spread, depth_m.shape), 0.02)
+        inverse = np.maximum(inverse_depth(depth_m) + rng.normal(0, spread, depth_m.shape), 0.02)
         dropped = rng.random(depth_m.shape) < holes
         return np.where((depth_m > 0) & ~dropped, 1 / inverse, 0).astype(np.float32)
 

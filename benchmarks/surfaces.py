@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from ddg_jax.data import surfaces
-from ddg_jax.inverse_depth import invert
 from ddgrasp.config import SURFACES
-from ddgrasp.depth import to_metres, to_millimetres
+from ddgrasp.depth import inverse_depth, to_metres, to_millimetres
 from evaluation.depth_score import features as score_features
 from evaluation.depth_score.data import REAL, SIM, Episode, load_episode
 from evaluation.depth_score.distances import fid
@@ -56,7 +55,9 @@ def measure(real: Sequence[Episode], sim: Sequence[Episode]) -> None:
     for name, make in WAYS.items():
         made_m = [make(depth_m) for depth_m in sensed]
         made = of(made_m)
-        error = np.mean([np.abs(invert(m) - invert(t)).mean() for m, t in zip(made_m, truth_m, strict=True)])
+        error = np.mean(
+            [np.abs(inverse_depth(m) - inverse_depth(t)).mean() for m, t in zip(made_m, truth_m, strict=True)]
+        )
         print(
             f"{name:24}{fid(made, truth) / unit:10.4f}{fid(recorded, made) / unit:10.3f}"
             f"{fid(whole, made) / unit:10.4f}{error:10.5f}",

@@ -10,13 +10,12 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32, Int
 
-from ddg_jax.inverse_depth import invert
 from ddg_jax.piecewise import piecewise_smooth
 from ddg_jax.prior import Prior
 from ddg_jax.representation import encode
 from ddgrasp import artifacts
 from ddgrasp.config import PIECEWISE, PLANES, DDGConfig
-from ddgrasp.depth import crop_nearest, window
+from ddgrasp.depth import crop_nearest, inverse_depth, window
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import memory
@@ -227,10 +226,10 @@ def surfaces(
     made = np.empty(depth_m.shape, np.float32)  # a list of them would take as much again
     for i, frame in enumerate(depth_m if progress is None else progress.track(depth_m, "surfaces")):
         if kind == PIECEWISE:
-            smooth = piecewise_smooth(invert(frame))
+            smooth = piecewise_smooth(inverse_depth(frame))
         else:
-            smooth = smooth_surface(fill_from_background(invert(frame)))
-        made[i] = invert(on_planes(smooth) if kind == PLANES else smooth)
+            smooth = smooth_surface(fill_from_background(inverse_depth(frame)))
+        made[i] = inverse_depth(on_planes(smooth) if kind == PLANES else smooth)
     return made
 
 

@@ -9,11 +9,6 @@ STATISTICS_STRIDE = 7
 """Every how many pixels the statistics are taken."""
 
 
-def invert(depth_m: Float[np.ndarray, "*x"]) -> Float32[np.ndarray, "*x"]:
-    """1/d in 1/m, 0 where depth is 0 (infinitely far, or a hole). Any shape."""
-    return np.divide(1, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)
-
-
 def normalise(inverse: Float[np.ndarray, "T H W"]) -> Float32[np.ndarray, "T H W"]:
     """Affine-normalised inverse depth of a sequence (T, H, W): median 0, mean deviation 1/2, clipped."""
     sample = inverse.reshape(-1)[::STATISTICS_STRIDE]

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from ddg_jax.inverse_depth import invert, normalise
+from ddg_jax.inverse_depth import normalise
 from ddgrasp.config import DDGConfig
-from ddgrasp.depth import window
+from ddgrasp.depth import inverse_depth, window
 from ddgrasp.errors import UserError
 from foundation import catalog, store
 from foundation.long_video import fit_scale_shift
@@ -66,7 +66,7 @@ class DepthNetworkPrior:
     ) -> Float32[np.ndarray, "T H W"]:
         """See `Prior`."""
         if self._config.prior.in_sim == "depth":
-            return normalise(invert(depth_m))
+            return normalise(inverse_depth(depth_m))
         return self._from_rgb(rgb, depth_m.shape[1:])
 
     def _from_rgb(self, rgb: np.ndarray | None, size: tuple[int, ...]) -> np.ndarray:

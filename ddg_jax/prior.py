@@ -19,10 +19,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from ddg_jax.inverse_depth import invert, normalise
+from ddg_jax.inverse_depth import normalise
 from ddg_jax.network_prior import NETWORKS, DepthNetworkPrior
 from ddg_jax.piecewise import piecewise_smooth
 from ddgrasp.config import FILTERED, PIECEWISE, PLANES, DDGConfig
+from ddgrasp.depth import inverse_depth
 from sensors.statistics.holes import fill_from_background, smooth_surface
 from sensors.statistics.planes import on_planes
 
@@ -104,7 +105,7 @@ class InverseDepthPrior:
         self, depth_m: Float[np.ndarray, "T H W"], rgb: UInt8[np.ndarray, "T h w 3"] | None = None
     ) -> Float32[np.ndarray, "T H W"]:
         """See `Prior`."""
-        inverse = invert(depth_m)
+        inverse = inverse_depth(depth_m)
         # Filters that edges do not survive whole are passed by both sides.
         seen = inverse if self.surface == PIECEWISE else map(smooth_surface, inverse)
         return self._scaled(self._blurred(seen, depth_m.shape))
@@ -112,9 +113,9 @@ class InverseDepthPrior:
     def _with_decoys(self, depth_m: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
         """Inverse depth of each frame, of some with another frame's holes besides."""
         for frame, decoy in zip(depth_m, rng.random(len(depth_m)) < self.decoy_share, strict=True):
-            inverse = invert(frame)
+            inverse = inverse_depth(frame)
             if decoy:
-                holes = invert(depth_m[rng.integers(len(depth_m))]) == 0
+                holes = inverse_depth(depth_m[rng.integers(len(depth_m))]) == 0
                 inverse[decoy_holes(holes, rng)] = 0
             yield inverse
 

@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float, Int
 from ddg_jax import data, start
 from ddg_jax.distil import check as check_halving
 from ddg_jax.distil import distil
-from ddg_jax.inverse_depth import invert
 from ddg_jax.prior import Prior, make_prior
 from ddg_jax.sample import Generator, grafted, predict
 from ddg_jax.train import fit
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE, DDGConfig
+from ddgrasp.depth import inverse_depth
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.job import Job
 from ddgrasp.progress import Progress
@@ -164,7 +164,7 @@ def deviation_statistics(
     known = (depth_m > 0) & (surface_m > 0)
     if not known.any():
         return {"deviation_median_per_m": float("nan"), "deviation_p99_per_m": float("nan")}
-    median, high = np.quantile(np.abs(invert(depth_m) - invert(surface_m))[known], [0.5, 0.99])
+    median, high = np.quantile(np.abs(inverse_depth(depth_m) - inverse_depth(surface_m))[known], [0.5, 0.99])
     return {"deviation_median_per_m": float(median), "deviation_p99_per_m": float(high)}
 
 

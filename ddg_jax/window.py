@@ -4,6 +4,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
+from ddgrasp.depth import inverse_depth
+
 
 def mixed(depth_m: Float[np.ndarray, "B H W"], window_px: float) -> Float32[np.ndarray, "B H W"]:
     """(B, H, W) planar depth, metres, 0 = none, as a window of standard deviation `window_px` sees it.
@@ -20,7 +22,7 @@ def mixed(depth_m: Float[np.ndarray, "B H W"], window_px: float) -> Float32[np.n
 
 def _mixed(depth_m: Float32[np.ndarray, "H W"], window_px: float) -> Float32[np.ndarray, "H W"]:
     valid = depth_m > 0
-    inverse = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=valid)
+    inverse = inverse_depth(depth_m)
     weight = cv2.GaussianBlur(valid.astype(np.float32), (0, 0), window_px)
     mean = cv2.GaussianBlur(inverse, (0, 0), window_px)
     return np.divide(weight, mean, out=np.zeros_like(depth_m), where=valid)

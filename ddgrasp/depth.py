@@ -1,4 +1,4 @@
-"""Depth maps: millimetres on disk and metres in memory, and nearest-neighbour resampling. JAX-free.
+"""Depth maps: millimetres on disk and metres in memory, inverses, nearest-neighbour resampling. JAX-free.
 
 Depth is planar. On disk and from cameras: uint16 millimetres. In memory: float32 metres. 0 in both = no
 reading.
@@ -61,6 +61,11 @@ def metres_from_counts(counts: UInt16[np.ndarray, "*any"], unit_m: float) -> Flo
     if unit_m >= DEPTH_UNIT_M:
         return to_metres(millimetres)
     return np.where(millimetres > 0, counts * unit_m, 0).astype(np.float32)
+
+
+def inverse_depth(depth_m: Float[np.ndarray, "*x"]) -> Float32[np.ndarray, "*x"]:
+    """1/d in 1/m, 0 where depth is 0 (infinitely far, or a hole). Any shape."""
+    return np.divide(1, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)
 
 
 def _whole(millimetres: AnyArray, xp: ModuleType) -> AnyArray:

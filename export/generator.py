@@ -15,7 +15,7 @@ from ddg_jax.sample import Generator, frame_noise, generate
 from ddgrasp import artifacts, generator_metadata
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import PROGRESSIVE, DDGConfig
-from ddgrasp.depth import crop_nearest, window
+from ddgrasp.depth import crop_nearest, inverse_depth, window
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.generator_metadata import GeneratorMetadata
@@ -207,7 +207,7 @@ def parity(generator: Generator, session: ort.InferenceSession, *, steps: int = 
     reported, predicted, mask = run(session, depth_m, noise, steps)
     alike = (mask == wanted.mask) & ((reported > 0) == (wanted.depth_m > 0))
     both = (predicted > 0) & (wanted.predicted_m > 0)
-    inverse = np.abs(_inverse(reported) - _inverse(wanted.depth_m))
+    inverse = np.abs(inverse_depth(reported) - inverse_depth(wanted.depth_m))
     return Parity(
         share=float(np.mean(~alike)),
         inverse_depth_per_m=float(inverse[alike].max(initial=0)),
@@ -269,7 +269,3 @@ def scenes(rng: np.random.Generator, count: int, size: tuple[int, int]) -> Float
             picture[inside] *= np.float32(rng.uniform(0.6, 0.9))
         picture[: size[0] // 8, : size[1] // 8] = 0
     return made
-
-
-def _inverse(depth_m: np.ndarray) -> np.ndarray:
-    return np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)

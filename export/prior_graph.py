@@ -57,7 +57,7 @@ def write_prior(g: GraphBuilder, depth: str, config: DDGConfig) -> str:
 
 
 def write_inverse(g: GraphBuilder, depth: str) -> str:
-    """1/d, 0 where depth is 0: `inverse_depth.invert`."""
+    """1/d, 0 where depth is 0: `ddgrasp.depth.inverse_depth`."""
     valid = g.op("Greater", depth, g.constant(0.0))
     inverse = g.op("Div", g.constant(1.0), g.op("Where", valid, depth, g.constant(1.0)))
     return g.op("Where", valid, inverse, g.constant(0.0))

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt16
 
 from ddgrasp.contract import D455
-from ddgrasp.depth import to_metres
+from ddgrasp.depth import inverse_depth, to_metres
 from foundation.depth_feature_noise import ProceduralConfig, corrupt
 from sensors.statistics import stats
 
@@ -147,13 +147,13 @@ def make_batch(pool: Pool, rows: Int[np.ndarray, " B"], rng: np.random.Generator
 def measure(pool: Pool, at: int, depth_m: Float[np.ndarray, "H W"]) -> Float[np.ndarray, f" {len(MEASURED)}"]:
     """The regression targets of picture `at` after a treatment, in the order of MEASURED."""
     clean_m = to_metres(pool.clean_mm[at])
-    inverse = _inverse(clean_m)
+    inverse = inverse_depth(clean_m)
     edges = depth_edges(clean_m)
     layout = cv2.resize(inverse, GRID[::-1], interpolation=cv2.INTER_AREA)
     holes = depth_m <= 0
     sizes = stats.hole_sizes_px(depth_m)
     both = ~holes & (clean_m > 0)
-    noise = np.median(np.abs(_inverse(depth_m)[both] - inverse[both])) if both.any() else 0.0
+    noise = np.median(np.abs(inverse_depth(depth_m)[both] - inverse[both])) if both.any() else 0.0
     near = cv2.dilate(edges.astype(np.uint8), np.ones((2 * EDGE_NEAR_PX + 1,) * 2, np.uint8)) > 0
     at_edges = np.mean(near[holes]) if holes.any() else 0.0
     return np.array([
@@ -167,10 +167,6 @@ def depth_edges(depth_m: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
 
     depth_m: clean, 0 = nothing in range, which counts as infinitely far.
     """
-    inverse = _inverse(depth_m)
+    inverse = inverse_depth(depth_m)
     span = cv2.morphologyEx(inverse, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     return span > EDGE_STEP * np.maximum(cv2.dilate(inverse, np.ones((3, 3), np.uint8)), 1e-6)
-
-
-def _inverse(depth_m: np.ndarray) -> np.ndarray:
-    return np.divide(1, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)

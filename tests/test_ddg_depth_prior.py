@@ -8,7 +8,7 @@ import pytest
 
 from ddg_jax import network_prior, sample, start
 from ddg_jax.generate import Clip
-from ddg_jax.inverse_depth import NORMALISED_LIMIT, invert, normalise
+from ddg_jax.inverse_depth import NORMALISED_LIMIT, normalise
 from ddg_jax.monocular import MonocularDepth
 from ddg_jax.prior import InverseDepthPrior, make_prior
 from ddgrasp import artifacts
@@ -21,6 +21,7 @@ from ddgrasp.config import (
     ScoreConfig,
     StudentConfig,
 )
+from ddgrasp.depth import inverse_depth
 from ddgrasp.errors import UserError
 from demos.rollout import Scene
 from evaluation.depth_score.data import REAL, SIM, Episode
@@ -93,7 +94,7 @@ def test_simulated_depth_is_normalised_as_the_networks_output(weights):
     depth = np.random.default_rng(0).uniform(0.5, 2, (2, 12, 16)).astype(np.float32)
     prior = make_prior(config(weights))
     assert prior.needs_rgb
-    np.testing.assert_array_equal(prior.from_sim(depth, None), normalise(invert(depth)))
+    np.testing.assert_array_equal(prior.from_sim(depth, None), normalise(inverse_depth(depth)))
 
 
 def test_what_was_used_is_said(weights):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from ddg_jax.data import surfaces
-from ddg_jax.inverse_depth import invert
 from ddg_jax.piecewise import piecewise_smooth
 from ddg_jax.prior import make_prior
 from ddgrasp.config import PIECEWISE, DDGConfig, DDGDepthConfig, PriorConfig
+from ddgrasp.depth import inverse_depth
 from ddgrasp.errors import UserError
 
 HEIGHT, WIDTH = 60, 80
@@ -51,7 +51,7 @@ def test_a_frame_without_any_depth_stays_empty():
 def test_prior_and_surface_of_the_generator_take_it(scene):
     """The prior of a recording is that of simulation, but for the camera's noise."""
     truth, recorded, _ = scene
-    depth_m = invert(recorded[None])
+    depth_m = inverse_depth(recorded[None])
     made = make_prior(
         DDGConfig(
             prior=PriorConfig(source="metric_inverse_depth", decoy_holes=0.0),
@@ -60,6 +60,6 @@ def test_prior_and_surface_of_the_generator_take_it(scene):
     )
     np.testing.assert_allclose(surfaces(depth_m, PIECEWISE)[0], 1 / piecewise_smooth(recorded), rtol=1e-3)
     c = made.from_recording(depth_m, None, np.random.default_rng(0))
-    assert np.median(np.abs(c - made.from_sim(invert(truth[None]), None))) < 2 * 0.25 * NOISE_PER_M
+    assert np.median(np.abs(c - made.from_sim(inverse_depth(truth[None]), None))) < 2 * 0.25 * NOISE_PER_M
     with pytest.raises(UserError, match="Unknown ddg.depth.surface 'piecewice'. Did you mean 'piecewise'"):
         make_prior(DDGConfig(depth=DDGDepthConfig(surface="piecewice")))

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from ddg_jax.data import surfaces
-from ddg_jax.inverse_depth import invert
 from ddg_jax.prior import make_prior
 from ddgrasp.config import FILTERED, PLANES, DDGConfig, DDGDepthConfig, PriorConfig
 from ddgrasp.config.ddg import Surface
+from ddgrasp.depth import inverse_depth
 from sensors.statistics.planes import on_planes
 
 HEIGHT, WIDTH = 180, 320
@@ -61,7 +61,9 @@ def test_two_planes_each_become_flat(bumps):
 def test_the_generator_is_taught_the_bumps_and_its_prior_does_not_show_them(table, bumps):
     depth_m = (1 / (table + bumps))[None]
     seen = {
-        kind: np.corrcoef((invert(depth_m) - invert(surfaces(depth_m, kind))).ravel(), bumps.ravel())[0, 1]
+        kind: np.corrcoef(
+            (inverse_depth(depth_m) - inverse_depth(surfaces(depth_m, kind))).ravel(), bumps.ravel()
+        )[0, 1]
         for kind in (FILTERED, PLANES)
     }
     assert seen[FILTERED] < 0.5 and seen[PLANES] > 0.8

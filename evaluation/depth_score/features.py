@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from ddgrasp.config import SCORE_FEATURES
+from ddgrasp.depth import inverse_depth
 from ddgrasp.errors import unknown_name
 
 NEAR_M, FAR_M = 0.25, 10.0
@@ -47,7 +48,7 @@ def load(name: str, weights_dir: Path | None = None) -> FeatureExtractor:
 
 def as_pictures(depth_m: Float[np.ndarray, "N H W"]) -> UInt8[np.ndarray, "N H W 3"]:
     """(N, H, W) metres -> (N, H, W, 3) uint8 grey: inverse depth, holes black, on one fixed scale."""
-    inverse = np.divide(1, depth_m, out=np.zeros(depth_m.shape, np.float32), where=depth_m > 0)
+    inverse = inverse_depth(depth_m)
     level = (inverse - 1 / FAR_M) / (1 / NEAR_M - 1 / FAR_M)
     grey = np.rint(255 * np.clip(level, 0, 1)).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=-1)
