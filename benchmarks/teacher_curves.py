@@ -7,14 +7,13 @@ deterministic evaluation during training: the policy that is kept is the best of
 """
 
 import argparse
-import io
 from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_bytes
+from ddgrasp.files import atomic_write_bytes, to_png
 from ddgrasp.progress import read_curves
 
 _LINES = ("-", "--", ":", "-.")
@@ -37,7 +36,7 @@ def main() -> None:
 
 def draw(runs: list[tuple[str, Path]]) -> bytes:
     """PNG of the curves of `runs`, (label, run's directory); UserError where there are none."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained", dpi=120)
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
     by_steps, by_minutes = figure.subplots(1, 2, sharey=True)
     labels = list(dict.fromkeys(label for label, _ in runs))
     for i, label in enumerate(labels):
@@ -53,9 +52,7 @@ def draw(runs: list[tuple[str, Path]]) -> bytes:
     _finish(by_minutes, "minutes of training, evaluations included")
     by_steps.set_ylabel("success, %")
     by_steps.legend(frameon=False, loc="lower right")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+    return to_png(figure, dpi=120)
 
 
 def _named(text: str) -> tuple[str, Path]:

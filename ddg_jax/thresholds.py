@@ -6,7 +6,6 @@ One set of generated maps is masked with every threshold and compared with the r
 was made from.
 """
 
-import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from ddg_jax.sample import Generator, grafted, predict
 from ddg_jax.stage import SCORED_FRAMES, hole_statistics
 from ddgrasp import artifacts
 from ddgrasp.config import DEPTH, DDGConfig
-from ddgrasp.files import atomic_write_bytes, atomic_write_json
+from ddgrasp.files import atomic_write_bytes, atomic_write_json, to_png
 from ddgrasp.progress import Progress
 from ddgrasp.shipped import shipped
 
@@ -153,6 +152,4 @@ def _drawn(rows: Sequence[Masked], recorded: dict[str, float], used: float) -> b
         axis.set_ylim(bottom=0)
         axis.set_title(title, fontsize=9)
         axis.set_xlabel("threshold")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    return to_png(figure, dpi=110)

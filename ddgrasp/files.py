@@ -6,6 +6,7 @@ Every file goes to a temporary name in the same directory, reaches the disk (fsy
 
 import contextlib
 import dataclasses
+import io
 import json
 import os
 import shutil
@@ -14,9 +15,12 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ddgrasp.errors import UserError
+
+if TYPE_CHECKING:
+    import matplotlib.figure
 
 TEMPORARY = ".tmp-"
 """What the names of half-written files begin with."""
@@ -163,6 +167,13 @@ def to_json(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return value
+
+
+def to_png(figure: "matplotlib.figure.Figure", dpi: int = 100) -> bytes:
+    """The figure as a PNG file's content."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()
 
 
 def _fsync(path: Path) -> None:

@@ -1,12 +1,12 @@
 """A robot that is connected but not moved, and a picture of what it would have been told."""
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from ddgrasp.files import to_png
 from deploy import kinematics
 from deploy.interfaces import Robot, RobotState
 from deploy.safety import SafetyLimits
@@ -83,6 +83,4 @@ def draw(sent: Sequence[Sent], limits: SafetyLimits, period_s: float) -> bytes:
         axes.plot(*zip(*corners, corners[0], strict=True), color="grey", linestyle="--")
         axes.set(xlabel=f"{'xyz'[a]}, m", ylabel=f"{'xyz'[b]}, m", aspect="equal")
     figure.suptitle(f"{len(sent)} commands that were not sent; dashed: what the safety filter allows")
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=100)
-    return file.getvalue()
+    return to_png(figure)

@@ -1,6 +1,5 @@
 """The rig's camera beside real ones: a table, curves as JSON and PNG. Behind `ddgrasp sensors compare`."""
 
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from ddgrasp.config import RecordConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_bytes, atomic_write_json
+from ddgrasp.files import atomic_write_bytes, atomic_write_json, to_png
 from ddgrasp.progress import Progress
 from mjx_envs.objects import OBJECTS
 from rig.scenes import StandingScene, standing_scenes
@@ -229,9 +228,7 @@ def plot(result: Comparison) -> bytes:
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.3)
     figure.axes[0].legend(fontsize=7)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    return to_png(figure, dpi=110)
 
 
 def _line(axes, curve: Curve, label: str, bold: bool) -> None:

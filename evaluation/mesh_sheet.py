@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from evaluation.report import figures
+from ddgrasp.files import to_png
 from mjx_envs.object_spec import slot_layout
 from mjx_envs.objects import OBJECTS
 from rig.fr3.picture import draw_without_display
@@ -53,7 +53,7 @@ def draw(names: Sequence[str] = tuple(MESH_OBJECTS)) -> bytes:
                 axes.imshow(image)
                 axes.set_axis_off()
                 axes.set_title(title, fontsize=8, loc="left")
-    return figures.to_png(figure)
+    return to_png(figure)
 
 
 def _panels(

@@ -9,6 +9,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from ddgrasp import contract
+from ddgrasp.files import to_png
 from ddgrasp.layout import QPOS
 from evaluation.report import figures
 from mjx_envs import kinematics, scene
@@ -60,7 +61,7 @@ def draw(names: Sequence[str]) -> bytes:
     )
     bar.set_label("depth (m)", fontsize=8)
     bar.ax.tick_params(labelsize=7)
-    return figures.to_png(figure)
+    return to_png(figure)
 
 
 def close_camera(height_m: float) -> Camera:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from ddgrasp.files import to_png
 from evaluation.depth_score import holes
 from evaluation.depth_score.domains import COLUMNS, DOMAINS, FLOOR, RAW
-from evaluation.report import figures
 
 REAL_COLOR, SIM_COLOR = "tab:blue", "tab:orange"
 _LABELS = {
@@ -35,7 +35,7 @@ def draw_table(rows: Sequence[Mapping[str, str]], title: str) -> bytes:
         cell.set_linewidth(0.4)
         if row == 0 or column == 0:
             cell.set_text_props(weight="bold")
-    return figures.to_png(figure)
+    return to_png(figure)
 
 
 def draw_holes(scored: Mapping[str, Any]) -> bytes:
@@ -61,7 +61,7 @@ def draw_holes(scored: Mapping[str, Any]) -> bytes:
         axes.grid(alpha=0.3)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=8, frameon=False)
-    return figures.to_png(figure)
+    return to_png(figure)
 
 
 def _places(name: str, count: int) -> np.ndarray:
@@ -96,7 +96,7 @@ def draw_embedding(
         axes.set_xticks([])
         axes.set_yticks([])
         axes.legend(fontsize=7, markerscale=3, loc="upper right")
-    return figures.to_png(figure)
+    return to_png(figure)
 
 
 def draw_efficiency(points: Sequence[Mapping[str, Any]], floor: Mapping[str, Any], base: float) -> bytes:
@@ -123,4 +123,4 @@ def draw_efficiency(points: Sequence[Mapping[str, Any]], floor: Mapping[str, Any
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.3)
     figure.axes[0].legend(fontsize=7)
-    return figures.to_png(figure)
+    return to_png(figure)

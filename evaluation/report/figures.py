@@ -1,7 +1,6 @@
 """Pictures of a run, drawn with Matplotlib into PNG bytes. Depth has one colour map, invalid pixels a colour
 that is not in it."""
 
-import io
 import textwrap
 from collections.abc import Mapping, Sequence
 
@@ -13,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ddgrasp.depth import to_metres, to_millimetres
+from ddgrasp.files import to_png
 from rig.film import INVALID_RGB, colored
 
 DEPTH_COLORS = "viridis_r"
@@ -174,10 +174,3 @@ def _depth_legend(figure: Figure, near_m: float, far_m: float) -> None:
         handles=[Patch(color=(red, green, blue), label="no depth")],
         loc="lower right", fontsize=8, frameon=False, borderpad=0.0, handlelength=1.0,
     )  # fmt: skip
-
-
-def to_png(figure: Figure) -> bytes:
-    """The figure as a PNG file's content."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    return buffer.getvalue()

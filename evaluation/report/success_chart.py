@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ddgrasp import contract
-from evaluation.report.figures import to_png
+from ddgrasp.files import to_png
 
 Rows = Mapping[str, Mapping[str, Any]]
 """Title -> what `evaluation.rig_trials.tabulate` gives."""
