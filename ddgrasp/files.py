@@ -149,6 +149,17 @@ def read_json(path: Path | str) -> Any:
         ) from None
 
 
+def read_npz(path: Path, remedy: str) -> dict[str, Any]:
+    """NumPy arrays of an .npz file by name; UserError with the `remedy` if it is damaged or absent."""
+    import numpy as np
+
+    try:
+        with np.load(path) as arrays:
+            return dict(arrays)
+    except DAMAGED_NPZ as error:
+        raise UserError(f"{path} is damaged ({error}): {remedy}.") from None
+
+
 def to_json(value: Any) -> Any:
     """`value` as plain JSON types: dataclasses become objects, tuples lists, NumPy numbers and arrays plain.
 

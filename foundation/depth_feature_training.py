@@ -21,7 +21,7 @@ from ddgrasp import artifacts
 from ddgrasp.alone import alone_in
 from ddgrasp.config import DepthFeatureConfig
 from ddgrasp.errors import UserError
-from ddgrasp.files import DAMAGED_NPZ, atomic_path, atomic_write_json, read_json, to_json
+from ddgrasp.files import atomic_path, atomic_write_json, read_json, read_npz, to_json
 from ddgrasp.progress import Progress
 from ddgrasp.versions import library_versions
 from foundation import depth_features
@@ -114,7 +114,7 @@ def load_pools(config: DepthFeatureConfig, work: Path, progress: Progress) -> tu
             if not file.exists():
                 _take_pictures(config, number, file)
                 task.advance()
-    pools = [_read(file) for file in files]
+    pools = [Pool(**read_npz(file, "delete it and run the same command again")) for file in files]
     tested = max(1, round(config.devices * TEST_SHARE))
     return _joined(pools[:-tested]), _joined(pools[-tested:])
 
@@ -126,14 +126,6 @@ def _take_pictures(config: DepthFeatureConfig, number: int, file: Path) -> None:
     arrays: dict[str, Any] = {name: np.stack([vars(p)[name] for p in taken]) for name in vars(taken[0])}
     with atomic_path(file) as path:
         np.savez_compressed(path, **arrays)
-
-
-def _read(file: Path) -> Pool:
-    try:
-        with np.load(file) as arrays:
-            return Pool(**dict(arrays))
-    except DAMAGED_NPZ as error:
-        raise UserError(f"{file} is damaged ({error}): delete it and run the same command again.") from None
 
 
 def _joined(pools: list[Pool]) -> Pool:

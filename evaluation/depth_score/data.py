@@ -17,7 +17,7 @@ from jaxtyping import Int, UInt8, UInt16
 from ddgrasp import depth
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
-from ddgrasp.files import DAMAGED_NPZ, atomic_path
+from ddgrasp.files import atomic_path, read_npz
 from ddgrasp.progress import Progress
 from sensors.recordings.recording import Recording, find_recordings
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     import rig.world
 
 REAL, SIM = SIDES = ("real", "sim")
+MADE_ANEW = "delete it and run again with --resume"
+"""What is to be done about a damaged file of the score."""
 SEED_OFFSET = 1_000_000
 """Added to a trajectory's number in its seed: far from the numbers of recorded trajectories."""
 BLOCK_FRAMES = 4
@@ -165,12 +167,8 @@ def _save(file: Path, episode: Episode) -> None:
 
 def load_episode(file: Path) -> Episode:
     """What `record_rig` wrote; UserError if the file is damaged."""
-    try:
-        with np.load(file) as arrays:
-            plain = {name: a.item() if a.ndim == 0 else a for name, a in arrays.items()}
-    except DAMAGED_NPZ as error:
-        raise UserError(f"{file} is damaged ({error}): delete it and run again with --resume.") from None
-    return Episode(**{"rgb": None, **plain})
+    arrays = read_npz(file, MADE_ANEW)
+    return Episode(**{"rgb": None, **{name: a.item() if a.ndim == 0 else a for name, a in arrays.items()}})
 
 
 # --- a real camera -------------------------------------------------------------------------------

@@ -13,11 +13,10 @@ import numpy as np
 from jaxtyping import UInt16
 
 from ddgrasp.depth import to_metres
-from ddgrasp.errors import UserError
-from ddgrasp.files import DAMAGED_NPZ, atomic_path
+from ddgrasp.files import atomic_path, read_npz
 from ddgrasp.progress import Progress
 from evaluation.depth_score import holes
-from evaluation.depth_score.data import Episode
+from evaluation.depth_score.data import MADE_ANEW, Episode
 from evaluation.depth_score.domains import DOMAINS, Methods, sense, sense_repeats
 from evaluation.depth_score.features import FeatureExtractor
 from evaluation.depth_score.resampling import Sample
@@ -70,7 +69,7 @@ def score_episodes(
 
 def _domains(file: Path) -> set[str]:
     """What an episode's file is about."""
-    return {key.split("|")[0] for key in _read(file) if key != _GROUP}
+    return {key.split("|")[0] for key in read_npz(file, MADE_ANEW) if key != _GROUP}
 
 
 def _sides(had: Set[str]) -> set[str]:
@@ -108,7 +107,7 @@ def collect(files: Sequence[Path]) -> Scored:
     scored = Scored()
     features: dict[tuple[str, str], list[np.ndarray]] = {}
     for file in files:
-        arrays = _read(file)
+        arrays = read_npz(file, MADE_ANEW)
         group, sums = int(arrays.pop(_GROUP)), {}
         for key, value in arrays.items():
             name, kind, what = key.split("|")
@@ -125,11 +124,3 @@ def collect(files: Sequence[Path]) -> Scored:
         rows = np.repeat(scored.groups[name], [len(part) for part in parts])
         scored.features.setdefault(extractor, {})[name] = Sample(np.concatenate(parts), rows)
     return scored
-
-
-def _read(file: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(file) as arrays:
-            return dict(arrays)
-    except DAMAGED_NPZ as error:
-        raise UserError(f"{file} is damaged ({error}): delete it and run again with --resume.") from None
