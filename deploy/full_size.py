@@ -7,7 +7,6 @@ from jaxtyping import Float, UInt16
 from ddgrasp import contract
 from ddgrasp.config import StereoConfig
 from deploy.clock import SimClock
-from deploy.devices.fr3_camera import pinhole
 from deploy.devices.realsense_camera import RealSenseCamera
 from mjx_envs.camera import Camera
 from rig.camera import RigCamera
@@ -34,4 +33,4 @@ class FullSizeCamera(RigCamera):
 
     def pinhole(self, T_world_cam: Pose) -> Camera:
         """See RigCamera: of the pictures that it hands out."""
-        return pinhole(self._profile, T_world_cam)
+        return Camera.of(self._profile, T_world_cam)

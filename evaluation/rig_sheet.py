@@ -17,7 +17,6 @@ from ddgrasp.config import DeployConfig
 from ddgrasp.presets import get_preset
 from deploy import kinematics
 from deploy.calibration import poses
-from deploy.devices.fr3_camera import pinhole
 from deploy.devices.fr3_imager import nominal_lens
 from deploy.setup import safety_filter
 from mjx_envs.camera import Camera, look_at, nominal_camera
@@ -97,7 +96,7 @@ def _overview() -> Camera:
 
 def _view(T_world_cam: Pose) -> Camera:
     """The depth camera's, at the panels' width."""
-    return pinhole(contract.D455.scaled(WIDTH_PX / contract.D455.width_px), T_world_cam)
+    return Camera.of(contract.D455.scaled(WIDTH_PX / contract.D455.width_px), T_world_cam)
 
 
 def _mounting(picture: ScenePicture, T_world_cam: Pose) -> Image:

@@ -25,6 +25,12 @@ class Camera:
     T_world_cam: Any
     """(4, 4) pose of the camera in the world frame, metres; NumPy or JAX."""
 
+    @classmethod
+    def of(cls, profile: contract.CameraProfile, T_world_cam: Any) -> "Camera":
+        """The camera with `profile`'s pixels at (4, 4) `T_world_cam`."""
+        p = profile
+        return cls(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.height_px, p.width_px, T_world_cam)
+
     def cropped(self, row0: int, col0: int, height_px: int, width_px: int) -> "Camera":
         """The camera that sees only the window whose first pixel is (row0, col0) of this one."""
         return replace(
@@ -59,14 +65,11 @@ def look_at(position_m: Point, target_m: Point) -> Float64[np.ndarray, "4 4"]:
     return T_world_cam
 
 
+def nominal_pose() -> Float64[np.ndarray, "4 4"]:
+    """(4, 4) T_world_cam that training assumes, before it is displaced."""
+    return look_at(contract.CAMERA_POSITION_M, contract.CAMERA_LOOK_AT_M)
+
+
 def nominal_camera(profile: contract.CameraProfile) -> Camera:
     """The contract's camera at its nominal place, with `profile`'s pixels."""
-    return Camera(
-        profile.fx_px,
-        profile.fy_px,
-        profile.cx_px,
-        profile.cy_px,
-        profile.height_px,
-        profile.width_px,
-        look_at(contract.CAMERA_POSITION_M, contract.CAMERA_LOOK_AT_M),
-    )
+    return Camera.of(profile, nominal_pose())

@@ -28,7 +28,7 @@ from deploy.trials import TrialResult
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import rig_trials
 from evaluation.rig_trials import Series
-from mjx_envs.camera import nominal_camera
+from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.objects import get_object
 from mjx_envs.scene import HOME_RAD
 from rig import seeds
@@ -67,7 +67,7 @@ def test_a_mesh_object_weighs_and_rests_as_described():
 
 
 def test_normals_and_geoms_are_those_of_the_scene(picture):
-    camera = fr3_camera.pinhole(PROFILE, T_WORLD_CAM)
+    camera = Camera.of(PROFILE, T_WORLD_CAM)
     buffers = picture.buffers(camera)
     table = buffers.segmentation == picture.model.geom(scene.TABLE).id
     assert table.mean() > 0.3
@@ -85,7 +85,7 @@ def test_the_d455_sees_the_table_to_a_millimetre_and_loses_black_rubber(picture)
     stereo = fr3_camera.stereo(STEREO, PROFILE, SimClock(), rng)(picture, T_WORLD_CAM, "wheel")
     ideal = fr3_camera.ideal(PROFILE)(picture, T_WORLD_CAM, "wheel")
     assert stereo.shape == ideal.shape == (180, 320) and stereo.dtype == np.uint16
-    geoms = picture.buffers(fr3_camera.pinhole(PROFILE, T_WORLD_CAM)).segmentation
+    geoms = picture.buffers(Camera.of(PROFILE, T_WORLD_CAM)).segmentation
     table = geoms == picture.model.geom(scene.TABLE).id
     error_mm = np.abs(stereo.astype(int) - ideal)[table & (stereo > 0)]
     assert np.median(error_mm) <= 1.0

@@ -13,9 +13,9 @@ GREY = np.full((*SIZE, 3), 0.5, np.float32)
 
 
 def beside(offset_m: float) -> Camera:
-    p, T = PROFILE, np.eye(4)
+    T = np.eye(4)
     T[0, 3] = offset_m
-    return Camera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.height_px, p.width_px, T)
+    return Camera.of(PROFILE, T)
 
 
 def test_the_same_place_gives_the_same_picture():

@@ -27,6 +27,7 @@ from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, R
 from deploy.interrupts import note, terminable, unbroken
 from deploy.session import ask_person, for_devices, keep_time_of, survived
 from deploy.setup import check_start, safety_filter, space_notice
+from mjx_envs.camera import nominal_pose
 from sensors.charuco_board import CharucoBoard, Corners
 
 HOPELESS = 4
@@ -107,7 +108,7 @@ def run(
     safety = safety_filter(config.deploy, info, "franka")
     driver = Driver(robot, safety, clock, min(options.speed_rad_s, *config.deploy.franka.speed_rad_s))
     with terminable(), _started(imager, robot, say) as start_robot:
-        bench = poses.Bench(safety.limits, imager.lens(), standing.nominal_pose(), options.board)
+        bench = poses.Bench(safety.limits, imager.lens(), nominal_pose(), options.board)
         check_start(safety)
         say(space_notice(config.deploy))
         say(f"looking for: {options.board.describe()}")
@@ -278,7 +279,7 @@ def _solved(
     _check_fit(found.rms_px, 1e3 * options.board.square_m, sheet, say)
     reads = "`ddgrasp deploy`" if options.out is None else f"`ddgrasp deploy --calibration {options.file}`"
     say(f"{options.file}, {sheet}: {reads} reads the first, look at the second")
-    away = standing.offset(found.T_base_cam, standing.nominal_pose())
+    away = standing.offset(found.T_base_cam, nominal_pose())
     say(standing.describe(away, config.world.random))
     return result
 

@@ -13,7 +13,7 @@ from ddgrasp.config import Config, RandomConfig
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json, read_json
 from deploy.devices.options import SessionOptions
-from mjx_envs.camera import look_at
+from mjx_envs.camera import nominal_pose
 
 DEFAULT_FILE = Path("runs/calibration/calibration.json")
 """Where `ddgrasp calibrate` writes and `ddgrasp deploy` looks."""
@@ -85,11 +85,6 @@ class Standing:
             "created": c.created, "T_base_cam": c.T_base_cam.tolist(), "rms_px": c.rms_px,
             "shift_m": o.shift_m.tolist(), "turn_rad": o.turn_rad.tolist(), "trained_for": self.trained_for,
         }  # fmt: skip
-
-
-def nominal_pose() -> Float64[np.ndarray, "4 4"]:
-    """(4, 4) T_base_cam that training assumes."""
-    return look_at(contract.CAMERA_POSITION_M, contract.CAMERA_LOOK_AT_M)
 
 
 def offset(T_base_cam: Float[np.ndarray, "4 4"], T_reference: Float[np.ndarray, "4 4"]) -> Offset:

@@ -13,7 +13,7 @@ from ddgrasp.depth import to_millimetres
 from deploy.devices.options import Setup
 from deploy.devices.realsense_camera import RealSenseCamera
 from deploy.interfaces import CameraError, Clock, Depth, Frame, Robot
-from mjx_envs.camera import Camera as Pinhole
+from mjx_envs.camera import Camera
 
 if TYPE_CHECKING:
     import mujoco
@@ -65,7 +65,7 @@ def ideal(profile: contract.CameraProfile) -> Sense:
     """Rendered depth of the policy's picture."""
 
     def sense(picture: "ScenePicture", T_world_cam: Pose, name: str) -> Depth:
-        return to_millimetres(picture.depth_m(pinhole(profile, T_world_cam)))
+        return to_millimetres(picture.depth_m(Camera.of(profile, T_world_cam)))
 
     return sense
 
@@ -146,7 +146,7 @@ class Fr3Camera:
 
     def _colour(self) -> UInt8[np.ndarray, "H W 3"]:
         assert self._picture is not None
-        return self._picture.rgb(pinhole(self._profile, self._T_world_cam))
+        return self._picture.rgb(Camera.of(self._profile, self._T_world_cam))
 
     def _judge(self, object_pos_m: np.ndarray) -> None:
         self._object_pos_m = object_pos_m
@@ -163,18 +163,12 @@ class Fr3Camera:
         """See Simulated; as of the last `read`."""
         assert self._channel is not None and self._picture is not None
         with self._channel.time_held():
-            return to_millimetres(self._picture.depth_m(pinhole(self._profile, self._T_world_cam)))
+            return to_millimetres(self._picture.depth_m(Camera.of(self._profile, self._T_world_cam)))
 
     def scene(self) -> "tuple[mujoco.MjModel, mujoco.MjData]":
         """See Staged; as of the last `read`."""
         assert self._picture is not None
         return self._picture.model, self._picture.data
-
-
-def pinhole(profile: contract.CameraProfile, T_world_cam: Pose) -> Pinhole:
-    """The camera of that picture at (4, 4) `T_world_cam`."""
-    p = profile
-    return Pinhole(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.height_px, p.width_px, T_world_cam)
 
 
 def _at_place(setup: Setup, profile: contract.CameraProfile, sense: Sense) -> Fr3Camera:

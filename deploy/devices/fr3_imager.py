@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ddgrasp import contract
-from deploy.devices.fr3_camera import pinhole
 from deploy.devices.options import Setup
 from deploy.interfaces import CameraError, Lens
+from mjx_envs.camera import Camera
 
 if TYPE_CHECKING:
     from rig.fr3.channel import Channel
@@ -82,7 +82,7 @@ def look(
     picture: "ScenePicture", T_world_cam: Pose, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "720 1280"]:
     """(720, 1280) uint8 brightness as an imager at `T_world_cam` takes it."""
-    fine = picture.rgb(pinhole(contract.D455.scaled(FINER), T_world_cam))
+    fine = picture.rgb(Camera.of(contract.D455.scaled(FINER), T_world_cam))
     size = (contract.D455.width_px, contract.D455.height_px)
     gray = cv2.resize(cv2.cvtColor(fine, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     gray = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_PX)

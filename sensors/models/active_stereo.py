@@ -284,9 +284,7 @@ def _beside(T_world_cam: np.ndarray, x_m: float) -> np.ndarray:
 
 def _camera(profile: CameraProfile, T_world_cam: np.ndarray, x_m: float) -> Camera:
     """The pinhole `x_m` to the right of T_world_cam, axes parallel."""
-    p = profile
-    T = _beside(T_world_cam, x_m)
-    return Camera(p.fx_px, p.fy_px, p.cx_px, p.cy_px, p.height_px, p.width_px, T)
+    return Camera.of(profile, _beside(T_world_cam, x_m))
 
 
 def _projector_profile(profile: CameraProfile) -> CameraProfile:
