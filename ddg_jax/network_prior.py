@@ -87,6 +87,7 @@ class DepthNetworkPrior:
         """(T, h, w, 3) uint8 -> (T, h, w) relative inverse depth; loads the weights when first used."""
         from foundation.convert import depth_network
         from foundation.depth import predict
+        from foundation.pictures import in_batches
         from foundation.video import stream
 
         manifest, variables = store.load(self._directory, NETWORKS)
@@ -101,9 +102,7 @@ class DepthNetworkPrior:
         def pictures(rgb: np.ndarray) -> np.ndarray:
             if len(rgb) == 1:
                 return np.asarray(predict(network, params, rgb, side))
-            parts = [rgb[start : start + _BATCH] for start in range(0, len(rgb), _BATCH)]
-            filled = [np.concatenate([part, np.repeat(part[-1:], _BATCH - len(part), 0)]) for part in parts]
-            return np.concatenate([np.asarray(predict(network, params, f, side)) for f in filled])[: len(rgb)]
+            return in_batches(lambda part: predict(network, params, part, side), rgb, _BATCH)
 
         return video if network.video else pictures
 

@@ -22,6 +22,7 @@ from ddgrasp import artifacts
 from ddgrasp.errors import UserError
 from ddgrasp.files import read_json
 from ddgrasp.shipped import PRETRAINED
+from foundation.pictures import in_batches
 from learning.params import load_params
 
 NAME = "depthfeat-v1"
@@ -86,14 +87,7 @@ class DepthFeatures:
 
     def __call__(self, depth_m: Float[np.ndarray, "N H W"]) -> Float32[np.ndarray, f"N {FEATURES}"]:
         """(N, H, W) metres, 0 = invalid -> (N, FEATURES) float32."""
-        starts = range(0, len(depth_m), _BATCH)
-        return np.concatenate([self._batch(depth_m[at : at + _BATCH]) for at in starts])
-
-    def _batch(self, depth_m: np.ndarray) -> np.ndarray:
-        """One compiled size: the last map is repeated, its copies' features are dropped."""
-        sized = at_width(depth_m, WIDTH_PX)
-        filled = np.concatenate([sized, np.repeat(sized[-1:], _BATCH - len(sized), 0)])
-        return np.asarray(standardised(self.params, filled))[: len(depth_m)]
+        return in_batches(lambda maps: standardised(self.params, at_width(maps, WIDTH_PX)), depth_m, _BATCH)
 
 
 @jax.jit

@@ -5,8 +5,8 @@ ResNet-18 with fixed random weights, whose features tell distributions apart as 
 section 4.2), but whose figures compare only with each other. The extractor's name says which one it was.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +38,7 @@ class Extractor:
     def __call__(self, rgb: UInt8[np.ndarray, "N H W 3"]) -> Float32[np.ndarray, "N d"]:
         """(N, H, W, 3) uint8 -> (N, 2048) (FID Inception) or (N, 512) (ResNet-18), float32."""
         function = _inception if self.name == catalog.FID_INCEPTION else _resnet18
-        starts = range(0, len(rgb), _BATCH)
-        return np.concatenate([_padded(function, self.variables, rgb[at : at + _BATCH]) for at in starts])
+        return pictures.in_batches(partial(function, self.variables), rgb, _BATCH)
 
 
 def load_extractor(weights: Path | None = None) -> Extractor:
@@ -65,12 +64,6 @@ def random_resnet18() -> dict[str, Any]:
         return np.full(leaf.shape, 1.0 if name in ("scale", "var") else 0.0, np.float32)
 
     return jax.tree_util.tree_map_with_path(draw, variable_shapes(catalog.RESNET18))
-
-
-def _padded(function: Callable[..., jax.Array], variables: dict[str, Any], rgb: np.ndarray) -> np.ndarray:
-    """One compiled batch size: the last picture is repeated, its copies' features are dropped."""
-    filled = np.concatenate([rgb, np.repeat(rgb[-1:], _BATCH - len(rgb), 0)])
-    return np.asarray(function(variables, filled))[: len(rgb)]
 
 
 @jax.jit

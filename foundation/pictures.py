@@ -1,11 +1,12 @@
 """What pictures go through before a network: its input size, resampling, standardisation."""
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Shaped, UInt8
 
 from ddgrasp.arrays import AnyArray
 from ddgrasp.errors import UserError
@@ -21,6 +22,18 @@ WIDEST = 1.78
 """Side ratio beyond which the video network takes a smaller picture."""
 WIDE_SIDES = 1.777
 """The ratio whose area it keeps."""
+
+
+def in_batches(
+    function: Callable[[np.ndarray], AnyArray], rows: Shaped[np.ndarray, "N ..."], size: int
+) -> Shaped[np.ndarray, "N ..."]:
+    """`function` of all N `rows`, of which it is given `size` at once: one shape, compiled once.
+
+    Where too few are left, the last one is repeated; what its copies give is dropped.
+    """
+    parts = (rows[at : at + size] for at in range(0, len(rows), size))
+    filled = (np.concatenate([part, np.repeat(part[-1:], size - len(part), 0)]) for part in parts)
+    return np.concatenate([np.asarray(function(part)) for part in filled])[: len(rows)]
 
 
 def network_size(height: int, width: int, input_size: int = INPUT_SIZE, *, video: bool) -> tuple[int, int]:
