@@ -43,23 +43,20 @@ class Clip:
     """What the frames are of, where it is known."""
 
 
-def by_frames(
-    frames: Callable[..., UInt16[np.ndarray, "T H W"]],
-    lengths: Sequence[int],
-    read: Callable[[int], Clip],
-    first: int = 0,
-) -> Iterator[UInt16[np.ndarray, "T H W"]]:
-    """As `noisy_episodes`, an episode at a time, of a source whose frames share nothing.
+class FrameByFrame:
+    """A depth source whose frames share nothing (`student_jax.depth_source.DepthSource`)."""
 
-    Args:
-      frames: (clean depth, colour, episode's number and frame's number of each, views) -> depth.
-      lengths: frames of every episode.
-      read: episode's position in `lengths` -> its frames.
-    """
-    for i in range(first, len(lengths)):
-        clip = read(i)
-        number = np.full(len(clip.depth_mm), clip.number)
-        yield frames(clip.depth_mm, clip.rgb, number, np.arange(len(number)), clip.views)
+    frames: Callable[..., UInt16[np.ndarray, "T H W"]]
+    """(clean depth, colour, episode's number and frame's number of each, views) -> depth."""
+
+    def episodes(
+        self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
+    ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
+        """As `noisy_episodes`, an episode at a time."""
+        for i in range(first, len(lengths)):
+            clip = read(i)
+            number = np.full(len(clip.depth_mm), clip.number)
+            yield self.frames(clip.depth_mm, clip.rgb, number, np.arange(len(number)), clip.views)
 
 
 def noisy_episodes(

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int, Key, UInt8, UInt16
 
-from ddg_jax.generate import Clip, by_frames, made_mm, noisy_episodes
+from ddg_jax.generate import Clip, FrameByFrame, made_mm, noisy_episodes
 from ddg_jax.monocular import MonocularDepth
 from ddg_jax.sample import Generator, filled_up, generate
 from ddg_jax.sensor import make_sensor
@@ -121,18 +121,12 @@ class GeneratorSource:
 
 
 @dataclass(frozen=True)
-class MonocularSource:
+class MonocularSource(FrameByFrame):
     """Depth that a network estimates from simulated colour, made metric by clean depth; without noise."""
 
     network: MonocularDepth
     needs_rgb: bool = True
     needs_views: bool = False
-
-    def episodes(
-        self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
-    ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
-        """See `DepthSource`."""
-        return by_frames(self.frames, lengths, read, first)
 
     def frames(
         self,
@@ -148,19 +142,13 @@ class MonocularSource:
 
 
 @dataclass(frozen=True)
-class SenseSource:
+class SenseSource(FrameByFrame):
     """A camera model; every frame has noise of its own."""
 
     sense: Sense
     key: Key[jax.Array, ""]
     needs_rgb: bool = False
     needs_views: bool = False
-
-    def episodes(
-        self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
-    ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
-        """See `DepthSource`."""
-        return by_frames(self.frames, lengths, read, first)
 
     def frames(
         self,

@@ -5,14 +5,13 @@ source may know.
 """
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
 from jaxtyping import Int, UInt8, UInt16
 
-from ddg_jax.generate import Clip, by_frames
+from ddg_jax.generate import FrameByFrame
 from ddgrasp import machine
 from ddgrasp.config import Config
 from mjx_envs import scene
@@ -26,7 +25,7 @@ _STREAM = 0x626F756E
 """Keeps its random numbers apart from every other stage's ("boun")."""
 
 
-class RigSource:
+class RigSource(FrameByFrame):
     """A `DepthSource`: pictures the scene anew instead of changing clean depth."""
 
     needs_rgb, needs_views = False, True
@@ -37,12 +36,6 @@ class RigSource:
         self._table = ObjectTable(config.world.objects)
         self._own = threading.local()
         self._threads = ThreadPoolExecutor(machine.cores())
-
-    def episodes(
-        self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
-    ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
-        """See `DepthSource`."""
-        return by_frames(self.frames, lengths, read, first)
 
     def frames(
         self,
