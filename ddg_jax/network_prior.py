@@ -43,8 +43,6 @@ class DepthNetworkPrior:
             raise UserError(
                 f"{self._directory} holds {manifest.network}; ddg.prior.source is {config.prior.source}."
             )
-        if manifest.max_depth_m:
-            raise UserError(f"{self._directory} holds a metric model; the prior is relative inverse depth.")
         self.source: str | dict[str, str] = manifest.summary() | {"in_simulation": config.prior.in_sim}
 
     def from_recording(

@@ -79,6 +79,3 @@ ENTRIES = {
 def get_entry(name: str) -> Entry:
     """The entry called `name`; UserError with the nearest name otherwise."""
     return looked_up("network", name, ENTRIES)
-
-
-METRIC_NOTE = "weights for metric depth: licence as stated on their own page"

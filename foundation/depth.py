@@ -1,8 +1,7 @@
 """Depth Anything V2 (Yang et al. 2024) and Video Depth Anything (Chen et al. 2025): one class, all sizes.
 
-Both give relative inverse depth: large is near, scale and shift are arbitrary (models trained for metric
-depth give metres). The video network sees a clip at once, at most 32 frames; longer ones:
-foundation/video.py.
+Both give relative inverse depth: large is near, scale and shift are arbitrary. The video network sees a
+clip at once, at most 32 frames; longer ones: foundation/video.py.
 """
 
 from collections.abc import Callable
@@ -35,8 +34,6 @@ class DepthNetwork:
 
     size: DepthSize
     video: bool
-    max_depth_m: float = 0.0
-    """0: relative inverse depth. Otherwise the image network's metric variant: metres, up to this."""
     dtype: str = "float32"
     """Arithmetic: float32, or bfloat16 (parameters stay float32; its error is in docs/networks.md)."""
     frames_at_once: int = 8
@@ -105,7 +102,7 @@ class DepthNetwork:
 
     @property
     def _fine(self) -> FineHead:
-        return FineHead(self.size, jnp.dtype(self.dtype), 0.0 if self.video else self.max_depth_m)
+        return FineHead(self.size, jnp.dtype(self.dtype))
 
     def _precision(self) -> AbstractContextManager[Any]:
         """float32 means float32 on every device: accelerators would round products to fewer bits."""

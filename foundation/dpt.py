@@ -128,8 +128,6 @@ class FineHead(nn.Module):
 
     size: DepthSize
     dtype: DTypeLike = jnp.float32
-    max_depth_m: float = 0.0
-    """0: relative inverse depth. Otherwise metric depth up to this (models trained for it)."""
 
     @nn.compact
     def __call__(
@@ -146,7 +144,7 @@ class FineHead(nn.Module):
         x = resize_corners(x, (height // 4 * PATCH_PX, width // 4 * PATCH_PX)).astype(jnp.float32)
         x = nn.relu(conv3(FINE_CHANNELS, "scratch.output_conv2.0", jnp.float32)(x))
         x = conv1(1, "scratch.output_conv2.2", jnp.float32)(x)[..., 0]
-        return self.max_depth_m * nn.sigmoid(x) if self.max_depth_m else nn.relu(x)
+        return nn.relu(x)
 
 
 def _sides(x: Array) -> tuple[int, int]:

@@ -45,19 +45,18 @@ def fit_scale_shift(
 
 
 def stitch(
-    windows: Iterable[Float[np.ndarray, f"{WINDOW} H W"]], count: int | None = None, *, metric: bool = False
+    windows: Iterable[Float[np.ndarray, f"{WINDOW} H W"]], count: int | None = None
 ) -> Iterator[Float32[np.ndarray, "H W"]]:
     """Depth of each frame of the video, in order, from the depth of its windows.
 
     Args:
       windows: (32, H, W) per window, in order, as `window_frames` lays them out.
       count: frames of the video; what the windows hold beyond them is dropped.
-      metric: the depth has one scale already and is not aligned.
     """
-    return islice(_stitched(windows, metric), count)
+    return islice(_stitched(windows), count)
 
 
-def _stitched(windows: Iterable[np.ndarray], metric: bool) -> Iterator[np.ndarray]:
+def _stitched(windows: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     anchors = ending = None
     for window in windows:
         if anchors is None or ending is None:
@@ -65,7 +64,7 @@ def _stitched(windows: Iterable[np.ndarray], metric: bool) -> Iterator[np.ndarra
             yield from maps[:-BLENDED]
             anchors = maps[list(ANCHORS)]
         else:
-            scale, shift = (1.0, 0.0) if metric else fit_scale_shift(window[: len(ANCHORS)], anchors)
+            scale, shift = fit_scale_shift(window[: len(ANCHORS)], anchors)
             maps = np.maximum(np.float32(scale) * window + np.float32(shift), 0)
             share = np.linspace(0, 1, BLENDED, dtype=np.float32)[:, None, None]
             overlap = maps[len(ANCHORS) : len(KEPT)]

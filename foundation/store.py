@@ -35,8 +35,6 @@ class WeightsManifest:
     published: str
     parameters: int
     """How many numbers."""
-    max_depth_m: float
-    """0, or the range of weights trained for metric depth."""
     versions: dict[str, str]
     created: str
     """UTC time of the conversion."""
@@ -51,13 +49,10 @@ BUILT_IN = "built-in"
 """What reports say where no published weights were used."""
 
 
-def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float = 0.0) -> Path:
+def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR) -> Path:
     """Converts a published checkpoint into a folder of `weights_dir`, which is returned.
 
     An earlier conversion of the same network is replaced once the new one is complete.
-
-    Args:
-      max_depth_m: range of the model if its weights are of a metric variant, whose keys are the same.
 
     Raises UserError for a file that is damaged or does not fit a known network.
     """
@@ -67,25 +62,23 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR, max_depth_m: float
     arrays = read_checkpoint(file)
     network = recognise({key: tuple(array.shape) for key, array in arrays.items()})
     _check_version(file, network)
-    _check_metric(file, network, max_depth_m)
+    _check_relative(file, network)
     variables = convert(network, arrays)
-    name = f"{network}_metric" if max_depth_m else network
     entry = catalog.get_entry(network)
     manifest = WeightsManifest(
         network=network,
         source_file=file.name,
         source_sha256=_sha256(file),
-        licence=catalog.METRIC_NOTE if max_depth_m else entry.licence,
+        licence=entry.licence,
         published=entry.published,
         parameters=_count(variables["params"]),
-        max_depth_m=max_depth_m,
         versions=library_versions(),
         created=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     )
-    with replaced_folder(weights_dir / name) as folder:
+    with replaced_folder(weights_dir / network) as folder:
         _save(folder / CHECKPOINT, variables)
         atomic_write_json(folder / MANIFEST, asdict(manifest))
-    return weights_dir / name
+    return weights_dir / network
 
 
 def read_manifest(directory: Path) -> WeightsManifest:
@@ -97,6 +90,11 @@ def read_manifest(directory: Path) -> WeightsManifest:
             "`ddgrasp weights convert FILE`."
         )
     value = read_json(path)
+    if isinstance(value, dict) and value.pop("max_depth_m", 0):  # 0 in those that were written before
+        raise UserError(
+            f"{directory} holds weights for metric depth, which nothing uses: convert the file that "
+            "`ddgrasp weights list` names."
+        )
     names = {field.name for field in fields(WeightsManifest)}
     if not isinstance(value, dict) or value.keys() != names or value["format_version"] != FORMAT_VERSION:
         raise UserError(f"{path} was written by another version of this project: convert the weights again.")
@@ -126,7 +124,7 @@ def load(directory: Path, families: tuple[str, ...] = ()) -> tuple[WeightsManife
 
 
 def installed(weights_dir: Path = WEIGHTS_DIR) -> dict[str, WeightsManifest]:
-    """Folder name (the network's, of metric variants with `_metric` behind) -> manifest that can be read."""
+    """Folder name, which is the network's -> manifest that can be read."""
     return {name: read for name, read in _folders(weights_dir).items() if isinstance(read, WeightsManifest)}
 
 
@@ -154,18 +152,12 @@ def _check_version(file: Path, network: str) -> None:
         )
 
 
-def _check_metric(file: Path, network: str, max_depth_m: float) -> None:
-    if max_depth_m and not network.startswith(catalog.IMAGE_DEPTH):
-        raise UserError(f"max_depth_m is {max_depth_m:g}, but {network} has no metric variant of this kind.")
-    if "metric" in file.name and network.startswith(catalog.VIDEO_DEPTH):
+def _check_relative(file: Path, network: str) -> None:
+    """Weights for metric depth have the same arrays as those for relative depth, and give something else."""
+    if "metric" in file.name:
         raise UserError(
-            f"{file.name} looks like a metric video depth model, which are not supported: take "
+            f"{file.name} looks like a model of metric depth, which is not supported: take "
             f"{catalog.get_entry(network).file}."
-        )
-    if "metric" in file.name and network.startswith(catalog.IMAGE_DEPTH) and not max_depth_m:
-        raise UserError(
-            f"{file.name} looks like a metric depth model, whose range is not in the file: give "
-            "--max-depth-m (20 for indoor, 80 for outdoor models)."
         )
 
 

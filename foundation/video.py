@@ -26,14 +26,11 @@ def stream(
     params: dict[str, Any],
     frames: Iterable[UInt8[np.ndarray, "H W 3"]],
     input_size: int = INPUT_SIZE,
-    *,
-    metric: bool = False,
 ) -> Iterator[Float32[np.ndarray, "H W"]]:
     """Depth of each frame of a video, in order, while the video is being read.
 
     Args:
       frames: (H, W, 3) uint8 RGB, all of one size; at most 32 are read ahead of the depth that is given out.
-      metric: the weights are of a metric video model, whose windows need no alignment.
 
     Yields (H, W) float32: relative inverse depth on the scale of the first window.
     """
@@ -51,7 +48,7 @@ def stream(
             kept = tuple(tap[jnp.asarray(KEPT)] for tap in taps)
             yield depth
 
-    for index, depth in enumerate(stitch(windows(), metric=metric)):
+    for index, depth in enumerate(stitch(windows())):
         if index == read:  # behind here the last frame was repeated to fill its window
             return
         yield depth

@@ -4,6 +4,7 @@ import json
 import pickle
 import struct
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
 
 import jax
@@ -228,21 +229,34 @@ def test_conversion_is_stored_with_its_origin_and_loads_back(tmp_path, resnet18)
     (directory / store.MANIFEST).write_text("{")
     with pytest.raises(UserError, match="not valid JSON"):
         store.load(directory)
-    with pytest.raises(UserError, match="no metric variant"):
-        store.convert_file(file, tmp_path / "weights", max_depth_m=20)
 
 
-def test_metric_weights_lie_beside_the_relative_ones_and_state_their_range(tmp_path):
-    shapes = {key: target.shape for key, target in convert.targets("depth_anything_v2_small").items()}
-    arrays = {key: np.zeros(shape, np.float32) for key, shape in shapes.items()}
-    file = tmp_path / "depth_anything_v2_metric_hypersim_vits.safetensors"
-    files.write_safetensors(file, arrays)
-    with pytest.raises(UserError, match="--max-depth-m"):
-        store.convert_file(file, tmp_path)
-    directory = store.convert_file(file, tmp_path, max_depth_m=20.0)
-    assert directory.name == "depth_anything_v2_small_metric"
-    assert store.installed(tmp_path)["depth_anything_v2_small_metric"].max_depth_m == 20.0
-    assert store.read_manifest(directory).licence == catalog.METRIC_NOTE
+@pytest.mark.parametrize(
+    ("network", "name"),
+    [
+        ("depth_anything_v2_small", "depth_anything_v2_metric_hypersim_vits"),
+        ("video_depth_anything_small", "metric_video_depth_anything_vits"),
+    ],
+)
+def test_weights_for_metric_depth_are_refused_by_name(tmp_path, network, name):
+    shapes = {key: target.shape for key, target in convert.targets(network).items()}
+    file = tmp_path / f"{name}.safetensors"
+    files.write_safetensors(file, {key: np.zeros(shape, np.float32) for key, shape in shapes.items()})
+    with pytest.raises(
+        UserError, match=f"{file.name} .* not supported: take {catalog.ENTRIES[network].file}"
+    ):
+        store.convert_file(file, tmp_path / "weights")
+    assert not (tmp_path / "weights").exists()
+
+
+def test_manifests_that_state_a_range_of_metric_depth(tmp_path):
+    name = "depth_anything_v2_small"
+    manifest = store.WeightsManifest(name, "x.pth", "ab12", "Apache-2.0", "here", 1, {}, "today")
+    atomic_write_json(tmp_path / store.MANIFEST, asdict(manifest) | {"max_depth_m": 0.0})
+    assert store.read_manifest(tmp_path) == manifest
+    atomic_write_json(tmp_path / store.MANIFEST, asdict(manifest) | {"max_depth_m": 20.0})
+    with pytest.raises(UserError, match=f"{tmp_path} holds weights for metric depth.* weights list"):
+        store.read_manifest(tmp_path)
 
 
 def test_weights_of_depth_anything_s_first_version_are_refused(tmp_path):
@@ -256,21 +270,12 @@ def test_weights_of_depth_anything_s_first_version_are_refused(tmp_path):
     assert store.convert_file(file, tmp_path / "weights").name == "depth_anything_v2_small"
 
 
-def test_metric_weights_of_the_video_network_are_refused(tmp_path):
-    shapes = {key: target.shape for key, target in convert.targets("video_depth_anything_small").items()}
-    file = tmp_path / "metric_video_depth_anything_vits.safetensors"
-    files.write_safetensors(file, {key: np.zeros(shape, np.float32) for key, shape in shapes.items()})
-    with pytest.raises(UserError, match="not supported: take video_depth_anything_vits.pth"):
-        store.convert_file(file, tmp_path / "weights")
-    assert not (tmp_path / "weights").exists()
-
-
 def test_one_damaged_folder_hides_no_other(tmp_path, capsys):
     for name, text in (("resnet18", "{"), ("fid_inception", '{"format_version": 0}')):
         (tmp_path / name).mkdir()
         (tmp_path / name / store.MANIFEST).write_text(text)
     name = "depth_anything_v2_small"
-    manifest = store.WeightsManifest(name, "x.pth", "ab12", "Apache-2.0", "here", 1, 0.0, {}, "today")
+    manifest = store.WeightsManifest(name, "x.pth", "ab12", "Apache-2.0", "here", 1, {}, "today")
     atomic_write_json(tmp_path / name / store.MANIFEST, manifest)
     assert store.installed(tmp_path) == {name: manifest}
     reasons = store.unreadable(tmp_path)

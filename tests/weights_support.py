@@ -30,6 +30,6 @@ def depth_anything_v2_small(base: Path) -> Path:
     }
     arrays["depth_head.scratch.output_conv2.2.bias"] += 1
     store._save(directory / store.CHECKPOINT, convert.convert(network, arrays))
-    manifest = store.WeightsManifest(network, "x.pth", "ab12", "Apache-2.0", "here", 1, 0.0, {}, "today")
+    manifest = store.WeightsManifest(network, "x.pth", "ab12", "Apache-2.0", "here", 1, {}, "today")
     atomic_write_json(directory / store.MANIFEST, manifest)
     return directory

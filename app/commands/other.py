@@ -4,13 +4,12 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
 from app.commands.checks import check_file, check_folder, is_shipped
 from ddgrasp import contract
-from ddgrasp.config.checks import Range
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from foundation.store import WEIGHTS_DIR
@@ -27,15 +26,13 @@ class WeightsConvert:
     """File as `ddgrasp weights list` names it; what is pickled in it is not run."""
     out: Path = WEIGHTS_DIR
     """Folder of converted weights; each network gets a folder in it."""
-    max_depth_m: Annotated[float, Range(0, 1000)] = 0.0
-    """Range of a metric depth model in metres (20 indoor, 80 outdoor); 0 for the relative ones."""
 
     def run(self) -> None:
         """Converts one file and prints what it is."""
         check_folder("--out", self.out)
         from foundation import store
 
-        directory = store.convert_file(self.file, self.out, self.max_depth_m)
+        directory = store.convert_file(self.file, self.out)
         manifest = store.read_manifest(directory)
         print(
             f"{directory}: {manifest.network}, {manifest.parameters:,} numbers\nLicence: {manifest.licence}"
@@ -55,11 +52,10 @@ class WeightsList:
 
         there, damaged = store.installed(self.out), store.unreadable(self.out)
         for name, entry in catalog.ENTRIES.items():
-            folder = name if name in there | damaged else f"{name}_metric"
-            manifest = there.get(folder)
-            place = self.out / folder
+            manifest = there.get(name)
+            place = self.out / name
             state = f"installed in {place}, from {manifest.source_file}" if manifest else "not installed"
-            state = damaged.get(folder, state)
+            state = damaged.get(name, state)
             lines = {"file": entry.file, "published": entry.published, "licence": entry.licence}
             lines |= {"used for": entry.used_for, "here": state}
             print(name, *(f"  {title:<10} {text}" for title, text in lines.items()), "", sep="\n")
