@@ -136,7 +136,7 @@ def _record(
     sensed, clean, rgb = [], [], []
     for _ in range(score.frames):
         sensed.append(camera.depth_mm(world.data, T_world_cam, rng, name))
-        clean.append(_clean_mm(world, camera, T_world_cam))
+        clean.append(camera.clean_mm(world.data, T_world_cam))
         if with_rgb:
             rgb.append(camera.rgb(world.data, T_world_cam))
         act(world, policy(world.observation()))
@@ -146,17 +146,6 @@ def _record(
         np.stack(repeats) if repeats else np.zeros((0, *sensed[0].shape), np.uint16),
         np.stack(rgb) if rgb else None, profile.fx_px, profile.baseline_m,
     )  # fmt: skip
-
-
-def _clean_mm(
-    world: "rig.world.RigWorld", camera: "rig.camera.RigCamera", T_world_cam: np.ndarray
-) -> np.ndarray:
-    """The simulator's own depth from the place of the left imager."""
-    from mjx_envs.render.raycast_numpy import render_depth
-    from rig.camera import FAR_M
-
-    depth_m = render_depth(world.model, world.data, camera.stereo.camera(T_world_cam), far_m=FAR_M)
-    return depth.to_millimetres(depth_m)
 
 
 def _save(file: Path, episode: Episode) -> None:
