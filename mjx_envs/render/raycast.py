@@ -70,25 +70,16 @@ class Geoms:
         )
 
 
-@partial(jax.jit, static_argnames="crop_shape")
-def render(
-    geoms: Geoms,
-    camera: Camera,
-    row0: Any = 0,
-    col0: Any = 0,
-    crop_shape: tuple[int, int] | None = None,
-    far_m: Any = 2.0,
-) -> Buffers:
+@jax.jit
+def render(geoms: Geoms, camera: Camera, far_m: Any = 2.0) -> Buffers:
     """Everything `camera` sees of `geoms`.
 
-    `camera.T_world_cam` may be traced and mapped; its intrinsics are static. With `crop_shape`
-    (height, width) only the window of the picture whose first pixel is (`row0`, `col0`) is
-    rendered; the offsets may be traced, per environment, and fractional.
+    `camera.T_world_cam` may be traced and mapped; its intrinsics are static.
 
     Planar depth in metres, 0 beyond `far_m`; the other buffers have no such limit.
     """
-    shape = crop_shape or (camera.height_px, camera.width_px)
-    rays = _rays(camera, row0, col0, shape)
+    shape = (camera.height_px, camera.width_px)
+    rays = _rays(camera)
     t, winner = _decode(geoms, _pass(lambda *ray: _nearest_key(geoms, camera, ray), *rays))
     rgb, normal_w = _shade(geoms, camera, rays, t, winner)
     ids = jnp.array((*(geoms.ids or range(len(geoms.types))), -1), jnp.int32)
@@ -100,30 +91,22 @@ def render(
     )
 
 
-@partial(jax.jit, static_argnames="crop_shape")
-def render_depth(
-    geoms: Geoms,
-    camera: Camera,
-    row0: Any = 0,
-    col0: Any = 0,
-    crop_shape: tuple[int, int] | None = None,
-    far_m: Any = 2.0,
-) -> jax.Array:
+@jax.jit
+def render_depth(geoms: Geoms, camera: Camera, far_m: Any = 2.0) -> jax.Array:
     """(H, W) planar depth in metres alone, 0 beyond `far_m`; arguments as `render`'s."""
-    shape = crop_shape or (camera.height_px, camera.width_px)
-    t = _pass(lambda *ray: _nearest(geoms, camera, ray), *_rays(camera, row0, col0, shape))
-    return _limited(t, far_m).reshape(shape)
+    t = _pass(lambda *ray: _nearest(geoms, camera, ray), *_rays(camera))
+    return _limited(t, far_m).reshape(camera.height_px, camera.width_px)
 
 
 def _limited(t: jax.Array, far_m: Any) -> jax.Array:
     return jnp.where(t <= far_m, t, 0)
 
 
-def _rays(camera: Camera, row0: Any, col0: Any, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+def _rays(camera: Camera) -> tuple[jax.Array, jax.Array]:
     """x and y, each (chunks, pixels of a chunk), of every pixel's ray in the camera frame; z is 1."""
-    height, width = shape
-    x = (jnp.arange(width) + (0.5 - camera.cx_px) + col0) / camera.fx_px
-    y = (jnp.arange(height) + (0.5 - camera.cy_px) + row0) / camera.fy_px
+    shape = height, width = camera.height_px, camera.width_px
+    x = (jnp.arange(width) + (0.5 - camera.cx_px)) / camera.fx_px
+    y = (jnp.arange(height) + (0.5 - camera.cy_px)) / camera.fy_px
     x = jnp.broadcast_to(x.astype(jnp.float32)[None, :], shape)
     y = jnp.broadcast_to(y.astype(jnp.float32)[:, None], shape)
     chunk = _chunk_size(height * width)

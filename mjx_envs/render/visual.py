@@ -84,8 +84,8 @@ class Viewer:
         window = (self.profile.crop_height_px, self.profile.crop_width_px)
 
         def count(a):
-            picture = render(a[0], self._seen_from(a[1]), *self.profile.crop_origin_px, window)
-            return jnp.isin(picture.segmentation, self._slots).sum()
+            camera = self._seen_from(a[1]).cropped(*self.profile.crop_origin_px, *window)
+            return jnp.isin(render(a[0], camera).segmentation, self._slots).sum()
 
         return jax.lax.map(count, (geoms, T_world_cam))
 
