@@ -6,7 +6,7 @@ Identification of the Franka Emika Panda Robot", RA-L 2019. Geometry is our own:
 """
 
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -109,8 +109,8 @@ def _arm_xml(depth: int = 0) -> str:
     lower, upper = contract.JOINT_LOWER_RAD[depth], contract.JOINT_UPPER_RAD[depth]
     geoms = "".join(f'<geom class="arm" {g}/>' for g in link.geoms)
     return f"""
-    <body name="{link.name}" pos="{_fmt(link.pos_m)}" quat="{_fmt(link.quat)}" gravcomp="1">
-      <inertial mass="{link.mass_kg}" pos="{_fmt(link.com_m)}" fullinertia="{_fmt(link.fullinertia_kg_m2)}"/>
+    <body name="{link.name}" pos="{mjcf(link.pos_m)}" quat="{mjcf(link.quat)}" gravcomp="1">
+      <inertial mass="{link.mass_kg}" pos="{mjcf(link.com_m)}" fullinertia="{mjcf(link.fullinertia_kg_m2)}"/>
       <joint name="{contract.ARM_JOINTS[depth]}" axis="0 0 1" range="{lower} {upper}"
              damping="{JOINT_DAMPING_NMS_RAD}" frictionloss="0.1" armature="{ARM_ARMATURE_KG_M2}"/>
       {geoms}{_arm_xml(depth + 1)}
@@ -124,7 +124,7 @@ def _hand_xml() -> str:
         ("right_finger", contract.FINGER_JOINTS[1], "0 0 0 1"),
     ):
         fingers += f"""
-      <body name="{name}" pos="{_fmt(FINGER_POS_M)}" quat="{quat}" gravcomp="1">
+      <body name="{name}" pos="{mjcf(FINGER_POS_M)}" quat="{quat}" gravcomp="1">
         <inertial mass="0.015" pos="0 0.01 0.025" diaginertia="3e-6 3e-6 1e-6"/>
         <joint name="{joint}" type="slide" axis="0 1 0" range="0 0.04" damping="{FINGER_DAMPING_NS_M}"
                armature="{FINGER_ARMATURE_KG}"/>
@@ -133,11 +133,11 @@ def _hand_xml() -> str:
               pos="0 0.005 0.0415"/>
       </body>"""
     return f"""
-    <body name="hand" pos="{_fmt(HAND_POS_M)}" quat="{_fmt(HAND_QUAT)}" gravcomp="1">
+    <body name="hand" pos="{mjcf(HAND_POS_M)}" quat="{mjcf(HAND_QUAT)}" gravcomp="1">
       <inertial mass="0.73" pos="-0.01 0 0.03" diaginertia="0.001 0.0025 0.0017"/>
       <geom class="arm" type="cylinder" fromto="0 0 -0.005 0 0 0.025" size="0.04"/>
       <geom name="hand_box" class="hand" type="box" size="0.031 0.102 0.02" pos="0 0 0.043"/>
-      <site name="grip" pos="{_fmt(GRIP_POS_M)}"/>{fingers}
+      <site name="grip" pos="{mjcf(GRIP_POS_M)}"/>{fingers}
     </body>"""
 
 
@@ -145,13 +145,13 @@ def _object_xml(layout: SlotLayout) -> str:
     cube = OBJECTS["cube"]
     slots = "".join(
         f'<geom name="{n}" class="{"" if n in layout.colliding_names else "drawn_"}slot" type="{k}" '
-        f'size="{_fmt(s)}" pos="{_fmt(p)}" quat="{_fmt(q)}"/>'
+        f'size="{mjcf(s)}" pos="{mjcf(p)}" quat="{mjcf(q)}"/>'
         for n, k, s, p, q in zip(layout.names, layout.kinds, *cube.slot_arrays(layout), strict=True)
     )
     return f"""
     <body name="object" pos="{contract.WORKSPACE_CENTER_M[0]} 0 {cube.rest_height_m}">
       <joint name="object" type="free" damping="0.0005"/>
-      <inertial mass="{cube.mass_kg}" pos="0 0 0" diaginertia="{_fmt(cube.inertia_kg_m2())}"/>
+      <inertial mass="{cube.mass_kg}" pos="0 0 0" diaginertia="{mjcf(cube.inertia_kg_m2())}"/>
       {slots}
     </body>"""
 
@@ -294,5 +294,6 @@ def _widen_object_bounds(model: mujoco.MjModel) -> None:
     model.bvh_aabb[first : first + count] = [0.0, 0.0, 0.0, 0.15, 0.15, 0.15]
 
 
-def _fmt(values) -> str:
+def mjcf(values: Iterable[float]) -> str:
+    """Values as an attribute of MuJoCo's model files has them: nine digits, apart by spaces."""
     return " ".join(f"{float(v):.9g}" for v in values)

@@ -81,12 +81,8 @@ def _furnish(root: ET.Element, rng: np.random.Generator) -> None:
     assert world is not None
     table = world.find("geom[@name='table']")
     assert table is not None
-    table.attrib |= {"type": "box", "pos": _numbers(TABLE_CENTER_M), "size": _numbers(TABLE_HALF_M)}
+    table.attrib |= {"type": "box", "pos": scene.mjcf(TABLE_CENTER_M), "size": scene.mjcf(TABLE_HALF_M)}
     ET.SubElement(
         world, "geom", {"name": "floor", "type": "plane", "size": "0 0 1", "pos": f"0 0 {FLOOR_Z_M}"}
     )
     add_surroundings(world, rng)
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return " ".join(f"{value:.9g}" for value in values)

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from ddgrasp.files import atomic_write_bytes, user_cache
-from mjx_envs.scene import GRIP_POS_M
+from mjx_envs.scene import GRIP_POS_M, mjcf
 from sensors.charuco_board import CharucoBoard
 
 HAND = "hand"
@@ -41,7 +41,7 @@ def hold(scene: ET.Element, board: CharucoBoard, seed: int) -> None:
     T = held_pose(board, seed)
     T[:3, 3] += GRIP_POS_M
     turn = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
-    place = {"pos": _numbers(T[:3, 3]), "quat": _numbers(turn)}
+    place = {"pos": mjcf(T[:3, 3]), "quat": mjcf(turn)}
     body = ET.SubElement(hand, "body", {"name": _NAME, **place})
     width, height = board.size_m
     corners = " ".join(f"{x} {y} 0" for x, y in ((0, 0), (width, 0), (width, height), (0, height)))
@@ -54,8 +54,8 @@ def hold(scene: ET.Element, board: CharucoBoard, seed: int) -> None:
     ET.SubElement(body, "geom", front | shows)
     back = {
         "type": "box",
-        "size": _numbers((width / 2 + MARGIN_M, height / 2 + MARGIN_M, HALF_THICK_M)),
-        "pos": _numbers((width / 2, height / 2, HALF_THICK_M + 2e-4)),
+        "size": mjcf((width / 2 + MARGIN_M, height / 2 + MARGIN_M, HALF_THICK_M)),
+        "pos": mjcf((width / 2, height / 2, HALF_THICK_M + 2e-4)),
         "rgba": "0.9 0.9 0.9 1",
     }
     ET.SubElement(body, "geom", back | shows)
@@ -68,7 +68,3 @@ def _texture(board: CharucoBoard) -> str:
     path = user_cache("boards") / f"{board.columns}x{board.rows}-{board.dictionary}.png"
     atomic_write_bytes(path, png.tobytes())
     return str(path.resolve())
-
-
-def _numbers(values) -> str:
-    return " ".join(f"{float(value):.9g}" for value in values)

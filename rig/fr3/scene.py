@@ -11,6 +11,7 @@ import numpy as np
 from ddgrasp import contract
 from mjx_envs.object_spec import ObjectSpec, SlotLayout, check_symmetry, slot_layout
 from mjx_envs.objects import get_object
+from mjx_envs.scene import mjcf
 
 OBJECT_BODY, OBJECT_JOINT = "object", "object_free"
 TABLE, TABLE_RGBA = "table", "0.55 0.5 0.45 1"
@@ -50,7 +51,7 @@ def primitive(name: str) -> SceneObject:
     """One of the project's own objects. Raises UserError for an unknown name."""
     spec = get_object(name)
     layout = slot_layout([spec])
-    inertia = _numbers(spec.inertia_kg_m2())
+    inertia = mjcf(spec.inertia_kg_m2())
     inertial = f'<inertial mass="{spec.mass_kg}" pos="0 0 0" diaginertia="{inertia}"/>'
     geoms = inertial + _slot_geoms(spec, layout)
     grasp = {"grasp_offset_m": spec.grasp_offset_m, "grasp_symmetry": spec.grasp_symmetry}
@@ -63,19 +64,19 @@ def meshed(name: str) -> SceneObject:
 
     body = make_body(name)
     xx, yy, zz, xy, xz, yz = body.inertia_kg_m2[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    inertia = _numbers((xx, yy, zz, xy, xz, yz))
+    inertia = mjcf((xx, yy, zz, xy, xz, yz))
     geoms = [f'<inertial mass="{body.mass_kg}" pos="0 0 0" fullinertia="{inertia}"/>']
     assets = []
     for surface in body.surfaces:
         mesh = f"{OBJECT_BODY}_{surface.name}"
-        vertices, faces = _numbers(surface.vertices_m.ravel()), " ".join(map(str, surface.faces.ravel()))
+        vertices, faces = mjcf(surface.vertices_m.ravel()), " ".join(map(str, surface.faces.ravel()))
         assets.append(f'<mesh name="{mesh}" vertex="{vertices}" face="{faces}" inertia="shell"/>')
-        look = f'rgba="{_numbers(surface.rgb)} 1" contype="0" conaffinity="0" group="1"'
+        look = f'rgba="{mjcf(surface.rgb)} 1" contype="0" conaffinity="0" group="1"'
         geoms.append(f'<geom name="{mesh}" type="mesh" mesh="{mesh}" {look} mass="0"/>')
-    touching = _touching(body.friction, _numbers(CONTACT_SOLREF))
+    touching = _touching(body.friction, mjcf(CONTACT_SOLREF))
     for i, vertices_m in enumerate(body.convex_m):
         mesh = f"{OBJECT_BODY}_contact{i}"
-        assets.append(f'<mesh name="{mesh}" vertex="{_numbers(vertices_m.ravel())}"/>')
+        assets.append(f'<mesh name="{mesh}" vertex="{mjcf(vertices_m.ravel())}"/>')
         geoms.append(f'<geom name="{mesh}" type="mesh" mesh="{mesh}" group="3" mass="0" {touching}/>')
     grasp = {"grasp_offset_m": body.grasp_offset_m, "grasp_symmetry": body.grasp_symmetry}
     return SceneObject(name, "".join(geoms), body.rest_height_m, "".join(assets), **grasp)
@@ -122,7 +123,7 @@ def start_pose(rng: np.random.Generator) -> tuple[tuple[float, float], float]:
 
 
 def _object(thing: SceneObject, xy_m: tuple[float, float], yaw_rad: float) -> ET.Element:
-    place = f'pos="{_numbers((*xy_m, thing.rest_height_m))}" euler="0 0 {yaw_rad}"'
+    place = f'pos="{mjcf((*xy_m, thing.rest_height_m))}" euler="0 0 {yaw_rad}"'
     free = f'<freejoint name="{OBJECT_JOINT}"/>'
     return ET.fromstring(f'<body name="{OBJECT_BODY}" {place}>{free}{thing.geoms_xml}</body>')
 
@@ -136,8 +137,8 @@ def _slot_geoms(spec: ObjectSpec, layout: SlotLayout) -> str:
         if max(size) <= _HIDDEN_M:
             continue
         contact = touching if name in layout.colliding_names else 'contype="0" conaffinity="0"'
-        shape = f'type="{kind}" size="{_numbers(size)}" pos="{_numbers(pos)}" quat="{_numbers(quat)}"'
-        geoms += f'<geom name="{name}" {shape} mass="0" rgba="{_numbers(rgb)} 1" {contact}/>'
+        shape = f'type="{kind}" size="{mjcf(size)}" pos="{mjcf(pos)}" quat="{mjcf(quat)}"'
+        geoms += f'<geom name="{name}" {shape} mass="0" rgba="{mjcf(rgb)} 1" {contact}/>'
     return geoms
 
 
@@ -149,15 +150,11 @@ def _clutter(world: ET.Element, index: int, rng: np.random.Generator) -> None:
     """A box or a cylinder that stands on the table beside the workspace; sides alternate."""
     half = rng.uniform((0.02, 0.02, 0.02), (0.05, 0.05, 0.07))
     x, y = rng.uniform(*CLUTTER_X_M), rng.uniform(*CLUTTER_Y_M) * (-1) ** index
-    rgba = f"{_numbers(rng.uniform(0.2, 0.8, 3))} 1"
+    rgba = f"{mjcf(rng.uniform(0.2, 0.8, 3))} 1"
     _box(world, f"clutter{index}", (x, y, half[2]), half, rgba, "box" if index < 2 else "cylinder")
 
 
 def _box(parent: ET.Element, name: str, center_m, half_m, rgba: str, kind: str = "box") -> None:
     size = half_m if kind == "box" else (half_m[0], half_m[2])
-    geom = {"name": name, "type": kind, "pos": _numbers(center_m), "size": _numbers(size), "rgba": rgba}
+    geom = {"name": name, "type": kind, "pos": mjcf(center_m), "size": mjcf(size), "rgba": rgba}
     ET.SubElement(parent, "geom", geom)
-
-
-def _numbers(values) -> str:
-    return " ".join(f"{float(value):.9g}" for value in values)
