@@ -1,6 +1,6 @@
 """The trained teacher as a function from observation to action: in NumPy for the rig, in JAX for batches."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
@@ -64,11 +64,7 @@ def save(path: Path, normalizer: Normalizer, policy_params: Mapping[str, Any]) -
 
 def from_learner(normalizer: Normalizer, policy_params: Mapping[str, Any]) -> TeacherPolicy:
     """The policy of a learner's current parameters; works on traced arrays."""
-    layers = policy_params["params"]
-    ordered = [layers[f"hidden_{i}"] for i in range(len(layers))]
-    return TeacherPolicy(
-        normalizer.mean, normalizer.std, [(layer["kernel"], layer["bias"]) for layer in ordered]
-    )
+    return _policy(normalizer.mean, normalizer.std, policy_params["params"])
 
 
 def find(directory: Path | str) -> Path:
@@ -93,8 +89,9 @@ def load_state(directory: Path | str) -> dict:
 def load(directory: Path | str) -> TeacherPolicy:
     """The teacher in a stage directory, a run directory or a pretrained folder."""
     state = load_state(directory)
-    ordered = [state["layers"][f"hidden_{i}"] for i in range(len(state["layers"]))]
-    return TeacherPolicy(state["mean"], state["std"], [(layer["kernel"], layer["bias"]) for layer in ordered])
+    return _policy(state["mean"], state["std"], state["layers"])
 
 
-load_policy: Callable[[Path | str], TeacherPolicy] = load
+def _policy(mean: AnyArray, std: AnyArray, layers: Mapping[str, Any]) -> TeacherPolicy:
+    ordered = [layers[f"hidden_{i}"] for i in range(len(layers))]
+    return TeacherPolicy(mean, std, [(layer["kernel"], layer["bias"]) for layer in ordered])

@@ -69,7 +69,7 @@ def test_contacts_dropped_are_kept_and_shown_and_were_not_always(teacher):
 
 
 def test_the_command_says_how_many_contacts_were_dropped(teacher, monkeypatch, capsys):
-    monkeypatch.setattr("ppo.policy.load_policy", lambda directory: None)
+    monkeypatch.setattr("ppo.policy.load", lambda directory: None)
     measured = [("cpu", result(96, 100)), ("jax", result(45, 50, dropped=1313))]
     monkeypatch.setattr("ppo.backends.evaluate_backends", lambda *_: iter(measured))
     TeacherCompare(teacher.parent).run()

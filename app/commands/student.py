@@ -45,7 +45,7 @@ class StudentEval:
         from evaluation import wilson
         from evaluation.report.summary import perceived
         from learning.params import load_params
-        from ppo.policy import load_policy
+        from ppo import policy as teacher_policy
         from student_jax.depth_source import make_source
         from student_jax.evaluate import closed_loop
         from student_jax.policy import PARAMS_FILE
@@ -54,7 +54,7 @@ class StudentEval:
         config = replace(config, seed=self.seed, evaluation=evaluation)
         params = load_params(self.run_dir / "student" / PARAMS_FILE)
         source = make_source(config, self.run_dir / "ddg")
-        teacher = load_policy(self.run_dir / "teacher")
+        teacher = teacher_policy.load(self.run_dir / "teacher")
         result = closed_loop(config, teacher, source, params, Progress(name="student eval"))
         for name, counts in result.items():
             success = counts["success"]

@@ -83,11 +83,11 @@ class TeacherEval:
         check_folder("--out", self.out or directory)
         from ddgrasp.progress import Progress
         from mjx_envs.grasp_env import GraspEnv
+        from ppo import policy as teacher_policy
         from ppo import trials
-        from ppo.policy import load_policy
         from ppo.visible import MOMENTS
 
-        env, policy = GraspEnv(self.world), load_policy(directory)
+        env, policy = GraspEnv(self.world), teacher_policy.load(directory)
         progress = Progress(name="teacher eval")
         result, pictures = trials.measure(env, policy, self.trials, self.watched, self.seed, progress)
         summary = teacher_trials.summarise(result, teacher, self.world, self.seed)
@@ -116,10 +116,10 @@ class TeacherCompare:
         _check_own(directory, "copy it and name the copy")
         from evaluation import backends as measured
         from evaluation import wilson
+        from ppo import policy as teacher_policy
         from ppo.backends import evaluate_backends
-        from ppo.policy import load_policy
 
-        policy = load_policy(directory)
+        policy = teacher_policy.load(directory)
         for name, result in evaluate_backends(config.world, policy, self.backends, self.trials, self.seed):
             success = wilson.success(result["success"]["successes"], result["success"]["n"])
             dropped = f"{result['contacts_dropped']:,} contacts dropped"
