@@ -99,11 +99,6 @@ class ReflexServer(FrankaRobotServer):
         self._post_process_commands()
 
     @property
-    def contact_torque_nm(self) -> tuple[float, ...]:
-        """(7,) N m that contacts exert on the joints, filtered; what the thresholds are compared with."""
-        return tuple(self._torque_nm.tolist())
-
-    @property
     def robot_state(self) -> FrankaRobotState:
         """See franky-sim; with what the arm touches and the error that stands.
 

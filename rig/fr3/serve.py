@@ -127,17 +127,13 @@ class Rig:
     def _state(self) -> dict[str, Any]:
         data, server = self._sim.data, self._server.robot_server
         assert data is not None
-        body = data.body(scene.OBJECT_BODY)
         return {
             "time_s": data.time,
             "qpos": data.qpos.tolist(),
             "q_rad": list(self._robot.inner_state.q),
-            "width_m": self._robot.hand_width,
-            "object_position_m": body.xpos.tolist(),
-            "object_quat": body.xquat.tolist(),
+            "object_position_m": data.body(scene.OBJECT_BODY).xpos.tolist(),
             "error": server.error,
             "in_motion": bool(server.current_motion_id),
-            "contact_torque_nm": server.contact_torque_nm,
         }
 
     def _place(self, x_m: float, y_m: float, yaw_rad: float) -> dict[str, Any]:
