@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +72,8 @@ class Generator:
             spacing = "quadratic"
         sampling = replace(config.sampling, sampler=sampler, steps=steps, spacing=spacing)
         config = replace(config, sampling=sampling)
-        params = load_params(file, jax.eval_shape(partial(_init_shapes, config)))
+        shapes = jax.eval_shape(partial(init_params, config), jax.random.key(0))
+        params = load_params(file, shapes)
         return cls(config, params, make_prior(config))
 
     def on_devices(self, sharding: NamedSharding) -> Params:
@@ -87,10 +87,6 @@ class Generator:
     def save(self, directory: Path | str) -> None:
         """Writes a fitted network's parameters; the manifest, written by the stage, makes them loadable."""
         save_params(Path(directory) / PARAMS_FILE, self.params)
-
-
-def _init_shapes(config: DDGConfig) -> Any:
-    return init_params(config, jax.random.key(0))
 
 
 # --- noise shared between the frames of an episode ------------------------------------------------

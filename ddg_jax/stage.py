@@ -119,13 +119,11 @@ def _score(generator: Generator, frames: data.Frames, progress: Progress) -> dic
     if progress.directory is not None:
         _write_png(progress.directory / "samples.png", few)
     return {
-        **{
-            name: {
-                **hole_statistics(panels[name], frames.stretch),
-                **deviation_statistics(panels[name], frames.surface_m),
-            }
-            for name in ("recorded", "generated")
+        name: {
+            **hole_statistics(panels[name], frames.stretch),
+            **deviation_statistics(panels[name], frames.surface_m),
         }
+        for name in ("recorded", "generated")
     }
 
 

@@ -19,7 +19,7 @@ from ddgrasp import contract, machine, upgrades
 from ddgrasp.config import Config
 from ddgrasp.config.checks import has_sections
 from ddgrasp.errors import UserError
-from ddgrasp.files import TEMPORARY, atomic_write_json, read_json, to_json
+from ddgrasp.files import TEMPORARY, atomic_write_json, read_json, to_json, to_tuples
 from ddgrasp.stages import INDIFFERENT, config_fields, get_stage
 from ddgrasp.versions import library_versions
 
@@ -350,14 +350,10 @@ def _dataclass_from_json(cls: type, value: Mapping[str, Any], name: str) -> Any:
     arguments = {
         key: _dataclass_from_json(types[key], item, f"{name}.{key}")
         if dataclasses.is_dataclass(types[key])
-        else _to_tuple(item)
+        else to_tuples(item)
         for key, item in value.items()
     }
     return cls(**arguments)
-
-
-def _to_tuple(value: Any) -> Any:
-    return tuple(_to_tuple(item) for item in value) if isinstance(value, list) else value
 
 
 def _relevant(config: Mapping[str, Any], stage: str) -> dict[str, Any]:

@@ -187,6 +187,11 @@ def to_png(figure: "matplotlib.figure.Figure", dpi: int = 100) -> bytes:
     return buffer.getvalue()
 
 
+def to_tuples(value: Any) -> Any:
+    """A list that was read from JSON as the tuple that it was, with those in it; anything else as it is."""
+    return tuple(to_tuples(item) for item in value) if isinstance(value, list) else value
+
+
 def _fsync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:

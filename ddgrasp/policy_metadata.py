@@ -11,6 +11,7 @@ from ddgrasp import contract
 from ddgrasp.config import DEPTH_DTYPES, Config, ExportConfig, StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
+from ddgrasp.files import to_tuples
 
 STATE_LAYOUT = "q7 rad + gripper width m + its change since the control step before m"
 REMEDY = "make one with `ddgrasp export`"
@@ -147,7 +148,7 @@ def validate(properties: Mapping[str, str], source: str = "The ONNX file") -> Po
     ]
     if missing:
         raise UserError(f"{source} has metadata without {missing[0]!r}: {REMEDY}.")
-    values = {name: _tuples(raw[name]) for name in names}
+    values = {name: to_tuples(raw[name]) for name in names}
     metadata = PolicyMetadata(**values)
     _check_values(metadata, source)
     return metadata
@@ -185,10 +186,6 @@ def _parse(text: str, source: str) -> dict[str, Any]:
     if not isinstance(raw, dict):
         raise UserError(f"{source} has metadata {text[:40]!r}, expected a JSON object: {REMEDY}.")
     return raw
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 def _check_values(metadata: PolicyMetadata, source: str) -> None:

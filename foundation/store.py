@@ -20,7 +20,6 @@ CHECKPOINT = "variables"
 WEIGHTS_DIR = Path("weights")
 """Where converted weights go and are looked for, unless told otherwise."""
 FORMAT_VERSION = 1
-_READ_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -65,10 +64,12 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR) -> Path:
     _check_relative(file, network)
     variables = convert(network, arrays)
     entry = catalog.get_entry(network)
+    with file.open("rb") as opened:
+        digest = hashlib.file_digest(opened, "sha256")
     manifest = WeightsManifest(
         network=network,
         source_file=file.name,
-        source_sha256=_sha256(file),
+        source_sha256=digest.hexdigest(),
         licence=entry.licence,
         published=entry.published,
         parameters=_count(variables["params"]),
@@ -188,11 +189,3 @@ def _restore(path: Path, shapes: dict[str, Any]) -> dict[str, Any]:
 
 def _count(tree: dict[str, Any]) -> int:
     return sum(_count(value) if isinstance(value, dict) else int(value.size) for value in tree.values())
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while part := file.read(_READ_BYTES):
-            digest.update(part)
-    return digest.hexdigest()
