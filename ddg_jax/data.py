@@ -19,7 +19,7 @@ from ddgrasp.depth import crop_nearest, inverse_depth, window
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import memory
-from sensors.recordings.recording import Recording, depth_picture_count, find_recordings, is_recording
+from sensors.recordings.recording import Recording, depth_picture_count, find_recordings, recording_folders
 from sensors.statistics.holes import fill_from_background, smooth_surface
 from sensors.statistics.planes import on_planes
 
@@ -237,8 +237,7 @@ def _folders(root: Path) -> list[Path]:
     """Recordings at or directly below `root`, by name; `root` itself, for its error, if there are none."""
     if (root / artifacts.MANIFEST).exists():
         artifacts.read_manifest(root)
-    below = root.iterdir() if root.is_dir() and not (root / "depth").is_dir() else ()
-    return sorted(p for p in below if is_recording(p) and not p.name.startswith(".")) or [root]
+    return (recording_folders(root) if root.is_dir() else []) or [root]
 
 
 def _read(
