@@ -16,10 +16,10 @@ from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text, read_json, to_json
 from ddgrasp.job import start_of
+from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.progress import Progress
 from ddgrasp.stages import get_stage
 from ddgrasp.versions import library_versions
-from deploy.policy import POLICY_FILE
 from evaluation import rig_trials
 from evaluation.rig_trials import Series
 from evaluation.table2 import results

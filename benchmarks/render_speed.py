@@ -63,7 +63,7 @@ def random_scenes(config: Config) -> tuple[mujoco.MjModel, list[mujoco.MjData]]:
     half = np.array(contract.WORKSPACE_SIZE_M) / 2
     for _ in range(SCENES):
         data = mujoco.MjData(model)
-        data.qpos[QPOS.arm] = np.array(scene.HOME_RAD) + 0.3 * rng.uniform(-1, 1, scene.N_ARM)
+        data.qpos[QPOS.arm] = np.array(contract.HOME_RAD) + 0.3 * rng.uniform(-1, 1, scene.N_ARM)
         data.qpos[QPOS.object_pos][:2] = np.array(contract.WORKSPACE_CENTER_M) + half * rng.uniform(-1, 1, 2)
         mujoco.mj_forward(model, data)
         scenes.append(data)

@@ -25,12 +25,11 @@ from sensors.inpainting import inpainted
 
 Make = Callable[[np.ndarray], np.ndarray]
 """Sensed depth (T, H, W) metres -> geometry, the same."""
-INPAINT_RADIUS_PX = 3.0
 
 
 def telea(depth_m: np.ndarray) -> np.ndarray:
     """Inpainted."""
-    return to_metres(inpainted(to_millimetres(depth_m), INPAINT_RADIUS_PX))
+    return to_metres(inpainted(to_millimetres(depth_m)))
 
 
 WAYS: dict[str, Make] = {

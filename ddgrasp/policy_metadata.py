@@ -13,6 +13,8 @@ from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
 from ddgrasp.files import to_tuples
 
+POLICY_FILE = "policy.onnx"
+"""As the stage `export` names it."""
 STATE_LAYOUT = "q7 rad + gripper width m + its change since the control step before m"
 REMEDY = "make one with `ddgrasp export`"
 _DIGITS = 12

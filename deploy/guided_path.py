@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from ddgrasp import contract
+from ddgrasp.contract import HOME_RAD
 from deploy.calibration.poses import reach
 from deploy.safety import SafetyLimits
 from mjx_envs import grasp_math, kinematics
-from mjx_envs.scene import HOME_RAD
 from rig.fr3.scene import SceneObject
 
 STEP_RAD, TOUCH_STEP_RAD = 0.07, 0.03

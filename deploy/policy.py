@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32
 
 from ddgrasp import artifacts, contract
 from ddgrasp import policy_metadata as metadata
+from ddgrasp.config.deploy import START_NOISES
 from ddgrasp.depth import to_metres
 from ddgrasp.errors import UserError
 from ddgrasp.gripper import ClosingLatch, WidthChange
@@ -17,9 +18,6 @@ from ddgrasp.onnx_runtime import ort
 from ddgrasp.shipped import shipped
 from deploy.interfaces import Depth
 
-POLICY_FILE = "policy.onnx"
-"""As the stage `export` names it."""
-NOISES = ("zero", "normal")
 LEAST_VALID = 0.02
 """Share of a frame's pixels: with fewer something is over the lens, or nearer than the camera sees."""
 PLAUSIBLE_MEDIAN_M = (0.05, 20.0)
@@ -62,8 +60,8 @@ class OnnxPolicy:
         Raises:
             UserError: no such file, a folder, not ONNX, not ours, or of another contract.
         """
-        if noise not in NOISES:
-            raise UserError(f"noise is {noise!r}; expected one of {', '.join(NOISES)}.")
+        if noise not in START_NOISES:
+            raise UserError(f"noise is {noise!r}; expected one of {', '.join(START_NOISES)}.")
         self.path = shipped(path)
         self._session = _open(self.path)
         self.info = _metadata(self._session, self.path)
@@ -232,7 +230,7 @@ def _open(path: Path) -> ort.InferenceSession:
 def _file_in(folder: Path) -> Path:
     """The policy in a run's folder or in its stage's."""
     export = folder / "export"
-    return (export if export.is_dir() else folder) / POLICY_FILE
+    return (export if export.is_dir() else folder) / metadata.POLICY_FILE
 
 
 def _remedy(path: Path) -> str:

@@ -12,9 +12,9 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes, to_json
 from ddgrasp.job import Job
+from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.progress import Progress
 from ddgrasp.trained import trained_objects
-from deploy.policy import POLICY_FILE
 from deploy.timing import Timings
 from deploy.trial_log import TrialLog
 from deploy.trials import RULES, TrialResult, lasting, plan, run_trials, tried

@@ -32,7 +32,7 @@ def look(spec: ObjectSpec) -> Buffers:
     model = scene.build_model(layout=layout)
     scene.fill_slots(model, spec, layout)
     data = mujoco.MjData(model)
-    data.qpos[QPOS.arm] = scene.HOME_RAD
+    data.qpos[QPOS.arm] = contract.HOME_RAD
     data.qpos[QPOS.object_pos] = (*contract.WORKSPACE_CENTER_M, spec.rest_height_m)
     data.qpos[QPOS.object_quat] = kinematics.quat_about_z(np.asarray(YAW_RAD))
     mujoco.mj_kinematics(model, data)

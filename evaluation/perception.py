@@ -17,9 +17,9 @@ from ddgrasp.config import Config
 from ddgrasp.depth import to_millimetres
 from ddgrasp.errors import UserError
 from ddgrasp.layout import OBSERVATION
+from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.progress import Progress
 from deploy.changes import Change
-from deploy.policy import POLICY_FILE
 from deploy.trials import Rig
 from evaluation.failure_modes import LIFTED_M, MOVED_M
 from evaluation.rig_trials import Series

@@ -14,13 +14,13 @@ from jaxtyping import Float, UInt8
 
 from ddgrasp import contract, policy_metadata
 from ddgrasp.config import DeployConfig
+from ddgrasp.contract import HOME_RAD
 from ddgrasp.presets import get_preset
 from deploy import kinematics
 from deploy.calibration import poses
 from deploy.devices.fr3_imager import nominal_lens
 from deploy.setup import safety_filter
 from mjx_envs.camera import Camera, look_at, nominal_camera
-from mjx_envs.scene import HOME_RAD
 from rig.film import colored
 from rig.fr3 import scene
 from rig.fr3.board import held_pose, hold

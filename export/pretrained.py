@@ -7,9 +7,10 @@ from pathlib import Path
 
 from ddgrasp import artifacts
 from ddgrasp.files import atomic_write_bytes
+from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.progress import Progress
 from ddgrasp.shipped import PRETRAINED
-from export.stage import POLICY_FILE, export_policy, load_student, measure
+from export.stage import export_policy, load_student, measure
 
 
 def write(student: Path = PRETRAINED / "student") -> Path:

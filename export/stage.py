@@ -12,12 +12,11 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.job import Job
-from ddgrasp.policy_metadata import describe_run
+from ddgrasp.policy_metadata import POLICY_FILE, describe_run
 from ddgrasp.progress import Progress
 from ddgrasp.versions import project_version
 from export import graph, parity
 
-POLICY_FILE = "policy.onnx"
 BATCH = 4
 BATCH_ONE_CHECKS = 4
 
@@ -32,7 +31,7 @@ def run(job: Job) -> Artifact:
     config, student = job.config, job.parents["student"]
     params = load_student(student.directory)
     model = export_policy(config, params, student.hash)
-    job.progress.note(f"policy.onnx: {len(model) / 1e6:.1f} MB")
+    job.progress.note(f"{POLICY_FILE}: {len(model) / 1e6:.1f} MB")
     frames = demo_frames(student.directory.parent / "demos", config)
     metrics = measure(config, params, model, frames, job.progress)
     atomic_write_bytes(job.directory / POLICY_FILE, model)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.config import RandomConfig
-from mjx_envs import kinematics, scene
+from mjx_envs import kinematics
 
 
 class Units(NamedTuple):
@@ -78,7 +78,7 @@ def start_qpos(
       rest_height_m: () of its origin.
     """
     limits = xp.asarray(contract.JOINT_LOWER_RAD), xp.asarray(contract.JOINT_UPPER_RAD)
-    q_arm = xp.clip(xp.asarray(scene.HOME_RAD) + config.joint_rad * joints, *limits)
+    q_arm = xp.clip(xp.asarray(contract.HOME_RAD) + config.joint_rad * joints, *limits)
     half = xp.asarray(contract.WORKSPACE_SIZE_M) / 2
     place = xp.asarray(contract.WORKSPACE_CENTER_M) + half * xy
     fingers = xp.full(2, contract.GRIPPER_MAX_WIDTH_M / 2)

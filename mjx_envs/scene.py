@@ -69,8 +69,6 @@ FINGER_POS_M = (0.0, 0.0, 0.0584)
 GRIP_POS_M = (0.0, 0.0, 0.1034)
 """Site between the finger pads, in the hand frame; z points out of the hand, fingers open along y."""
 
-HOME_RAD = contract.HOME_RAD
-
 ARM_GAIN_NM_RAD = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)
 """Stiffness of libfranka's internal joint impedance controller in its examples."""
 ARM_DAMPING_NMS_RAD = (140.0, 140.0, 120.0, 110.0, 60.0, 50.0, 50.0)

@@ -11,12 +11,11 @@ from ddgrasp import contract
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import ExportConfig, HeadConfig, StudentConfig
 from deploy.interfaces import CameraError, Clock, Frame, RobotState
-from mjx_envs import scene
 
 PROFILE = contract.D455.scaled(1 / 80)
 """16 x 9 pixels."""
 SHAPE = (PROFILE.height_px, PROFILE.width_px)
-HOME_RAD = np.array(scene.HOME_RAD)
+HOME_RAD = np.array(contract.HOME_RAD)
 
 
 def describe(

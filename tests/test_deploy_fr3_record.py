@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ddgrasp import contract, policy_metadata
+from ddgrasp.contract import HOME_RAD
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
@@ -19,7 +20,6 @@ from deploy.interfaces import RobotError
 from deploy.safety import SafetyFilter
 from deploy.setup import safety_filter
 from deploy_support import KinematicRobot, ScriptedCamera, depth_mm
-from mjx_envs.scene import HOME_RAD
 from rig.fr3.scene import primitive
 from sensors.recordings.recording import find_recordings
 

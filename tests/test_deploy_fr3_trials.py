@@ -15,6 +15,7 @@ import franky
 from franky_sim.mujoco_simulator import MujocoSimulator
 
 from ddgrasp import contract
+from ddgrasp.contract import HOME_RAD
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
@@ -30,7 +31,6 @@ from evaluation import rig_trials
 from evaluation.rig_trials import Series
 from mjx_envs.camera import Camera, nominal_camera
 from mjx_envs.objects import get_object
-from mjx_envs.scene import HOME_RAD
 from rig import seeds
 from rig.fr3 import scene
 from rig.fr3.picture import of_scene

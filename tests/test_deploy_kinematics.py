@@ -19,7 +19,7 @@ def test_stretched_arm_by_hand():
 
 
 def test_first_joint_turns_everything_about_the_base():
-    q = np.array(scene.HOME_RAD)
+    q = np.array(contract.HOME_RAD)
     x, y, z = kinematics.grip_position(q)
     q[0] += np.pi / 2
     np.testing.assert_allclose(kinematics.grip_position(q), (-y, x, z), atol=1e-12)

@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ddgrasp import contract, policy_metadata
+from ddgrasp.contract import HOME_RAD
 from ddgrasp.presets import get_preset
 from deploy import kinematics
 from deploy.calibration.poses import reach
 from deploy.safety import NonFiniteAction, SafetyFilter, SafetyLimits
 from deploy.setup import safety_filter
-from mjx_envs.scene import HOME_RAD
 
 HOME = np.array(HOME_RAD)
 FREE = SafetyLimits(

@@ -15,12 +15,13 @@ import pytest
 from app.commands import parse, play
 from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
+from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.shipped import PRETRAINED
 from deploy import viewers
 from deploy.devices.rig_camera import StereoCamera
 from deploy.interfaces import Frame, RobotState
 from deploy.loop import Step
-from deploy.policy import POLICY_FILE, OnnxPolicy
+from deploy.policy import OnnxPolicy
 from deploy.video import ANIMATION_PANEL_PX, FAR_MM, NEAR_MM, PANEL_PX, VERDICT_S, Video, depth_picture
 from deploy.viewers import MujocoWindow, Rerun
 from rig.film import INVALID_RGB

@@ -10,8 +10,8 @@ import pytest
 from app import cli
 from ddgrasp import artifacts
 from ddgrasp.layout import OBSERVATION
+from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.presets import PRESETS
-from deploy.policy import POLICY_FILE
 from deploy.trials import drawn
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import perception, perception_table, rig_trials

@@ -13,10 +13,11 @@ from app import table2
 from ddgrasp import artifacts
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from deploy import treatment
-from deploy.policy import POLICY_FILE, OnnxPolicy
+from deploy.policy import OnnxPolicy
 from deploy.trial_log import read_log
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import rig_trials

@@ -24,8 +24,9 @@ from ddgrasp.config.student import Conditioning
 from ddgrasp.errors import UserError
 from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION
+from ddgrasp.policy_metadata import POLICY_FILE
 from demos.rollout import Scene
-from deploy.policy import POLICY_FILE, OnnxPolicy
+from deploy.policy import OnnxPolicy
 from export import graph, parity
 from learning.diffusion import q_sample
 from student_jax import policy

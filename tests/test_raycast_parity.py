@@ -59,7 +59,7 @@ def _robot(seed: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
     model = scene.build_model()
     model.vis.quality.numslices = model.vis.quality.numstacks = 128
     data = mujoco.MjData(model)
-    data.qpos[: scene.N_ARM] = np.array(scene.HOME_RAD) + rng.uniform(-0.4, 0.4, scene.N_ARM)
+    data.qpos[: scene.N_ARM] = np.array(contract.HOME_RAD) + rng.uniform(-0.4, 0.4, scene.N_ARM)
     mujoco.mj_forward(model, data)
     return model, data
 

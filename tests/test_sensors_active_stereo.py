@@ -236,7 +236,7 @@ def rig_frames() -> np.ndarray:
 
     model = scene.build_model()
     data = mujoco.MjData(model)
-    data.qpos[:7], data.qpos[7:9] = scene.HOME_RAD, 0.04
+    data.qpos[:7], data.qpos[7:9] = contract.HOME_RAD, 0.04
     data.qpos[9:16] = 0.5, 0.0, 0.025, 1, 0, 0, 0
     mujoco.mj_forward(model, data)
     camera = RigCamera(model, StereoConfig(), PROFILE)

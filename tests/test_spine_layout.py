@@ -56,7 +56,7 @@ def test_the_contracts_parts_are_made_of_whole_ones():
 def test_an_observation_has_its_parts_where_they_are_named(xp):
     rng = np.random.default_rng(0)
     quat = kinematics.quat_about_z(np.asarray(0.7))
-    qpos = np.concatenate([scene.HOME_RAD, (0.03, 0.02), (0.5, -0.1, 0.2), quat])
+    qpos = np.concatenate([contract.HOME_RAD, (0.03, 0.02), (0.5, -0.1, 0.2), quat])
     qvel = rng.normal(size=scene.NV)
     seen = grasp_math.observation(*map(xp.asarray, (qpos, qvel)), xp.asarray(4), 0.0, np.log(3), xp)
     grip_pos, grip_quat = kinematics.grip_pose(qpos[QPOS.arm])

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from mjx_envs import grasp_math, kinematics, scene
+from ddgrasp import contract
+from mjx_envs import grasp_math, kinematics
 from ppo.policy import TeacherPolicy
 
 
 def test_a_wrong_shape_or_kind_is_noticed():
-    qpos = np.concatenate([scene.HOME_RAD, np.zeros(2)])
+    qpos = np.concatenate([contract.HOME_RAD, np.zeros(2)])
     assert kinematics.grip_pose(qpos[:7])[0].shape == (3,)
     with pytest.raises(TypeCheckError, match="grip_pose"):
         kinematics.grip_pose(qpos)

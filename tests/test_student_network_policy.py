@@ -11,7 +11,7 @@ import pytest
 from ddgrasp import contract
 from ddgrasp.config import StudentConfig
 from ddgrasp.errors import UserError
-from mjx_envs import kinematics, scene
+from mjx_envs import kinematics
 from mjx_envs.camera import nominal_camera
 from student_jax import denoiser, encoder, hand_view, policy, preprocess
 from xla_support import optimized
@@ -143,8 +143,8 @@ def test_a_student_of_before_acts_as_it_did_until_it_listens_to_the_widths_chang
 def test_the_condition_is_joints_then_pose_then_offset_from_the_hand():
     params = policy.init_params(jax.random.key(0), SMALL, PROFILE)
     net = policy.StudentPolicy(SMALL, PROFILE)
-    state = jnp.asarray([[*scene.HOME_RAD, 0.05, -0.01]])
-    hand, _ = kinematics.grip_pose(np.array(scene.HOME_RAD))
+    state = jnp.asarray([[*contract.HOME_RAD, 0.05, -0.01]])
+    hand, _ = kinematics.grip_pose(np.array(contract.HOME_RAD))
     place = policy.position_from_world(jnp.asarray(hand + [0.0, 0.1, -0.05]))
     aux = policy.Aux(place[None], jnp.array([[0.6, 0.8]]), jnp.array([2.0]))
     seen = policy.Seen(jnp.ones((1, policy.feature_count(SMALL))), aux)
@@ -169,8 +169,8 @@ def test_the_hand_view_decides_how_much_the_hand_counts():
     """With the gate open the position is hand + 5 cm * offset, with it closed the raw output."""
     params = policy.init_params(jax.random.key(0), SMALL, PROFILE)
     output = {"kernel": jnp.zeros_like(params["aux_output"]["kernel"])}
-    state = jnp.asarray([[*scene.HOME_RAD, 0.05, -0.01]])
-    hand, _ = kinematics.grip_pose(np.array(scene.HOME_RAD))
+    state = jnp.asarray([[*contract.HOME_RAD, 0.05, -0.01]])
+    hand, _ = kinematics.grip_pose(np.array(contract.HOME_RAD))
     picture = jnp.zeros((1, SMALL.picture.height_px, SMALL.picture.width_px, 6))
     net = policy.StudentPolicy(SMALL, PROFILE)
 

@@ -85,7 +85,7 @@ def test_visible_pixels_are_those_of_the_numpy_ray_caster(env):
     watcher = Watcher(GraspEnv(still))
     model = scene.build_model(layout=env.table.layout)
     data = mujoco.MjData(model)
-    data.qpos[:7] = scene.HOME_RAD
+    data.qpos[:7] = contract.HOME_RAD
     data.qpos[9:12] = (*contract.WORKSPACE_CENTER_M, spec.rest_height_m)
     data.qpos[12:16] = kinematics.quat_about_z(np.asarray(0.4))
     hidden = data.qpos.copy()
@@ -125,7 +125,7 @@ def _nominal_params(env: GraspEnv):
 
 def test_moments_by_hand():
     qpos = np.zeros((9, 16))
-    qpos[:, :7] = scene.HOME_RAD  # the grip point stands 0.26 m above the table
+    qpos[:, :7] = contract.HOME_RAD  # the grip point stands 0.26 m above the table
     height = [0.02, 0.22, 0.1, 0.2, 0.2, 0.2, 0.25, 0.32, 0.4]  # 0.22: 4 cm under the grip, not above
     qpos[:, 11] = height
     touched = np.arange(9) >= 4

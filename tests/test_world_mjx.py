@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from ddgrasp import contract
 from ddgrasp.config import Config, WorldConfig
 from demos.rollout import Roller
 from mjx_envs import scene
@@ -60,7 +61,7 @@ def _random_qpos(model: mujoco.MjModel, count: int) -> np.ndarray:
     """(count, nq): joints around home, the object turned anyhow."""
     rng = np.random.default_rng(0)
     qpos = np.tile(model.qpos0, (count, 1))
-    qpos[:, : scene.N_ARM] = np.array(scene.HOME_RAD) + rng.uniform(-0.3, 0.3, (count, scene.N_ARM))
+    qpos[:, : scene.N_ARM] = np.array(contract.HOME_RAD) + rng.uniform(-0.3, 0.3, (count, scene.N_ARM))
     qpos[:, 12:] = rng.normal(size=(count, 4))
     return qpos
 
@@ -132,7 +133,7 @@ def test_contacts_beyond_the_cap_are_counted():
     layout = SlotLayout(capsules=8)
     physics = JaxPhysics(0.005, 20, layout)
     falling = scene.build_model(layout=layout).qpos0.astype(np.float32)
-    falling[: scene.N_ARM], falling[11] = scene.HOME_RAD, 0.1
+    falling[: scene.N_ARM], falling[11] = contract.HOME_RAD, 0.1
     sunk = falling.copy()
     sunk[11] = -0.2  # 4 contacts of the box, 2 of each capsule
 
@@ -153,7 +154,7 @@ def test_a_ball_beside_a_pads_face_is_touched():
     model = scene.build_model()
     scene.fill_slots(model, OBJECTS["peach"], DEFAULT_SLOTS)
     data = mujoco.MjData(model)
-    data.qpos[: scene.N_ARM], data.qpos[7:9] = scene.HOME_RAD, 0.04
+    data.qpos[: scene.N_ARM], data.qpos[7:9] = contract.HOME_RAD, 0.04
     mujoco.mj_forward(model, data)
     pad, turn = data.geom("left_finger_pad").xpos, data.geom("left_finger_pad").xmat.reshape(3, 3)
     ball = model.geom("slot_capsule0")

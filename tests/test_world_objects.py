@@ -58,7 +58,7 @@ def place(spec: ObjectSpec, layout: SlotLayout | None = None) -> tuple[mujoco.Mj
     scene.fill_slots(model, spec, layout)
     mujoco.mj_setConst(model, data)
     mujoco.mj_resetData(model, data)
-    data.qpos[:9] = data.ctrl[:] = (*scene.HOME_RAD, 0.04, 0.04)
+    data.qpos[:9] = data.ctrl[:] = (*contract.HOME_RAD, 0.04, 0.04)
     data.qpos[9:16] = (*contract.WORKSPACE_CENTER_M, spec.rest_height_m, 1, 0, 0, 0)
     mujoco.mj_forward(model, data)
     return model, data

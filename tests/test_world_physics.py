@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import warp
 
+from ddgrasp import contract
 from ddgrasp.config import RandomConfig
 from ddgrasp.errors import UserError
-from mjx_envs import inverse_kinematics, kinematics, randomize, scene
+from mjx_envs import inverse_kinematics, kinematics, randomize
 from mjx_envs.grasp_math import HAND_DOWN
 from mjx_envs.object_spec import DEFAULT_SLOTS
 from mjx_envs.objects import OBJECTS
@@ -190,7 +191,7 @@ def test_the_experiments_do_what_they_say():
 
 def test_inverse_kinematics_reaches_the_pose():
     position, quat = jnp.array([0.42, 0.15, 0.05]), jnp.array(HAND_DOWN)
-    q = inverse_kinematics.solve(jnp.array(scene.HOME_RAD), position, quat)
+    q = inverse_kinematics.solve(jnp.array(contract.HOME_RAD), position, quat)
     reached, orientation = kinematics.grip_pose(q, jnp)
     np.testing.assert_allclose(reached, position, atol=1e-4)
     assert float(kinematics.angle_between(orientation, quat, jnp)) < 5e-3

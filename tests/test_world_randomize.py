@@ -76,7 +76,7 @@ def sampler(table):
                 "joint_damping": params.joint_damping / scene.JOINT_DAMPING_NMS_RAD,
                 "joint_friction": params.joint_friction,
                 "gain_scale": params.gain_scale,
-                "joints": qpos[:7] - jnp.asarray(scene.HOME_RAD),
+                "joints": qpos[:7] - jnp.asarray(contract.HOME_RAD),
                 "fingers": qpos[7:9],
                 "camera_position": randomize.sample_camera(k_camera, config, CAMERA)[:3, 3] - CAMERA[:3, 3],
                 "camera_angle": jnp.stack([turn[2, 1], turn[0, 2], turn[1, 0]]),
@@ -137,7 +137,7 @@ def test_ranges_are_drawn_independently(sampler):
 def test_an_arm_starts_within_its_limits_however_far_from_home():
     config = RandomConfig(joint_rad=1.0)
     qpos = draws.start_qpos(config, -np.ones(7), np.zeros(2), np.zeros(()), 0.02)
-    home, limits = np.array(scene.HOME_RAD), np.array(contract.JOINT_LOWER_RAD)
+    home, limits = np.array(contract.HOME_RAD), np.array(contract.JOINT_LOWER_RAD)
     np.testing.assert_allclose(qpos[:7], np.maximum(home - 1.0, limits))
     assert (qpos[:7] > home - 1.0).any()
 
@@ -203,7 +203,7 @@ def test_shares_of_exploring_starts_are_turned_down(exploring):
     state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 400))
     qpos = np.asarray(jax.jit(env.refresh)(state, exploring).info["next"][0].qpos)
     held = qpos[:, QPOS.object_pos][:, 2] > 0.026
-    moved = np.abs(qpos[:, QPOS.arm] - scene.HOME_RAD).max(axis=1) > 1e-6
+    moved = np.abs(qpos[:, QPOS.arm] - contract.HOME_RAD).max(axis=1) > 1e-6
     assert held.mean() == pytest.approx(0.5 * exploring, abs=0.08)
     assert moved[~held].mean() == pytest.approx(0.5 * exploring, abs=0.08)
 
@@ -247,7 +247,7 @@ def test_latency_delays_commands_by_one_step_in_its_share_of_the_episodes():
     path = []
     for action in (bend, -bend, -bend):
         state = step(state, action)
-        path.append(np.asarray(state.data.qpos[:, :9]) - np.append(scene.HOME_RAD, (0.04, 0.04)))
+        path.append(np.asarray(state.data.qpos[:, :9]) - np.append(contract.HOME_RAD, (0.04, 0.04)))
     path = np.stack(path)  # all start alike, far from the cube: only latency tells them apart
     prompt, delayed = path[:, ~late], path[:, late]
     assert np.abs(prompt[0, :, 3]).min() > 0.01 and prompt[0, :, 7].max() < -0.004

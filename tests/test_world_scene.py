@@ -33,7 +33,7 @@ def test_forward_kinematics_equals_mujoco(model):
 
 
 def test_home_holds_the_grip_above_the_table_pointing_down():
-    pos, quat = kinematics.grip_pose(np.array(scene.HOME_RAD))
+    pos, quat = kinematics.grip_pose(np.array(contract.HOME_RAD))
     np.testing.assert_allclose(pos, [0.45, 0.0, 0.26], atol=1e-3)
     down = kinematics.rotate(quat, np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(down, [0.0, 0.0, -1.0], atol=1e-3)

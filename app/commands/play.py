@@ -19,6 +19,7 @@ from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
 from ddgrasp.install import check_fr3, lacks_fr3
+from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.shipped import PRETRAINED
 from deploy.controls import KEYS, Controls, Noise
 
@@ -264,6 +265,4 @@ def _has_display() -> bool:
 
 
 def _pretrained() -> Path:
-    from deploy.policy import POLICY_FILE
-
     return PRETRAINED / "student" / POLICY_FILE

@@ -14,10 +14,11 @@ from ddgrasp import artifacts, contract
 from ddgrasp.config import Camera, Config, Robot
 from ddgrasp.config.checks import Count, Range, Seed
 from ddgrasp.errors import UserError
+from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.presets import get_preset
 from ddgrasp.shipped import NAME, shipped
 
-DEFAULT_POLICY = Path("runs") / DEFAULT_PRESET / "export" / "policy.onnx"
+DEFAULT_POLICY = Path("runs") / DEFAULT_PRESET / "export" / POLICY_FILE
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ class Deploy:
 
 def _check_policy(policy: Path) -> None:
     """UserError that names the student of this project where no policy was given and there is none yet."""
-    there = Path(NAME) / "student" / "policy.onnx"
+    there = Path(NAME) / "student" / POLICY_FILE
     if policy == DEFAULT_POLICY and not policy.exists() and shipped(there).is_file():
         raise UserError(
             f"--policy is {policy}, which does not exist: make one with `ddgrasp export`, or give --policy "

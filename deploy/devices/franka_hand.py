@@ -6,7 +6,6 @@ from typing import Any
 
 from ddgrasp import contract
 
-SPEED_M_S = 0.1
 GRASP_ANY_WIDTH_M = 1.5 * contract.GRIPPER_MAX_WIDTH_M
 """franky's outer tolerance: a grasp of any width counts, as in simulation. More than the whole opening, since
 fingers that something presses apart report a little more than that."""
@@ -111,9 +110,11 @@ class FrankaHand:
             self._busy, close = True, self._wish
         try:
             if close:
-                self._gripper.grasp(0.0, SPEED_M_S, self._force_n, epsilon_outer=GRASP_ANY_WIDTH_M)
+                self._gripper.grasp(
+                    0.0, contract.GRIPPER_SPEED_M_S, self._force_n, epsilon_outer=GRASP_ANY_WIDTH_M
+                )
             else:
-                self._gripper.open(SPEED_M_S)
+                self._gripper.open(contract.GRIPPER_SPEED_M_S)
         except self._errors:
             if not self._changed.is_set():  # not stopped by `set`: the gripper's own trouble
                 raise

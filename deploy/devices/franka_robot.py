@@ -21,7 +21,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.install import pip_install
 from deploy import kinematics
 from deploy.devices import franka_faults
-from deploy.devices.franka_hand import SPEED_M_S, FrankaHand, HandError
+from deploy.devices.franka_hand import FrankaHand, HandError
 from deploy.devices.franka_probe import check_arm, check_hand
 from deploy.devices.franka_spring import FrankaSpring, priority_kept, touched
 from deploy.devices.options import Setup
@@ -222,7 +222,7 @@ class FrankaRobot:
     def _home(self, gripper: Any) -> None:
         """Homed and open: where homing leaves the fingers is the hand's affair. Raises HandError."""
         self._awaited(gripper, "homing", gripper.homing_async)
-        self._awaited(gripper, "opening", lambda: gripper.open_async(SPEED_M_S))
+        self._awaited(gripper, "opening", lambda: gripper.open_async(contract.GRIPPER_SPEED_M_S))
 
     def _awaited(self, gripper: Any, what: str, begin: Callable[[], Any]) -> None:
         """Raises HandError."""

@@ -14,7 +14,7 @@ from typing import Any
 
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
-from deploy.policy import POLICY_FILE
+from ddgrasp.policy_metadata import POLICY_FILE
 from deploy.trial_log import read_log
 from deploy.trials import TrialResult
 from evaluation import paired, rig_trials

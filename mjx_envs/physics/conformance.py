@@ -209,7 +209,7 @@ def grasp_and_lift() -> Scenario:
         branch = grasp_math.yaw_branch(qpos[QPOS.object_quat], symmetry, jnp)
         pose = qpos[QPOS.object_pos], qpos[QPOS.object_quat]
         pos, quat = grasp_math.grasp_pose(*pose, symmetry, branch, jnp, offset)
-        home = jnp.asarray(scene.HOME_RAD)
+        home = jnp.asarray(contract.HOME_RAD)
         at = inverse_kinematics.solve(home, pos, quat)
         return at, inverse_kinematics.solve(at, pos + above, quat)
 
@@ -262,7 +262,7 @@ def _params(names: tuple[str, ...] = OBJECTS_TRIED) -> tuple[ModelParams, np.nda
 
 def _start(places) -> PhysicsState:
     """At rest, arm home, gripper open, objects upright at `places` (B, 3)."""
-    robot = np.tile([*scene.HOME_RAD, *_OPEN], (len(places), 1))
+    robot = np.tile([*contract.HOME_RAD, *_OPEN], (len(places), 1))
     qpos = np.concatenate([robot, places, np.tile([1.0, 0, 0, 0], (len(places), 1))], axis=1)
     return jax.vmap(physics.initial_state)(jnp.asarray(qpos, jnp.float32))
 
@@ -272,7 +272,7 @@ _OPEN = (contract.GRIPPER_MAX_WIDTH_M / 2,) * 2
 
 def _hold(steps: int) -> np.ndarray:
     """(steps, B, 9) commands that hold the arm home."""
-    return np.tile(np.array([*scene.HOME_RAD, *_OPEN], np.float32), (steps, len(OBJECTS_TRIED), 1))
+    return np.tile(np.array([*contract.HOME_RAD, *_OPEN], np.float32), (steps, len(OBJECTS_TRIED), 1))
 
 
 def _substeps(scenario: Scenario) -> int:

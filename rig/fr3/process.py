@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from types import TracebackType
 
+from ddgrasp.contract import HOME_RAD
 from ddgrasp.errors import UserError
 from ddgrasp.install import FR3, check_fr3
-from mjx_envs.scene import HOME_RAD
 from rig.fr3.channel import PORT, Channel
 from rig.fr3.scene import SceneObject
 
