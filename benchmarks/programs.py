@@ -91,7 +91,7 @@ def evaluation_rollout(config: Config) -> Program:
     layers, mean = _teacher_shapes(config)
     mesh, keys = devices.make_mesh(), shape(config.evaluation.teacher_trials, 2, dtype=jnp.uint32)
     start = jax.eval_shape(partial(rollout.begin, env, mesh), keys)
-    return rollout._roll_out, (env, mesh, evaluate.motion_of, layers, mean, mean, start)
+    return rollout.roll_out_from, (env, mesh, evaluate.motion_of, layers, mean, mean, start)
 
 
 def _teacher_shapes(config: Config) -> tuple[list[tuple[Any, Any]], Any]:
@@ -140,7 +140,7 @@ def generator_step(config: Config) -> Program:
 def generator_encode(config: Config) -> Program:
     """A training batch to diffusion space."""
     _, depth = _maps(config, config.ddg.training.batch_size)
-    return data._encode, (config.ddg, depth, depth)
+    return data.encode_batch, (config.ddg, depth, depth)
 
 
 def distil_step(config: Config) -> Program:
@@ -182,15 +182,15 @@ def graft(config: Config) -> Program:
     """Generated maps onto clean depth, an episode's."""
     profile, count = config.world.profile, config.world.episode_steps
     size = (count, profile.height_px, profile.width_px)
-    return sample._graft, (config.ddg, shape(*size), shape(*size, representation.channels(config.ddg)))
+    return sample.graft_maps, (config.ddg, shape(*size), shape(*size, representation.channels(config.ddg)))
 
 
 def camera_model(name: Sensor, config: Config) -> Program:
     """A procedural camera model on a batch of clean pictures."""
-    profile, count = config.world.profile, depth_source._BATCH
+    profile, count = config.world.profile, depth_source.BATCH
     sense = make_sensor(SensorConfig(name=name), profile)
     depth, number = shape(count, profile.height_px, profile.width_px), shape(count, dtype=jnp.int32)
-    return depth_source._sensed, (sense, _key(), depth, None, number, number)
+    return depth_source.sense_batch, (sense, _key(), depth, None, number, number)
 
 
 # --- student --------------------------------------------------------------------------------------

@@ -131,10 +131,10 @@ def timed(name: str, noise: Noise, episodes: Sequence[Episode]) -> Row:
 def measure(episodes: Sequence[Episode], files: Sequence[Path], threads: int) -> None:
     """Prints a line per noise. UserError for fewer blocks of frames than can be resampled."""
     real, sim = ([e for e in episodes if e.side == side] for side in (REAL, SIM))
-    if len(real) < real_score._FEWEST_BLOCKS:
+    if len(real) < real_score.FEWEST_BLOCKS:
         raise UserError(
             f"the frames scored hold {len(real)} run(s) of {2 * BLOCK_FRAMES} of one recording; expected "
-            f"{real_score._FEWEST_BLOCKS} or more: give a larger --score-frames."
+            f"{real_score.FEWEST_BLOCKS} or more: give a larger --score-frames."
         )
     sensed, clean = (to_metres(np.concatenate([getattr(e, n) for e in sim])) for n in _PAIR)
     rows = [Row("none (clean depth)", clean)]

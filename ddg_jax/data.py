@@ -311,7 +311,8 @@ def make_batch(frames: Frames, config: DDGConfig, seed: int, step: int) -> Batch
         -config.prior.jitter, config.prior.jitter, (2, config.training.batch_size, 1, 1)
     )
     c = ((1 + scale) * c + shift).astype(np.float32)
-    return Batch(np.asarray(_encode(config, depth_m, surface_m)), c)
+    return Batch(np.asarray(encode_batch(config, depth_m, surface_m)), c)
 
 
-_encode = jax.jit(encode, static_argnums=0)
+encode_batch = jax.jit(encode, static_argnums=0)
+"""`representation.encode` as one program."""

@@ -255,13 +255,16 @@ def grafted(
     parts = []
     for start in range(0, len(depth_m), size):
         now = slice(start, start + size)
-        made = _graft(config, _batch(depth_m[now], size), _batch(sized[now], size))
+        made = graft_maps(config, _batch(depth_m[now], size), _batch(sized[now], size))
         parts.append([np.asarray(part)[: len(depth_m[now])] for part in made])
     return Generated(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @partial(jax.jit, static_argnums=0)
-def _graft(config: DDGConfig, depth_m: Array, x: Array) -> tuple[Array, Array, Array]:
+def graft_maps(
+    config: DDGConfig, depth_m: Float[Array, "B H W"], x: Float[Array, "B H W C"]
+) -> tuple[Float[Array, "B H W"], Float[Array, "B H W"], Bool[Array, "B H W"]]:
+    """The program of `grafted`: metres, grafted and the generator's own, and the mask of artefacts."""
     predicted = decode(config, x, depth_m)
     return graft(depth_m, predicted.depth_m, predicted.mask), predicted.depth_m, predicted.mask
 

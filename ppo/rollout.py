@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.sharding import Mesh
-from jaxtyping import UInt32
+from jaxtyping import Float, UInt32
 from mujoco_playground import State
 
 from ddgrasp.arrays import AnyArray
@@ -48,7 +48,7 @@ def roll_out(env: GraspEnv, policy: TeacherPolicy, keys: jax.Array | np.ndarray,
     mesh, keys = devices.make_mesh(), np.asarray(keys)
     surplus = -len(keys) % mesh.size  # the devices share evenly: some repeat the last episode
     padded = np.concatenate([keys, np.repeat(keys[-1:], surplus, axis=0)])
-    made = _roll_out(env, mesh, keep, policy.layers, policy.mean, policy.std, begin(env, mesh, padded))
+    made = roll_out_from(env, mesh, keep, policy.layers, policy.mean, policy.std, begin(env, mesh, padded))
     (params, index, success), (running, kept, lost) = jax.tree.map(np.asarray, made)
     first = partial(jax.tree.map, lambda values: values[: len(keys)])
     running, kept, lost = jax.tree.map(lambda values: values[:, : len(keys)], (running, kept, lost))
@@ -65,7 +65,23 @@ def begin(env: GraspEnv, mesh: Mesh, keys: UInt32[AnyArray, "n 2"]) -> State:
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _roll_out(env: GraspEnv, mesh: Mesh, keep: Keep, layers, mean, std, state: State) -> Any:
+def roll_out_from(
+    env: GraspEnv,
+    mesh: Mesh,
+    keep: Keep,
+    layers: list[tuple[AnyArray, AnyArray]],
+    mean: Float[AnyArray, "40"],
+    std: Float[AnyArray, "40"],
+    state: State,
+) -> Any:
+    """The program of `roll_out`: whole episodes of a teacher from N first states on.
+
+    Args:
+      layers: (kernel, bias) of each, as `TeacherPolicy` has them; `mean` and `std` too.
+
+    Returns ((parameters, object, success), (running, kept, contacts dropped)): per episode, and per step of
+    each, as `Rollout` has them.
+    """
     policy = TeacherPolicy(mean, std, layers)
     episode, count = state.info["episode"], len(state.done)
 

@@ -14,12 +14,13 @@ from typing import Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, Key, UInt8, UInt16
+from jaxtyping import Float, Float32, Int, Key, UInt8, UInt16
 
 from ddg_jax.generate import Clip, FrameByFrame, made_mm, noisy_episodes
 from ddg_jax.monocular import MonocularDepth
 from ddg_jax.sample import Generator, filled_up, generate
 from ddg_jax.sensor import make_sensor
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import BY_COLOUR, Config, DextrahConfig, SensorConfig
 from ddgrasp.depth import to_metres, to_millimetres
 from ddgrasp.errors import UserError
@@ -31,7 +32,7 @@ from student_jax.source_check import LEARNED
 
 VIEWED = ("variant", "size", "T_world_cam")
 """What demos say of each episode that its pictures are of (`mjx_envs.views.Views`)."""
-_BATCH = 16
+BATCH = 16
 """Frames that a camera model gets at once: one size, compiled once."""
 
 
@@ -161,8 +162,8 @@ class SenseSource(FrameByFrame):
         """See `DepthSource`."""
         colour = rgb if self.needs_rgb else None
         parts = []
-        for start in range(0, len(depth_mm), _BATCH):
-            now = slice(start, start + _BATCH)
+        for start in range(0, len(depth_mm), BATCH):
+            now = slice(start, start + BATCH)
             batch = (
                 to_metres(depth_mm[now]),
                 None if colour is None else colour[now],
@@ -170,7 +171,7 @@ class SenseSource(FrameByFrame):
                 frame[now],
             )
             count = len(batch[0])
-            sensed = _sensed(self.sense, self.key, *jax.tree.map(partial(filled_up, size=_BATCH), batch))
+            sensed = sense_batch(self.sense, self.key, *jax.tree.map(partial(filled_up, size=BATCH), batch))
             parts.append(np.asarray(sensed)[:count])
         return to_millimetres(np.concatenate(parts))
 
@@ -217,7 +218,17 @@ def check_views(demos: EpisodeStore) -> None:
 
 
 @partial(jax.jit, static_argnums=0)
-def _sensed(sense: Sense, key, depth_m, rgb, episode, frame):
+def sense_batch(
+    sense: Sense,
+    key: Key[jax.Array, ""],
+    depth_m: Float[AnyArray, "B H W"],
+    rgb: UInt8[AnyArray, "B H W 3"] | None,
+    episode: Int[AnyArray, " B"],
+    frame: Int[AnyArray, " B"],
+) -> Float32[jax.Array, "B H W"]:
+    """Depth in metres as a camera model reports it, 0 = hole; a frame's draws depend on (key, episode, frame)
+    alone."""
+
     def one(depth, picture, e, t):
         return sense(jax.random.fold_in(jax.random.fold_in(key, e), t), depth, picture)
 

@@ -30,7 +30,7 @@ APART = (
     "flicker and persistence say nothing."
 )
 
-_FEWEST_BLOCKS = 2
+FEWEST_BLOCKS = 2
 """On either side: resampling needs two."""
 _FEW_BLOCKS = 10
 """With fewer, drawing them again says little of other frames."""
@@ -50,7 +50,7 @@ def run(job: Job) -> Artifact:
 
     config, root = job.config, job.inputs["data"]
     fit_frames, score_frames = job.inputs["fit_frames"], job.inputs["score_frames"]
-    least = _FEWEST_BLOCKS * 2 * score_data.BLOCK_FRAMES
+    least = FEWEST_BLOCKS * 2 * score_data.BLOCK_FRAMES
     if score_frames < least:
         raise UserError(f"--score-frames is {score_frames}; expected {least} or more: two blocks per side.")
     frames = score_data.load_real(root, config.ddg.depth.width_px, score_frames)
@@ -59,10 +59,10 @@ def run(job: Job) -> Artifact:
             f"--fit-frames {fit_frames} and --score-frames {score_frames} of {frames.total} frame(s): "
             "they must not overlap, and fitting needs 2 or more."
         )
-    if len(frames.blocks) < _FEWEST_BLOCKS:
+    if len(frames.blocks) < FEWEST_BLOCKS:
         raise UserError(
             f"--score-frames {score_frames} hold {len(frames.blocks)} run(s) of "
-            f"{2 * score_data.BLOCK_FRAMES} frames of one recording; expected {_FEWEST_BLOCKS} or more: give "
+            f"{2 * score_data.BLOCK_FRAMES} frames of one recording; expected {FEWEST_BLOCKS} or more: give "
             "more frames."
         )
     # Before hours of fitting:
