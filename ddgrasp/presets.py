@@ -119,8 +119,8 @@ DEMO = Config(
     evaluation=EvalConfig(student_trials=30),
     score=ScoreConfig(trajectories=24, kid_subset_size=150, tsne_maps=3000),
 )
-"""For two cores; the student starts from the pretrained one. 28 minutes on two Intel Xeon cores on 2026-11-28
-(docs/results.md)."""
+"""For two cores; the student starts from the pretrained one. 28 minutes on two Intel Xeon cores, 19 on two
+AMD EPYC ones (docs/results.md)."""
 
 LAPTOP = Config(
     preset="laptop",
@@ -137,9 +137,10 @@ LAPTOP = Config(
     ),
     evaluation=EvalConfig(student_trials=60),
 )
-"""Everything trained here on two cores, the teacher from the guide. 81 minutes on two Intel Xeon cores on
-2026-11-28 (docs/results.md). Six plain shapes besides the paper's objects teach a student more than those.
-Demos have no colour, which takes most of their time and which row Monocular of Table II alone needs."""
+"""Everything trained here on two cores, the teacher from the guide. 81 minutes on two Intel Xeon cores,
+50 on two AMD EPYC ones (docs/results.md). Six plain shapes besides the paper's objects teach a student more
+than those. Demos have no colour, which takes most of their time and which row Monocular of Table II alone
+needs."""
 
 _FROM_NOTHING = TeacherConfig(
     start="nothing",

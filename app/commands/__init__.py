@@ -212,8 +212,8 @@ def _described(name: str) -> str:
 
 
 _PRESET_HELP = (
-    "Presets (--preset): debug (tests), demo (28 minutes on two cores), laptop (random first weights, the",
-    "teacher from a scripted guide, twelve training objects; 81 minutes on two cores), ppo and ppo_paper",
+    "Presets (--preset): debug (tests), demo (19 to 28 minutes on two cores), laptop (random first weights,",
+    "the teacher from a scripted guide, twelve training objects; 50 to 81 minutes), ppo and ppo_paper",
     "(laptop with PPO from nothing, six), camera (laptop, the generator for short recordings of a real",
     "camera), student_paper (laptop with the paper's own student, six), paper (one GPU). Any value can be",
     "given, for example --teacher.num-envs 64. --scale 0.001 makes all its counts that much smaller, never",
