@@ -40,7 +40,7 @@ STAGES = (
         "PPO policy on the privileged state",
     ),
     Stage("demos", "demos.stage", ("teacher",), ("demos",), "successful teacher episodes with clean depth"),
-    Stage("record", "rig.stage", ("teacher",), ("record",), "RGB-D recordings from the pseudo-real rig"),
+    Stage("record", "rig.stage", ("teacher",), ("record",), "RGB-D recordings from the development rig"),
     Stage("ddg", "ddg_jax.stage", ("record",), ("ddg",), "diffusion model of the camera's errors"),
     Stage(
         "student", "student_jax.stage", ("teacher", "demos", "ddg"),
@@ -49,7 +49,7 @@ STAGES = (
     Stage("export", "export.stage", ("student",), ("export",), "one ONNX file, checked against JAX"),
     Stage(
         "deploy", "deploy.stage", ("export",), ("deploy", "evaluation.rig_trials"),
-        "the exported student in the pseudo-real rig at 10 Hz",
+        "the exported student on the development rig at 10 Hz",
     ),
 )  # fmt: skip
 """What `ddgrasp run` makes, in this order."""

@@ -1,4 +1,4 @@
-"""Stage `deploy`: the exported student in the pseudo-real rig at 10 Hz."""
+"""Stage `deploy`: the exported student on the development rig at 10 Hz."""
 
 import hashlib
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Trials of an exported policy in the pseudo-real rig, through the very loop that would drive a robot."""
+"""Trials of an exported policy on the development rig, through the very loop that would drive a robot."""
 
 import atexit
 import os

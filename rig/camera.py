@@ -1,4 +1,4 @@
-"""The pseudo-real rig's camera: colour and active-stereo depth of a MuJoCo state. JAX-free."""
+"""The development rig's camera: colour and active-stereo depth of a MuJoCo state. JAX-free."""
 
 from dataclasses import replace
 from functools import partial

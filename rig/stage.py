@@ -1,4 +1,4 @@
-"""Stage `record`: RGB-D recordings from the pseudo-real rig, as someone with a camera would make them.
+"""Stage `record`: RGB-D recordings from the development rig, as someone with a camera would make them.
 
 The teacher moves the rig's robot, the active-stereo camera looks on from a slightly different place in
 every trajectory. Only pictures are kept: no pose, no CAD model, no clean depth.

@@ -1,4 +1,4 @@
-"""The pseudo-real rig's world: one Franka in MuJoCo's own C engine, at half the training's time step.
+"""The development rig's world: one Franka in MuJoCo's own C engine, at half the training's time step.
 
 It stands in for reality: nothing that trains a student sees its ground truth, but for the bound that
 `student.depth_source rig` is. JAX-free.

@@ -1,4 +1,4 @@
-"""Trials in the pseudo-real rig, their log on disk, and the deploy stage that resumes from it."""
+"""Trials in the development rig, their log on disk, and the deploy stage that resumes from it."""
 
 import dataclasses
 import gc

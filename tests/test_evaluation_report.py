@@ -104,7 +104,7 @@ def test_the_table_ends_with_the_student_in_the_rig(run_dir, capsys):
     print_summary(build_report(run_dir))
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1].split() == (
-        "deploy exported student in the pseudo-real rig: success 50.0 % of 10 (23.7 to 76.3)".split()
+        "deploy exported student on the development rig: success 50.0 % of 10 (23.7 to 76.3)".split()
     )
     assert any("success 90.0 % of 10" in line and "this run" in line for line in lines)
     assert any("clean depth: success 70.0 % of 10" in line and "loaded" in line for line in lines)

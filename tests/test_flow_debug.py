@@ -143,7 +143,7 @@ def test_the_last_line_printed_is_the_student_in_the_rig(finished):
     out, _, output = finished
     success = json.loads((out / "report.json").read_text())["student_rig"]["success"]
     last = output.rstrip().splitlines()[-1]
-    assert "exported student in the pseudo-real rig" in last
+    assert "exported student on the development rig" in last
     assert f"{100 * success['rate']:.1f} % of {success['n']}" in last
     assert f"({100 * success['low']:.1f} to {100 * success['high']:.1f})" in last
 

@@ -24,7 +24,7 @@ class DemosCollect(OneStage):
 
 @dataclass(frozen=True)
 class Record(OneStage):
-    """Record RGB-D from the pseudo-real rig, moved by the teacher."""
+    """Record RGB-D from the development rig, moved by the teacher."""
 
     stage = "record"
 

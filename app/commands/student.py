@@ -109,7 +109,7 @@ class Deploy:
     policy: Path
     """ONNX file that `ddgrasp export` wrote. Without --preset the configuration of its run counts."""
     robot: Robot = "sim"
-    """sim (the pseudo-real rig) or franka."""
+    """sim (the development rig) or franka."""
     host: str = ""
     """Address of franka's control unit; empty takes deploy.franka.host, or 127.0.0.1 with camera rig."""
     camera: Camera = "stereo"

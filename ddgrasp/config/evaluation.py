@@ -14,5 +14,5 @@ class EvalConfig(Section, name="evaluation"):
     student_trials: Count = 100
     """Episodes of the student on clean depth and on that of its training."""
     rig_trials: Count = 120
-    """Episodes of the exported student in the pseudo-real rig, the objects of training and the six unseen
+    """Episodes of the exported student on the development rig, the objects of training and the six unseen
     ones in turn."""

@@ -1,4 +1,4 @@
-"""Recordings from the pseudo-real rig."""
+"""Recordings from the development rig."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -9,7 +9,7 @@ from ddgrasp.config.sensors import StereoConfig
 
 @dataclass(frozen=True)
 class RecordConfig(Section, name="record"):
-    """RGB-D recordings from the pseudo-real rig, and the rig's stereo camera."""
+    """RGB-D recordings from the development rig, and the rig's stereo camera."""
 
     trajectories: Count = 24
     """Recorded episodes of the teacher, objects in turn."""

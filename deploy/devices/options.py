@@ -22,7 +22,7 @@ class SessionOptions:
     """What to drive, what to look through, for how long."""
 
     robot: str = SIMULATION
-    """sim (the pseudo-real rig) or franka."""
+    """sim (the development rig) or franka."""
     camera: str = "stereo"
     """stereo (the rig's own camera), realsense, replay (a recording; the robot acts on old pictures), rig (a
     D455 before the FR3 rig that runs at the robot's host), or rig-ideal (the same without errors)."""

@@ -1,4 +1,4 @@
-"""The Franka of the pseudo-real rig as a robot driver: MuJoCo's C engine, advanced by the loop's clock."""
+"""The Franka of the development rig as a robot driver: MuJoCo's C engine, advanced by the loop's clock."""
 
 import math
 from typing import TYPE_CHECKING

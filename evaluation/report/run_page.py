@@ -48,7 +48,7 @@ def render_html(report: Mapping[str, Any], run_dir: Path) -> str:
         *judgement(targets(report)),
         contents([SUMMARY, *(stage.name for stage in stages), ORIGIN]),
         heading(SUMMARY),
-        f"<p class=note>{escape(made)} Success: rate of n trials, Wilson 95 % interval. The pseudo-real "
+        f"<p class=note>{escape(made)} Success: rate of n trials, Wilson 95 % interval. The development "
         "rig is a Franka in MuJoCo's C engine seen by a simulated active-stereo camera; no real robot was "
         "used.</p>",
         table(("Stage", "From", "Time", "Measured"), summary_rows(report), last_bold=True),

@@ -155,7 +155,7 @@ def summary_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
         rows.extend(("", "", "", result) for result in results[1:])
     if rig := _success(report, "student_rig"):
         apart = _apart(report["student_rig"])
-        rows.append(("deploy", "", "", f"exported student in the pseudo-real rig: success {rig}{apart}"))
+        rows.append(("deploy", "", "", f"exported student on the development rig: success {rig}{apart}"))
     return rows
 
 
