@@ -34,7 +34,7 @@ from rig.film import Film
 
 _STREAM = 0x526967
 """Keeps the trials' random numbers apart from every other stage's ("Rig")."""
-_FAULT = " fault: "
+_FAULT, _RETRY = " fault: ", " retry: "
 """Between the time and the words of an event that is one."""
 
 
@@ -86,6 +86,11 @@ class TrialResult:
         """What made the robot end the trial; "" if it did not."""
         faults = [event.split(_FAULT, 1)[1] for event in self.events if _FAULT in event]
         return next(iter(faults), "")
+
+    @property
+    def at_first_try(self) -> bool:
+        """Whether it succeeded without any of the loop's rules for trying again (`deploy.retry`)."""
+        return self.success and not any(_RETRY in event for event in self.events)
 
 
 def tried(config: Config) -> Config:

@@ -32,7 +32,7 @@ from rig.film import Film, contact_sheet
 
 RigName = Literal["development", "fr3"]
 TRIALS_FILE, TABLE_FILE, EPISODES = "trials.jsonl", "table.json", "episodes"
-EVERYTHING = "all"
+EVERYTHING, FIRST_TRY = "all", "first_try"
 _SAME = ("rig", "shapes", "split", "number", "seconds", "ends", "rules")
 """What the headers of two logs agree on where trial i of an object is the same trial, besides `_DRAWS`."""
 _DRAWS = "draws_hash"
@@ -241,7 +241,7 @@ def tabulate(
     (`evaluation.failure_modes.count`).
 
     Totals are of all objects, of seen ones, which are those `trained` on, of the paper's other ones (unseen)
-    and of those that no list has (other).
+    and of those that no list has (other); `first_try` is of all, those that succeeded without trying again.
     """
     names = tuple(dict.fromkeys(result.object_name for result in results))
     new = [name for name in names if name not in trained]
@@ -257,15 +257,22 @@ def tabulate(
     return {
         "objects": {name: _success(r for r in results if r.object_name == name) for name in names},
         **{group: row for group, row in rows.items() if row["n"]},
+        FIRST_TRY: _counted(result.at_first_try for result in results),
         "faults": sum(bool(result.fault) for result in results),
         "failures": failure_modes.count(results),
     }
 
 
+def shown_rows(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Name -> success, of every object and total of `tabulate`, as people read them."""
+    totals = {name: table[name] for name in ("seen", "unseen", "other", "all") if name in table}
+    first = {"first try": table[FIRST_TRY]} if FIRST_TRY in table else {}
+    return {**table["objects"], **totals, **first}
+
+
 def describe(table: dict[str, Any]) -> str:
     """The table as text."""
-    rows = {**table["objects"], **{k: table[k] for k in ("seen", "unseen", "other", "all") if k in table}}
-    lines = [f"{name:<12} {wilson.describe(row)}" for name, row in rows.items()]
+    lines = [f"{name:<12} {wilson.describe(row)}" for name, row in shown_rows(table).items()]
     return "\n".join([*lines, f"failures: {failure_modes.describe(table['failures'])}"])
 
 
@@ -275,7 +282,11 @@ def _listed() -> tuple[str, ...]:
 
 
 def _success(results: Iterable[TrialResult]) -> dict[str, Any]:
-    return wilson.success(**contract.counted([result.success for result in results]))
+    return _counted(result.success for result in results)
+
+
+def _counted(outcomes: Iterable[bool]) -> dict[str, Any]:
+    return wilson.success(**contract.counted(list(outcomes)))
 
 
 def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:

@@ -131,14 +131,16 @@ def trial_result(name: str, index: int, success: bool, event: str = "") -> Trial
 def test_the_table_counts_groups_and_faults():
     results = [trial_result("apple", i, i > 0) for i in range(4)]
     results += [trial_result("wheel", 9, False, "step 3 (0.30 s) fault: it met something")]
-    results += [trial_result("mug", 12, True)]
+    results += [trial_result("mug", 12, True, "step 9 (0.90 s) retry: the hand closed on nothing")]
     table = rig_trials.tabulate(results)
     counts = {
         group: (table[group]["successes"], table[group]["n"]) for group in ("seen", "unseen", "other", "all")
     }
     assert counts == {"seen": (3, 4), "unseen": (0, 1), "other": (1, 1), "all": (4, 6)}
     assert table["faults"] == 1 and table["objects"]["apple"]["rate"] == 0.75
-    assert "apple        75.0 % of 4" in rig_trials.describe(table)
+    assert (table["first_try"]["successes"], table["first_try"]["n"]) == (3, 6), "the mug's was the second"
+    said = rig_trials.describe(table)
+    assert "apple        75.0 % of 4" in said and "first try    50.0 % of 6" in said
     trained_otherwise = rig_trials.tabulate(results, ("wheel", "mug"))
     assert [trained_otherwise[group]["n"] for group in ("seen", "unseen")] == [2, 4]
     assert "other" not in trained_otherwise

@@ -20,20 +20,21 @@ from evaluation.rig_trials import TRIALS_FILE
 CONFIG = Config(preset="debug")
 
 
-def _result(index: int, name: str, success: bool, missed: int = 0) -> TrialResult:
-    """The object is pushed 5 cm away."""
+def _result(index: int, name: str, success: bool, missed: int = 0, again: bool = False) -> TrialResult:
+    """The object is pushed 5 cm away; the hand tries `again`, or not."""
     times = {name: [0.01] * 3 for name in ("sense_s", "infer_s", "act_s", "latency_s", "period_s")}
-    made = {"safety": {"commands": 3}, "events": [], "holds": 0, "steps": 3, "realtime": False}
+    events = ["step 1 (0.10 s) retry: the hand closed to 0 mm, on nothing"] * again
+    made = {"safety": {"commands": 3}, "events": events, "holds": 0, "steps": 3, "realtime": False}
     made["object_pos_m"] = [[0.5, 0.0, 0.02], [0.55, 0.0, 0.02]]
     return TrialResult(
         index=index, object_name=name, success=success, missed_deadlines=missed, **made, **times
     )
 
 
-def _trials(folder, outcomes, missed=0, number=0):
+def _trials(folder, outcomes, missed=0, number=0, again=()):
     """A folder as `ddgrasp deploy trials` leaves it, with a film of a success and of a failure."""
     folder.mkdir()
-    results = [_result(i, name, success, missed) for i, (name, success) in enumerate(outcomes)]
+    results = [_result(i, name, success, missed, i in again) for i, (name, success) in enumerate(outcomes)]
     lines = [{"policy_sha256": "", "rig": "development", "number": number}, *map(asdict, results)]
     (folder / TRIALS_FILE).write_text("".join(json.dumps(line) + "\n" for line in lines))
     for outcome in {result.success for result in results}:
@@ -149,6 +150,9 @@ def test_the_same_trials_are_compared_in_pairs(trials, tmp_path, capsys):
     assert trials_page.compare([trials_page.find(trials), trials_page.find(other)])[1][-1][-1] == (
         "3 won, 1 lost of 4, p 0.62"
     )
+    twice = _trials(tmp_path / "twice", [("cube", True), ("cube", True)], again=(0,))
+    *_, first_try, whole = trials_page.compare([trials_page.find(folder) for folder in (trials, twice)])[1]
+    assert (first_try[-1], whole[-1]) == ("1 won, 1 lost of 2, p 1", "1 won, 0 lost of 2, p 1")
     third = _trials(tmp_path / "third", [("cube", False), ("cube", False), ("can", False), ("can", True)])
     (*_, last) = trials_page.compare([trials_page.find(folder) for folder in (trials, other, third)])[1]
     assert last[-2:] == ("3 won, 1 lost of 4, p 0.62 (Holm 1)", "1 won, 1 lost of 4, p 1 (Holm 1)")

@@ -1,6 +1,6 @@
 """Trials on a rig (`ddgrasp deploy trials`) as one page: verdict, success by object, films of both kinds."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -14,7 +14,7 @@ from evaluation import failure_modes, paired, wilson
 from evaluation.report import success_chart
 from evaluation.report.comparison import COMPARISON_HTML, COMPARISON_PNG
 from evaluation.report.html import REPORT_HTML, contents, film, heading, image, page, table
-from evaluation.rig_trials import TRIALS_FILE, differing, shown, tabulate, trained_on
+from evaluation.rig_trials import TRIALS_FILE, differing, shown, shown_rows, tabulate, trained_on
 from evaluation.treatments import RECORDED
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
@@ -91,13 +91,19 @@ def write(trials: Trials) -> Path:
 def compare(all_trials: Sequence[Trials]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """(header, rows) of several series side by side: success by object, then trials that the first lost and
     another won, and the other way round, among those that both ran, with McNemar's exact p, and that after
-    Holm's correction where several are set beside the first."""
+    Holm's correction where several are set beside the first; the same of success at the first try."""
     header = ("", *(str(trials.folder) for trials in all_trials))
     rates = [dict(_rows(trials.table)) for trials in all_trials]
     names = dict.fromkeys(name for column in rates for name in column)
     rows = [(name, *(column.get(name, "") for column in rates)) for name in names]
-    pairs = _pairs(all_trials[0], all_trials[1:])
-    return header, [*rows, (f"against {all_trials[0].folder}, same trials", "", *pairs)]
+    first, *others = all_trials
+    against = f"against {first.folder}, same trials"
+    tries = _pairs(first, others, lambda result: result.at_first_try)
+    return header, [
+        *rows,
+        (f"{against}, at the first try", "", *tries),
+        (against, "", *_pairs(first, others, lambda result: result.success)),
+    ]
 
 
 def write_comparison(all_trials: Sequence[Trials]) -> Path:
@@ -121,8 +127,7 @@ def write_comparison(all_trials: Sequence[Trials]) -> Path:
 
 
 def _rows(made: dict[str, Any]) -> list[tuple[str, str]]:
-    groups = {name: made[name] for name in ("seen", "unseen", "other", "all") if name in made}
-    return [(name, wilson.describe(row)) for name, row in {**made["objects"], **groups}.items()]
+    return [(name, wilson.describe(row)) for name, row in shown_rows(made).items()]
 
 
 def _settings(trials: Trials) -> list[tuple[str, str]]:
@@ -136,23 +141,26 @@ def _settings(trials: Trials) -> list[tuple[str, str]]:
     return [(k, ", ".join(v) if isinstance(v, list) else str(v)) for k, v in given.items()]
 
 
-def _outcomes(trials: Trials) -> dict[tuple[int, str], bool]:
-    return {(r.index, r.object_name): r.success for r in trials.results if not r.realtime}
+Outcome = Callable[[TrialResult], bool]
 
 
-def _pairs(first: Trials, others: Sequence[Trials]) -> list[str]:
+def _outcomes(trials: Trials, of: Outcome) -> dict[tuple[int, str], bool]:
+    return {(r.index, r.object_name): of(r) for r in trials.results if not r.realtime}
+
+
+def _pairs(first: Trials, others: Sequence[Trials], of: Outcome) -> list[str]:
     """A cell for each of `others`."""
-    made = [_compared(first, other) for other in others]
+    made = [_compared(first, other, of) for other in others]
     adjusted = paired.holm([pair["p"] for pair in made if pair])
     holm = iter(adjusted if len(adjusted) > 1 else [None] * len(adjusted))
     return [_pair(pair, next(holm)) if pair else "other trials" for pair in made]
 
 
-def _compared(first: Trials, other: Trials) -> dict[str, Any] | None:
+def _compared(first: Trials, other: Trials, of: Outcome) -> dict[str, Any] | None:
     """None for trials of two kinds, or without one in common."""
     if differing(first.belong_to, other.belong_to):
         return None
-    pair = paired.compared(_outcomes(first), _outcomes(other))
+    pair = paired.compared(_outcomes(first, of), _outcomes(other, of))
     return pair if pair["n"] else None
 
 
