@@ -6,23 +6,32 @@ from typing import Any
 
 from ddgrasp.artifacts import MANIFEST, read_artifact
 from ddgrasp.errors import UserError
-from ddgrasp.shipped import holding
+from ddgrasp.shipped import NAME, PRETRAINED, holding
 
 _START = {"teacher": "start", "student": "init_from"}
+
+
+def trains(config: Mapping[str, Any], stage: str) -> bool:
+    """Whether the teacher or student of a configuration (as JSON) learns, or is a start taken as it is."""
+    if stage == "teacher":
+        return config["teacher"]["total_steps"] > 0
+    student = config["student"]
+    in_rounds = (student[name]["rounds"] * student[name]["steps"] for name in ("poses", "dagger"))
+    return any((student["training"]["steps"], student["head"]["train_steps"], *in_rounds))
 
 
 def trained_objects(config: Mapping[str, Any], stage: str) -> tuple[str, ...]:
     """Objects that the teacher or student of a configuration (as JSON) has seen in training, each once.
 
     Its own world's, unless it is a start taken as it is, then those of the start, of the start's start, and
-    so on for as long as their folders are here.
+    so on for as long as their folders are here: what lies there now, of shipped ones only what is shipped.
     """
     names: dict[str, None] = {}
     been: set[Path] = set()
     while True:
         start = config[stage][_START[stage]]
         folder = holding(start, MANIFEST, stage) if start else None
-        if stage != "teacher" or folder is None or config["teacher"]["total_steps"]:
+        if folder is None or trains(config, stage):
             names |= dict.fromkeys(config["world"]["objects"])
         if folder is None or folder in been:
             return tuple(names)
@@ -31,3 +40,7 @@ def trained_objects(config: Mapping[str, Any], stage: str) -> tuple[str, ...]:
             config = read_artifact(folder).manifest.config
         except UserError:  # of another version, or not finished: nothing is known of it
             return tuple(names)
+        begun_from = Path(config[stage][_START[stage]])
+        is_shipped = folder.resolve().is_relative_to(PRETRAINED.resolve())
+        if is_shipped and begun_from.parts[:1] != (NAME,):
+            return tuple(names | dict.fromkeys(config["world"]["objects"]))

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, Literal, TypeVar
 
 from ddgrasp.config.deploy import DeployConfig, FrankaConfig
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble, UserError
 from deploy.clock import RobotClock
 from deploy.devices.franka_faults import NO_FRANKA
 from deploy.devices.franka_robot import LOST, FrankaRobot
@@ -69,7 +69,7 @@ class Fr3Lab:
                 if self._is_up() and not any(sign in lost for sign in OF_THE_MACHINE):
                     raise
             self.close()
-        raise UserError(f"{lost} ({ATTEMPTS} times): use fewer --workers, or end what else runs here.")
+        raise Trouble(f"{lost} ({ATTEMPTS} times): use fewer --workers, or end what else runs here.")
 
     def close(self) -> None:
         """Ends the rig."""

@@ -34,7 +34,7 @@ from rig.film import Film
 
 _STREAM = 0x526967
 """Keeps the trials' random numbers apart from every other stage's ("Rig")."""
-_FAULT, _RETRY = " fault: ", " retry: "
+_FAULT, _RULES = " fault: ", (" retry: ", " done: ")
 """Between the time and the words of an event that is one."""
 
 
@@ -89,8 +89,8 @@ class TrialResult:
 
     @property
     def at_first_try(self) -> bool:
-        """Whether it succeeded without any of the loop's rules for trying again (`deploy.retry`)."""
-        return self.success and not any(_RETRY in event for event in self.events)
+        """Whether it succeeded without any of the loop's rules acting (`deploy.retry`)."""
+        return self.success and not any(rule in event for event in self.events for rule in _RULES)
 
 
 def tried(config: Config) -> Config:

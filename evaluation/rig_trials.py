@@ -241,7 +241,8 @@ def tabulate(
     (`evaluation.failure_modes.count`).
 
     Totals are of all objects, of seen ones, which are those `trained` on, of the paper's other ones (unseen)
-    and of those that no list has (other); `first_try` is of all, those that succeeded without trying again.
+    and of those that no list has (other); `first_try` is of all, those that succeeded with no rule of the
+    loop acting.
     """
     names = tuple(dict.fromkeys(result.object_name for result in results))
     new = [name for name in names if name not in trained]

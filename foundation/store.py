@@ -155,7 +155,7 @@ def _check_version(file: Path, network: str) -> None:
 
 def _check_relative(file: Path, network: str) -> None:
     """Weights for metric depth have the same arrays as those for relative depth, and give something else."""
-    if "metric" in file.name:
+    if "metric" in file.name and network.startswith((catalog.IMAGE_DEPTH, catalog.VIDEO_DEPTH)):
         raise UserError(
             f"{file.name} looks like a model of metric depth, which is not supported: take "
             f"{catalog.get_entry(network).file}."

@@ -9,8 +9,9 @@ from the last finished part.
 import shutil
 
 from ddgrasp.artifacts import Artifact
-from ddgrasp.config import Config
+from ddgrasp.files import to_json
 from ddgrasp.job import Job
+from ddgrasp.trained import trains
 from demos.stage import STORE
 from demos.store import EpisodeStore
 from mjx_envs.render.batch_render import check_renderer
@@ -36,14 +37,5 @@ def run(job: Job) -> Artifact:
     shutil.rmtree(directory / CACHE, ignore_errors=True)
     for name in (POSES, ACTED):
         (directory / name).unlink(missing_ok=True)
-    loaded = config.student.init_from and not _trains(config)
+    loaded = config.student.init_from and not trains(to_json(config), "student")
     return job.finish(metrics, origin="loaded" if loaded else "trained")
-
-
-def _trains(config: Config) -> bool:
-    student = config.student
-    steps = (
-        student.training.steps, student.dagger.rounds * student.dagger.steps, student.head.train_steps,
-        student.poses.rounds * student.poses.steps,
-    )  # fmt: skip
-    return any(steps)

@@ -132,6 +132,7 @@ def test_the_table_counts_groups_and_faults():
     results = [trial_result("apple", i, i > 0) for i in range(4)]
     results += [trial_result("wheel", 9, False, "step 3 (0.30 s) fault: it met something")]
     results += [trial_result("mug", 12, True, "step 9 (0.90 s) retry: the hand closed on nothing")]
+    assert not trial_result("mug", 12, True, "step 9 (0.90 s) done: it is lifted; stays").at_first_try
     table = rig_trials.tabulate(results)
     counts = {
         group: (table[group]["successes"], table[group]["n"]) for group in ("seen", "unseen", "other", "all")

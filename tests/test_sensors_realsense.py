@@ -219,14 +219,19 @@ def test_ctrl_c_keeps_what_was_recorded(tmp_path, monkeypatch, capsys, kind):
 
 
 def test_frames_that_a_killed_recording_left_are_not_recorded_over(tmp_path, monkeypatch, capsys):
+    def killed(self, *_):
+        self._alone.close()  # as the system does
+        raise SystemExit(9)
+
     scripted(monkeypatch, list(range(1, 60)))
-    record(tmp_path, "--frames", 2)
-    (tmp_path / "take").rename(tmp_path / ".take.partial")
-    (tmp_path / ".take.partial" / "meta.json").unlink()
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(writing.RecordingWriter, "__exit__", killed)
+        record(tmp_path, "--frames", 2)
     with pytest.raises(UserError, match=r"\.take\.partial has 2 frames of a recording that did not end"):
         record(tmp_path, "--frames", 2)
     parse("record import", [str(tmp_path / ".take.partial"), "--out", str(tmp_path / "kept")]).run()
-    assert "2 frames" in capsys.readouterr().out and len(find_recordings(tmp_path / "kept")) == 1
+    (kept,) = find_recordings(tmp_path / "kept")
+    assert "2 frames" in capsys.readouterr().out and not kept.color_aligned and kept.fx_px
 
 
 def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, monkeypatch):

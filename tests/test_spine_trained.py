@@ -5,9 +5,11 @@ from dataclasses import replace
 import pytest
 
 from ddgrasp import artifacts
+from ddgrasp.artifacts import read_artifact
 from ddgrasp.config import Config
 from ddgrasp.files import to_json
 from ddgrasp.presets import get_preset
+from ddgrasp.shipped import PRETRAINED
 from ddgrasp.trained import trained_objects
 
 DEBUG = get_preset("debug")
@@ -45,6 +47,29 @@ def test_a_teacher_that_is_taken_as_it_is_was_not_trained_on_the_run_s(earlier):
     taken = to_json(of(("lemon",), str(earlier), total_steps=0))
     assert trained_objects(taken, "teacher") == ("can", "apple")
     assert trained_objects(taken, "student") == ("lemon", "can", "apple"), "its student is"
+
+
+def test_a_student_that_is_taken_as_it_is_was_not_trained_on_the_run_s(earlier):
+    config = of(("lemon",), str(earlier))
+    student = config.student
+    taken = replace(
+        student,
+        training=replace(student.training, steps=0),
+        head=replace(student.head, train_steps=0),
+        poses=replace(student.poses, rounds=0),
+        dagger=replace(student.dagger, steps=0),
+    )
+    assert trained_objects(to_json(replace(config, student=taken)), "student") == ("can", "apple")
+
+
+def test_what_a_shipped_student_began_with_elsewhere_is_not_looked_for(tmp_path, monkeypatch):
+    """Its manifest names a run of whoever trained it; another may lie there under that name."""
+    monkeypatch.chdir(tmp_path)
+    start = read_artifact(PRETRAINED / "student").manifest.config["student"]["init_from"]
+    assert start.startswith("runs/")
+    other = of(("bottle",))
+    artifacts.finish(tmp_path / start, "student", other, seconds=1, metrics={}, origin="trained")
+    assert "bottle" not in trained_objects(to_json(of(("cube",), "pretrained")), "student")
 
 
 def test_what_demo_starts_from_is_known():

@@ -22,6 +22,7 @@ from ddgrasp.install import check_fr3, lacks_fr3
 from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.shipped import PRETRAINED
 from deploy.controls import KEYS, Controls, Noise
+from deploy.interrupts import terminable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -99,7 +100,8 @@ class Play:
             if self._live:
                 self._play_on(rigs, series.names(), viewer, controls)
             else:
-                lifted = sum(_watched(rigs.bench(self.rig), trial, viewer, controls) for trial in trials)
+                with terminable():  # the file is closed, whatever ends it
+                    lifted = sum(_watched(rigs.bench(self.rig), trial, viewer, controls) for trial in trials)
             whole = True
         finally:
             rigs.close()

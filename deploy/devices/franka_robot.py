@@ -17,7 +17,7 @@ from jaxtyping import Float
 from ddgrasp import contract
 from ddgrasp.config.deploy import FrankaConfig
 from ddgrasp.contract import HOME_RAD
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble, UserError
 from ddgrasp.install import pip_install
 from deploy import kinematics
 from deploy.devices import franka_faults
@@ -96,10 +96,10 @@ class FrankaRobot:
             self._hand = FrankaHand(gripper, self._errors, config.grip_force_n)
         except HandError as error:
             way = "on the way to the start pose " if self._moved else ""
-            raise UserError(f"{way}{self._hand_fault(error)}.") from error
+            raise Trouble(f"{way}{self._hand_fault(error)}.") from error
         except self._errors as error:
             if self._moved:
-                raise UserError(f"on the way to the start pose {self._fault(error)}.") from error
+                raise Trouble(f"on the way to the start pose {self._fault(error)}.") from error
             raise UserError(franka_faults.no_connection(franky, config.host, config.model, error)) from error
 
     def read_state(self) -> RobotState:
@@ -252,7 +252,7 @@ class FrankaRobot:
                 return
             if state.time.to_sec() - begun_s > longest_s:
                 waited = f"the arm is not at its start pose after {longest_s:.0f} s"
-                raise UserError(f"{waited}: see what holds it.")
+                raise Trouble(f"{waited}: see what holds it.")
             time.sleep(_POLL_S)
 
     def _to(self, q_target_rad: Float[np.ndarray, "7"], **options: Any) -> Any:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ddgrasp import contract, depth
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble, UserError
 from deploy.devices.options import Setup
 from deploy.interfaces import CameraError, Clock, Frame, Robot
 from sensors.recordings.realsense import load_pyrealsense2, project
@@ -92,7 +92,7 @@ class RealSenseCamera:
             intrinsics = active.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
         except RuntimeError as error:
             self.stop()
-            raise UserError(
+            raise Trouble(
                 f"the RealSense streams, and does not answer ({error}): plug it in anew."
             ) from error
         self._stream = self._checked(intrinsics)

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from types import TracebackType
 
 from ddgrasp.contract import HOME_RAD
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble, UserError
 from ddgrasp.install import FR3, check_fr3
 from rig.fr3.channel import PORT, Channel
 from rig.fr3.scene import SceneObject
@@ -134,9 +134,7 @@ class Fr3Rig:
                     raise UserError(
                         f"the FR3 rig did not start at {self.host}: {said.get('error', 'see above')}."
                     )
-        raise UserError(
-            f"the FR3 rig did not start at {self.host} within {START_S:g} s: is the machine busy?"
-        )
+        raise Trouble(f"the FR3 rig did not start at {self.host} within {START_S:g} s: is the machine busy?")
 
 
 def check_ports(host: str) -> None:

@@ -27,7 +27,7 @@ from sensors.recordings.recording import (
     check_fields,
 )
 from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, in_time, paired
-from sensors.recordings.writer import RecordingWriter
+from sensors.recordings.writer import BEGUN_FILE, RecordingWriter
 
 MARKER = 2**16 - 1
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
@@ -35,7 +35,7 @@ _COLOR_NAMES = ", ".join(f"{name}/" for name in COLOR_FOLDERS)
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 REALSENSE_SUFFIXES = (".bag", ".db3")
 KEPT_META = (
-    "sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth",
+    "sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth", "repeated_frames",
     "licence", "source",
 )  # fmt: skip
 """What is taken over of a folder's own meta.json."""
@@ -255,7 +255,7 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
     files = sorted(pictures, key=in_time)
     if not files:
         raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
-    own = _own_meta(folder / META_FILE)
+    own = _own_meta(folder / META_FILE) or _own_meta(folder / BEGUN_FILE)
     depth_unit_m = depth_unit_m or own.get("depth_unit_m", 0.0)
     if not depth_unit_m:
         first = next((d for d in map(_read_depth, files) if d is not None and _is_depth(d)), None)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp import contract
-from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.errors import Trouble, UserError, unknown_name
 from ddgrasp.progress import Progress, Task
 from ddgrasp.signals import ending, forget_terminal
 from sensors.recordings.importers import Imported, RawFrame, Source, import_recording
@@ -174,7 +174,7 @@ def _kept(
             frames = pipeline.wait_for_frames(_TIMEOUT_MS)
         except RuntimeError as error:
             if not take.frames:
-                raise UserError(
+                raise Trouble(
                     f"the camera has started but gives no frames ({error}): check the USB 3 cable and port."
                 ) from error
             take.trouble = f"the camera stopped ({error}): what it gave is kept; check the USB 3 cable."

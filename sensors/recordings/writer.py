@@ -16,6 +16,8 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import replace_folder
 from sensors.recordings.recording import META_FILE
 
+BEGUN_FILE = "begun.json"
+"""What is known of a recording before it is complete: the meta.json of one that was killed."""
 JPEG_QUALITY = 95
 PNG_COMPRESSION = 3
 
@@ -49,6 +51,10 @@ class RecordingWriter:
         for folder in ("color", "depth"):  # what a killed process has left goes
             shutil.rmtree(self._temporary / folder, ignore_errors=True)
             (self._temporary / folder).mkdir()
+        # What would be lost by a kill; whether frames follow each other is known at the end alone.
+        known = {name: value for name, value in self.meta.items() if name != "consecutive_frames"}
+        begun = json.dumps({"depth_unit_m": DEPTH_UNIT_M, **known}, indent=1) + "\n"
+        _write(self._temporary / BEGUN_FILE, begun.encode(), sync=True)
         return self
 
     def __exit__(self, kind, value, traceback) -> None:
@@ -129,6 +135,7 @@ class RecordingWriter:
         }
         text = json.dumps({**self.meta, **meta}, indent=1) + "\n"
         _write(self._temporary / META_FILE, text.encode(), sync=True)
+        (self._temporary / BEGUN_FILE).unlink()
         replace_folder(self._temporary, self.path)
 
 
