@@ -1,6 +1,7 @@
 """`ddgrasp deploy`: an exported policy on a robot and a camera chosen by name."""
 
 import contextlib
+import hashlib
 import math
 import signal
 import sys
@@ -85,6 +86,7 @@ def _run(
     sensor = f"{options.camera}, D455 profile"
     kept = DeploymentRecord(camera, policy.info.profile, sensor, config.deploy.film_every)
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
+    about["policy_sha256"] = hashlib.sha256(policy_path.read_bytes()).hexdigest()
     name = options.object_name or (config.world.objects[0] if options.camera == "stereo" else "")
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
     ending = contextlib.ExitStack()

@@ -1,11 +1,13 @@
 """What a deployment leaves: a recording that the generator can be fitted to, steps, report, film, verdict."""
 
+import hashlib
 import json
 import os
 import signal
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -80,6 +82,7 @@ def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
     assert rows[1]["action"][0] == pytest.approx(0.2) and rows[1]["q_target_rad"][0] > rows[1]["q_rad"][0]
     kept = json.loads((folder / "report.json").read_text())
     assert kept["calibration"] is None, "the simulated robot has no camera to calibrate"
+    assert kept["policy_sha256"] == hashlib.sha256(Path(kept["policy"]).read_bytes()).hexdigest()
     assert kept["object"] == get_preset("debug").world.objects[0]
     assert (kept["steps"], kept["frames"], kept["success"], kept["robot"]) == (5, 5, None, "sim")
     assert (folder / "film.png").stat().st_size > 1000

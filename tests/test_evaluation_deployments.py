@@ -70,6 +70,12 @@ def test_two_policies_have_a_rate_each():
     )
 
 
+def test_a_policy_that_was_exported_again_is_another():
+    made = [deployment(True, policy_sha256="a" * 64), deployment(False, policy_sha256="b" * 64)]
+    said = deployments.verdict(made)
+    assert "p.onnx (aaaaaaaa) on sim with stereo: 100.0 % of 1 (" in said and "p.onnx (bbbbbbbb) on" in said
+
+
 def test_the_page_says_what_counts(tmp_path):
     folder = tmp_path / "20261128-120000"
     folder.mkdir()

@@ -1,6 +1,6 @@
 """Deployments as one page: how each ended, how it kept time, its film, what happened in it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -104,8 +104,8 @@ def verdict(deployments: Sequence[Deployment]) -> str:
     driven = [deployment for deployment in deployments if deployment.is_driven]
     setups = sorted({_setup(deployment) for deployment in driven})
     rates = [_rate([one for one in driven if _setup(one) == setup]) for setup in setups]
-    if len(setups) > 1:  # a rig's trials say nothing of an arm's
-        rates = [f"{setup}: {rate}" for setup, rate in zip(setups, rates, strict=True)]
+    if len(setups) > 1:  # a rig's trials say nothing of an arm's, nor one policy's of another's
+        rates = [f"{_named(setup, setups)}: {rate}" for setup, rate in zip(setups, rates, strict=True)]
     rate = "; ".join(rates) or _rate([])
     faults = sum(bool(deployment.report["fault"]) for deployment in driven)
     missed = sum(deployment.report["missed_deadlines"] for deployment in driven)
@@ -115,9 +115,18 @@ def verdict(deployments: Sequence[Deployment]) -> str:
     return f"Success {rate}. Ended by a fault: {faults}. Missed deadlines: {missed} in {steps} steps.{beside}"
 
 
-def _setup(deployment: Deployment) -> str:
-    policy, robot, camera = (deployment.report.get(name, "") for name in ("policy", "robot", "camera"))
-    return f"{policy} on {robot} with {camera}"
+def _setup(deployment: Deployment) -> tuple[str, str, str, str]:
+    """Policy, robot, camera, and the policy's hash: a file may be exported again under its name."""
+    policy, robot, camera, sha256 = (
+        str(deployment.report.get(name, "")) for name in ("policy", "robot", "camera", "policy_sha256")
+    )
+    return policy, robot, camera, sha256
+
+
+def _named(setup: tuple[str, str, str, str], setups: Collection[tuple[str, str, str, str]]) -> str:
+    policy, robot, camera, sha256 = setup
+    alike = [other for other in setups if other[:3] == setup[:3]]
+    return f"{policy}{f' ({sha256[:8]})' if len(alike) > 1 else ''} on {robot} with {camera}"
 
 
 def _rate(driven: Sequence[Deployment]) -> str:
