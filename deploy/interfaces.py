@@ -209,6 +209,15 @@ class KnowsObject(Protocol):
 
 
 @runtime_checkable
+class Device(Protocol):
+    """A camera that one can buy."""
+
+    def device_name(self) -> str:
+        """As it calls itself, once it has started."""
+        ...
+
+
+@runtime_checkable
 class Judge(Protocol):
     """A camera before a rig, which knows where the object is."""
 

@@ -21,7 +21,7 @@ from jaxtyping import UInt8, UInt16
 from ddgrasp import contract
 from ddgrasp.depth import to_millimetres
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
-from deploy.interfaces import Camera, Filmed, Judge
+from deploy.interfaces import Camera, Device, Filmed, Judge
 from deploy.interrupts import unbroken
 from deploy.loop import Step
 from rig.film import Film, contact_sheet
@@ -104,6 +104,9 @@ class DeploymentRecord:
         if not self._queued:  # a camera's own are all kept
             apart = self._picture_every if rgb is None else 1
             self._meta |= {"hz": contract.CONTROL_HZ / apart, "consecutive_frames": apart == 1}
+            if isinstance(self._camera, Device) and (name := self._camera.device_name()):
+                self._meta["sensor"] = f"{name}, brought to the policy's picture"
+                self._meta.pop("baseline_m", None)  # known by the name
         if again := step.frame.timestamp_s == self._newest_s:  # the loop holds, and has no other
             self._meta["consecutive_frames"] = False
         self._newest_s = step.frame.timestamp_s

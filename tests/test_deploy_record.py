@@ -88,6 +88,22 @@ def test_a_deployment_is_a_recording_with_its_steps_and_report(run):
     assert (folder / "film.png").stat().st_size > 1000
 
 
+@pytest.mark.parametrize(("name", "baseline_m"), [("D455", 0.095), ("D435", 0.050)])
+def test_a_bought_camera_s_recording_names_it_and_has_its_own_baseline(run, name, baseline_m):
+    class Bought(ColourCamera):
+        def device_name(self):
+            return f"Intel RealSense {name}"
+
+        def read(self):  # the colour stream comes later than depth's
+            frame = super().read()
+            return replace(frame, rgb=None) if self._reads < 3 else frame
+
+    recording = Recording.open(run(Bought)[1])
+    assert recording.meta["sensor"] == f"Intel RealSense {name}, brought to the policy's picture"
+    assert recording.optics() == pytest.approx((168.6, baseline_m), abs=0.1)
+    assert recording.optics()[1] == pytest.approx(baseline_m, abs=1e-3)
+
+
 def test_steps_are_on_the_disk_while_it_runs_so_that_a_kill_leaves_them(run, tmp_path):
     there = []
 

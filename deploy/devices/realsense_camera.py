@@ -63,6 +63,7 @@ class RealSenseCamera:
         self._clock, self._profile, self._serial, self._say = clock, profile, serial, say
         self._stream_hz, self._timeout_ms = stream_hz, timeout_ms
         self._pipeline: Any = None
+        self._name = ""
         self._unit_m, self._mode, self._stream = contract.DEPTH_UNIT_M, stream, stream
         self._number: int | None = None
         self._frame: Frame | None = None
@@ -96,8 +97,13 @@ class RealSenseCamera:
                 f"the RealSense streams, and does not answer ({error}): plug it in anew."
             ) from error
         self._stream = self._checked(intrinsics)
+        self._name = name
         known = _TRAINED_FOR in name
         self._say(f"camera: {name}" if known else f"camera: {name}, {_OTHER}")
+
+    def device_name(self) -> str:
+        """See Device."""
+        return self._name
 
     def read(self) -> Frame:
         """The newest frame; waits for the first alone. A stream that pauses leaves its last one, whose time
