@@ -75,6 +75,17 @@ def test_colour_of_a_lens_of_its_own_is_called_so(tmp_path):
     assert Recording.open(tmp_path / "beside" / "desk").color_aligned
 
 
+def test_colour_of_another_shape_is_not_called_aligned(tmp_path, capsys):
+    root = make_folder(tmp_path / "desk", frames=1)
+    for size, told in (((2 * SIZE[0], 2 * SIZE[1]), False), ((SIZE[0], 2 * SIZE[1]), True)):
+        assert cv2.imwrite(str(root / "rgb" / "0000_rgb.png"), np.zeros((*size, 3), np.uint8))
+        run(root, "--out", tmp_path / f"out{told}")
+        assert Recording.open(tmp_path / f"out{told}" / "desk").color_aligned is not told
+        assert ("colour of 64x24 beside depth of 32x24 is not aligned" in capsys.readouterr().out) == told
+    run(root, "--out", tmp_path / "known", "--no-aligned")
+    assert "beside depth of" not in capsys.readouterr().out
+
+
 def test_bad_frames_are_named_and_counted(tmp_path, capsys):
     root = make_folder(tmp_path / "desk", frames=7)
     (root / "depth" / "0006_depth.png").unlink()

@@ -30,6 +30,8 @@ from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, in_time
 from sensors.recordings.writer import BEGUN_FILE, RecordingWriter
 
 MARKER = 2**16 - 1
+SAME_SHAPE = 0.02
+"""Colour and depth of one view have the same ratio of columns to rows, up to this share."""
 COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 _COLOR_NAMES = ", ".join(f"{name}/" for name in COLOR_FOLDERS)
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
@@ -55,11 +57,13 @@ class Imported:
     """See `Source`."""
     marked: int = 0
     """Pixels with a mark for "no reading" of the source's own."""
+    unlike: str = ""
+    """How the shapes of colour and depth differ, which cannot be aligned then; nothing where they do not."""
 
     @property
     def lines(self) -> list[str]:
-        """For people: what was left out, a line each, `loss`, `note` and `marked`."""
-        said = [f"left out {what}" for what in self.skipped] + [self.loss] + [self.note]
+        """For people: what was left out, a line each, `loss`, `note`, `unlike`, `marked`."""
+        said = [f"left out {what}" for what in self.skipped] + [self.loss] + [self.note] + [self.unlike]
         if self.marked:
             said.append(f"{self.marked} pixels of {MARKER}, the largest number, have no reading now")
         return [f"{self.path}: {text}" for text in said if text]
@@ -78,7 +82,7 @@ def import_recording(source: Source, path: Path) -> Imported:
     if path.exists():
         raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
     skipped, medians_m, size, frames, gaps, last = [], [], None, 0, False, False
-    loss, marked = "", 0
+    loss, marked, unlike = "", 0, ""
     with RecordingWriter(path, source.meta) as writer:
         for frame in map(_without_markers, source.frames()):
             medians_m += _median_m(frame, source.depth_unit_m)
@@ -91,6 +95,7 @@ def import_recording(source: Source, path: Path) -> Imported:
             size = depth_mm.shape
             loss = loss or _loss(frame, source.depth_unit_m)
             marked += frame.marked
+            unlike = unlike or _unlike(frame.rgb, depth_mm)
             try:
                 writer.add(frame.rgb, depth_mm)
             except OSError as error:
@@ -104,6 +109,10 @@ def import_recording(source: Source, path: Path) -> Imported:
         writer.meta.update(source.closing_meta())
         if gaps:
             writer.meta["consecutive_frames"] = False
+        if writer.meta.get("color_aligned_to_depth") is False:
+            unlike = ""  # somebody knows
+        elif unlike:
+            writer.meta["color_aligned_to_depth"] = False
         if not source.unit_is_certain or frames < UNIT_CHECK_FRAMES:
             _check_unit(source, medians_m)
         if not frames:
@@ -111,7 +120,14 @@ def import_recording(source: Source, path: Path) -> Imported:
                 f"{source.path}: none of its {len(skipped)} frames can be used "
                 f"({skipped[0] if skipped else 'it is empty'})."
             )
-    return Imported(path, frames, tuple(skipped), loss, source.note, marked)
+    return Imported(path, frames, tuple(skipped), loss, source.note, marked, unlike)
+
+
+def _unlike(rgb: np.ndarray, depth: np.ndarray) -> str:
+    (rows, columns), (high, wide) = depth.shape, rgb.shape[:2]
+    if abs(columns * high / (rows * wide) - 1) <= SAME_SHAPE:
+        return ""
+    return f"colour of {wide}x{high} beside depth of {columns}x{rows} is not aligned to it, and is noted so"
 
 
 def _loss(frame: RawFrame, unit_m: float) -> str:
