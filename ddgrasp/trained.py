@@ -4,8 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ddgrasp.artifacts import MANIFEST, read_artifact
+from ddgrasp.artifacts import MANIFEST, is_finished, read_artifact, read_manifest
+from ddgrasp.config import Config
 from ddgrasp.errors import UserError
+from ddgrasp.files import to_json
 from ddgrasp.shipped import NAME, PRETRAINED, holding
 
 _START = {"teacher": "start", "student": "init_from"}
@@ -18,6 +20,14 @@ def trains(config: Mapping[str, Any], stage: str) -> bool:
     student = config["student"]
     in_rounds = (student[name]["rounds"] * student[name]["steps"] for name in ("poses", "dagger"))
     return any((student["training"]["steps"], student["head"]["train_steps"], *in_rounds))
+
+
+def policy_objects(policy: Path, config: Config) -> tuple[str, ...]:
+    """`trained_objects` of an exported policy: of what made it, where its manifest lies beside it, or else of
+    `config`."""
+    beside = policy.parent
+    made = read_manifest(beside).config if is_finished(beside) else to_json(config)
+    return trained_objects(made, "student")
 
 
 def trained_objects(config: Mapping[str, Any], stage: str) -> tuple[str, ...]:

@@ -13,10 +13,10 @@ from typing import Any
 
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
-from ddgrasp.files import atomic_write_json, atomic_write_text, read_json, to_json
+from ddgrasp.files import atomic_write_json, atomic_write_text, read_json
 from ddgrasp.install import FR3, check_fr3
 from ddgrasp.progress import Progress
-from ddgrasp.trained import trained_objects
+from ddgrasp.trained import policy_objects
 from ddgrasp.versions import library_versions
 from deploy.changes import Change
 from deploy.fr3_trials import Fr3Bench
@@ -108,7 +108,7 @@ def run(
         row's own and count for nothing. UserError for what rig fr3 alone has: contact, shapes, coarse camera.
     """
     series = replace(series, rig="development")
-    trained = trained_objects(to_json(config), "student")
+    trained = policy_objects(policy, config)
     config = one_pose(series.configured(config, policy))
     trials = series.plan()
     belong_to = rig_trials.made_with(config, policy, trained) | {

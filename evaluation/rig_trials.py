@@ -15,7 +15,7 @@ from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from ddgrasp.progress import Progress
-from ddgrasp.trained import trained_objects
+from ddgrasp.trained import policy_objects
 from deploy.changes import Change
 from deploy.fr3_lab import Shapes, stopping_at
 from deploy.fr3_trials import Fr3Bench, Sight
@@ -294,9 +294,9 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     """What the trials belong to; how many of which objects may grow.
 
     Args:
-      config: the policy's own, with the objects of its run.
+      config: of camera and loop.
     """
-    trained, config = trained_objects(to_json(config), "student"), series.configured(config, policy)
+    trained, config = policy_objects(policy, config), series.configured(config, policy)
     config = replace(config, world=replace(config.world, objects=_listed()))
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}

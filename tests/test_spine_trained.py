@@ -10,7 +10,7 @@ from ddgrasp.config import Config
 from ddgrasp.files import to_json
 from ddgrasp.presets import get_preset
 from ddgrasp.shipped import PRETRAINED
-from ddgrasp.trained import trained_objects
+from ddgrasp.trained import policy_objects, trained_objects
 
 DEBUG = get_preset("debug")
 
@@ -70,6 +70,12 @@ def test_what_a_shipped_student_began_with_elsewhere_is_not_looked_for(tmp_path,
     other = of(("bottle",))
     artifacts.finish(tmp_path / start, "student", other, seconds=1, metrics={}, origin="trained")
     assert "bottle" not in trained_objects(to_json(of(("cube",), "pretrained")), "student")
+
+
+def test_a_policy_s_are_those_of_what_made_it_whatever_it_is_tried_by(tmp_path):
+    artifacts.finish(tmp_path, "export", of(("lemon",)), seconds=1, metrics={}, origin="trained")
+    assert policy_objects(tmp_path / "policy.onnx", of(("cube",))) == ("lemon",)
+    assert policy_objects(tmp_path / "elsewhere" / "policy.onnx", of(("cube",))) == ("cube",)
 
 
 def test_what_demo_starts_from_is_known():
