@@ -153,6 +153,7 @@ _FROM_NOTHING = TeacherConfig(
     action_std=0.3,
     gripper_std=0.5,
     min_std=0.2,
+    bootstrap_time_limit=True,
     entropy_cost=2e-3,
     hidden=(256, 256, 128),
     pregrasp_share=0.5,

@@ -8,7 +8,7 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 13
+VERSION = 14
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
@@ -120,6 +120,7 @@ _ADDED_AFTER: dict[int, dict[str, Any]] = {
     10: {"deploy.franka.approach_m_s": 0.06, "deploy.franka.approach_below_m": 0.16},
     11: {"deploy.franka.give_way": 0.5},
     12: {"student.dextrah_scale": 1.0},
+    13: {"teacher.bootstrap_time_limit": True},
 }
 """Version -> the fields that it lacked and the next one has, with what it did (10, 11: what is done now)."""
 

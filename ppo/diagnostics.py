@@ -31,6 +31,7 @@ def of_update(
       policy/kl: KL divergence of the action distributions, KL(old || new), mean, nats.
       policy/clip_fraction: share of the actions whose probability moved further than PPO's clipping range.
       policy/std: mean standard deviation of the exploration noise, before the tanh.
+      value/max: the largest value before the update; no more than what the reward can pay, in a sound one.
       value/explained_variance: 1 - Var(return - value) / Var(return), with the return as GAE estimates it
         and the value before the update: 1 foresees every return, 0 knows no more than their mean.
     """
@@ -44,6 +45,7 @@ def of_update(
         "policy/kl": jnp.mean(new.kl_divergence(old)),
         "policy/clip_fraction": jnp.mean(jnp.abs(moved - 1.0) > config.clip),
         "policy/std": jnp.mean(new.scale),
+        "value/max": jnp.max(values),
         "value/explained_variance": 1.0 - jnp.var(returns - values) / jnp.maximum(jnp.var(returns), 1e-8),
     }
 

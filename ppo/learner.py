@@ -236,6 +236,8 @@ def improve(
 
     Returns the new state, scalars for the curves, and scalars for the NaN guard (`ppo.health.watch`).
     """
+    if not config.bootstrap_time_limit:
+        data = ended(data)
     networks, normalizer = make_networks(config), state.normalizer
     _, k_sgd = _keys(state)
     (params, opt_state), losses = _improve(config, networks, normalizer, data, k_sgd, state, mesh)
@@ -312,6 +314,13 @@ def _held_back(learns, waiting, opt_state):
     without gradients takes the first ones with them several times too large."""
     actor = jax.tree.map(partial(jnp.where, learns), opt_state.inner_states["policy"], waiting)
     return opt_state._replace(inner_states=opt_state.inner_states | {"policy": actor})
+
+
+def ended(data: types.Transition) -> types.Transition:
+    """`data` whose episodes end where their time does: nothing comes after the last step."""
+    extras: Any = data.extras
+    limit = jnp.zeros_like(extras["state_extras"]["truncation"])
+    return data._replace(extras=extras | {"state_extras": extras["state_extras"] | {"truncation": limit}})
 
 
 def _improve(config, networks, normalizer, data, key, state, mesh):

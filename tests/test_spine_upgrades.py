@@ -17,16 +17,17 @@ ROOT = Path(__file__).parents[1]
 
 
 def _as_before(config):
-    """`config` as it was before versions 5, 7, 8, 9 and 10: a closing of the gripper could be taken back,
-    demos were taken whole, holes stayed holes, a generator did not know where in the picture it is, and the
-    policy alone acted."""
+    """`config` as it was before versions 5, 7, 8, 9, 10 and 14: a closing of the gripper could be taken back,
+    demos were taken whole, holes stayed holes, a generator did not know where in the picture it is, the
+    policy alone acted, and a teacher's values went on behind the time limit."""
     head = dataclasses.replace(config.student.head, closing_steps=0)
     picture = dataclasses.replace(config.student.picture, fill_holes=False)
     training = dataclasses.replace(config.student.training, demo_stretch_steps=0)
     student = dataclasses.replace(config.student, head=head, picture=picture, training=training)
     deploy = dataclasses.replace(config.deploy, retry=False)
     ddg = dataclasses.replace(config.ddg, unet=dataclasses.replace(config.ddg.unet, position=False))
-    return dataclasses.replace(config, ddg=ddg, student=student, deploy=deploy)
+    teacher = dataclasses.replace(config.teacher, bootstrap_time_limit=True)
+    return dataclasses.replace(config, ddg=ddg, student=student, deploy=deploy, teacher=teacher)
 
 
 CONFIG = _as_before(PRESETS["camera"])
@@ -150,7 +151,9 @@ def test_the_pretrained_folder_is_read_and_accepted(stage, preset):
     assert (config.preset, artifact.manifest.stage) == (preset, stage)
     if stage == "teacher":
         artifacts.check_config(artifact, config)
-        artifacts.check_config(artifact, dataclasses.replace(PRESETS["laptop"], world=config.world))
+        laptop = PRESETS["laptop"]
+        as_then = dataclasses.replace(laptop.teacher, bootstrap_time_limit=True)
+        artifacts.check_config(artifact, dataclasses.replace(laptop, world=config.world, teacher=as_then))
 
 
 def test_a_manifest_of_a_later_version_is_refused_by_its_number(tmp_path):

@@ -97,6 +97,23 @@ def test_a_critic_that_foresees_every_return_explains_all_and_one_number_nothing
     assert of(foreseen, value=constant)["value/explained_variance"] == pytest.approx(0.0, abs=1e-4)
 
 
+def test_what_comes_after_the_time_limit_is_nothing_or_what_the_critic_expects(data):
+    """Every episode ends at its second step, by the time limit. Values of 5 everywhere, rewards of 0."""
+    at_limit = jnp.zeros((COUNT, STEPS)).at[:, 1].set(1.0)
+    extras = data.extras | {"state_extras": {"truncation": at_limit}}
+    limited = data._replace(discount=1.0 - at_limit, extras=extras)
+    five = jax.tree.map(jnp.zeros_like, VALUE)
+    five["params"]["hidden_1"]["bias"] = five["params"]["hidden_1"]["bias"] + 5.0
+    found = [
+        np.asarray(diagnostics._returns(TEACHER, NETWORKS, STATE.normalizer, made, five)[1])[:, 0]
+        for made in (limited, learner.ended(limited))
+    ]
+    # Brax's masks the last step: its return is its own value. Ended, it is its reward, which is 0.
+    np.testing.assert_allclose(found[0], [0.9 * 5, 5.0, 0.9 * 5], rtol=1e-5)
+    step = 0.9 * 5 - 5 + 0.9 * TEACHER.gae_lambda * (0 - 5)  # delta of the first, and the second's
+    np.testing.assert_allclose(found[1], [5 + step, 0.0, 0.9 * 5], rtol=1e-4)
+
+
 def test_where_no_episode_ended_the_curves_of_episodes_have_no_point(tmp_path):
     """A 0 there would say that none succeeded, of a few environments or short unrolls most of the time."""
     progress = Progress(tmp_path, quiet=True)

@@ -15,7 +15,7 @@ from ppo.train import compile_iteration, initial, policy_of
 TEACHER = TeacherConfig(
     start="nothing", total_steps=160_000, num_envs=256, unroll_steps=10, minibatches=4, learning_rate=6e-4,
     target_kl=0.03, critic_learning_rate=1e-3, discount=0.95, action_std=0.2, gripper_std=0.5, min_std=0.2,
-    entropy_cost=0.0, hidden=(128, 64), critic_warmup=0,
+    entropy_cost=0.0, hidden=(128, 64), critic_warmup=0, bootstrap_time_limit=True,
 )  # fmt: skip
 WORLD = WorldConfig(
     objects=("apple",), episode_steps=20, random=RandomConfig(held_share=1.0),

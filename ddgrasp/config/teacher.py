@@ -50,6 +50,10 @@ class TeacherConfig(Section, name="teacher"):
     """Adam's step size for the value network at the start; always decays linearly to a tenth."""
     discount: Share = 0.97
     """How much a reward one control step later counts (gamma)."""
+    bootstrap_time_limit: bool = False
+    """What comes after an episode's last step counts as what the value network expects of it (Pardo et al.
+    2018), instead of nothing. A policy that holds what it has lifted is worth ever more by that, to a network
+    that learns from its own estimates: PPO follows them away from a cloned one (docs/teacher.md)."""
     gae_lambda: Share = 0.95
     """Generalised advantage estimation: 0 trusts the value network, 1 the rewards that were seen.
     Brax's, whose advantage is a step's own error plus discount, not discount times lambda, times the next

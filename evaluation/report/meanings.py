@@ -140,6 +140,7 @@ MEANINGS: dict[str, Meaning] = {
     "kl": Meaning("distance to the policy before the update", "nats"),
     "learning_rate": Meaning("step size"),
     "std": Meaning("spread of the actions tried"),
+    "value.max": Meaning("most that it promises, scaled reward to come"),
     "explained_variance": Meaning("share of the returns' variance that it foresees", SHARE),
     # scores
     "sampler": Meaning("how many times the network is evaluated"),
