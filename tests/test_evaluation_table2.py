@@ -308,6 +308,7 @@ KEPT = PRETRAINED / "table2" / "trials"
                                  "ddg_no_graft": (25, 20), "upper_bound": (16, 22)}),
         ("development-9", {"sim_gt": (499, 3), "rand_noise": (62, 37), "inpaint": (141, 28),
                            "ddg_no_graft": (26, 34), "upper_bound": (24, 42)}),
+        ("fr3-test-10", {"inpaint": (8, 3)}),
         ("fr3-test-3", {"sim_gt": (51, 3), "rand_noise": (4, 3), "inpaint": (10, 5),
                         "ddg_no_graft": (9, 3), "upper_bound": (7, 3)}),
     ],
