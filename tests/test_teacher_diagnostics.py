@@ -1,5 +1,7 @@
 """What people look at while PPO trains, against numbers worked out by hand."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 
 from ddgrasp.config import TeacherConfig
 from ddgrasp.progress import Progress, read_curves
+from mjx_envs import devices
 from ppo import diagnostics, learner
 from ppo import train as ppo_train
 from teacher_support import learner_without_envs
@@ -112,6 +115,22 @@ def test_what_comes_after_the_time_limit_is_nothing_or_what_the_critic_expects(d
     np.testing.assert_allclose(found[0], [0.9 * 5, 5.0, 0.9 * 5], rtol=1e-5)
     step = 0.9 * 5 - 5 + 0.9 * TEACHER.gae_lambda * (0 - 5)  # delta of the first, and the second's
     np.testing.assert_allclose(found[1], [5 + step, 0.0, 0.9 * 5], rtol=1e-4)
+
+
+@pytest.mark.parametrize("bootstrap", [False, True])
+def test_an_update_learns_from_the_end_that_the_configuration_asks_for(data, monkeypatch, bootstrap):
+    given = []
+
+    def caught(config, networks, normalizer, data, *rest):
+        given.append(data.extras["state_extras"]["truncation"])
+        raise StopIteration
+
+    monkeypatch.setattr(learner, "_improve", caught)
+    limited = data._replace(extras=data.extras | {"state_extras": {"truncation": jnp.ones((COUNT, STEPS))}})
+    config = replace(TEACHER, bootstrap_time_limit=bootstrap)
+    with pytest.raises(StopIteration):
+        learner.improve(config, devices.make_mesh(), STATE, limited, {})
+    assert bool(given[0].all()) == bool(given[0].any()) == bootstrap
 
 
 def test_where_no_episode_ended_the_curves_of_episodes_have_no_point(tmp_path):
