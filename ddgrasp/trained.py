@@ -37,9 +37,9 @@ def trained_objects(config: Mapping[str, Any], stage: str) -> tuple[str, ...]:
     so on for as long as their folders are here: what lies there now, of shipped ones only what is shipped.
     """
     names: dict[str, None] = {}
-    been: set[Path] = set()
+    folder, been = None, set[Path]()
     while True:
-        start = config[stage][_START[stage]]
+        start = _start(config, stage, folder)
         folder = holding(start, MANIFEST, stage) if start else None
         if folder is None or trains(config, stage):
             names |= dict.fromkeys(config["world"]["objects"])
@@ -50,7 +50,10 @@ def trained_objects(config: Mapping[str, Any], stage: str) -> tuple[str, ...]:
             config = read_artifact(folder).manifest.config
         except UserError:  # of another version, or not finished: nothing is known of it
             return tuple(names)
-        begun_from = Path(config[stage][_START[stage]])
-        is_shipped = folder.resolve().is_relative_to(PRETRAINED.resolve())
-        if is_shipped and begun_from.parts[:1] != (NAME,):
-            return tuple(names | dict.fromkeys(config["world"]["objects"]))
+
+
+def _start(config: Mapping[str, Any], stage: str, folder: Path | None) -> str:
+    """What it began from; nothing where `folder` is shipped and that is not: another may lie there here."""
+    start = config[stage][_START[stage]]
+    is_shipped = folder is not None and folder.resolve().is_relative_to(PRETRAINED.resolve())
+    return "" if is_shipped and Path(start).parts[:1] != (NAME,) else start
