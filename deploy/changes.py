@@ -1,6 +1,7 @@
 """What can be otherwise than in the development rig, one thing at a time: where a policy loses, by cause."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -13,7 +14,11 @@ if TYPE_CHECKING:
     from rig.world import RigWorld
 
 WorldName = Literal["as it is", "meshes", "furniture", "dark table", "spring"]
-SightName = Literal["stereo", "ideal", "full size", "holes", "values", "ripple", "mismatches"]
+SightName = Literal[
+    "stereo", "ideal", "full size",
+    "holes", "values", "ripple", "mismatches",
+    "generator", "generator's holes", "generator's values",
+]  # fmt: skip
 _STREAM = 0x4F6666
 """Keeps the direction in which a camera is off apart from every other random number ("Off")."""
 
@@ -26,10 +31,13 @@ class Change:
     """meshes (the test rig's objects), furniture (its table's end, wall and clutter), dark table, or spring
     (the arm follows as the Franka driver's spring has it at full stiffness)."""
     sight: SightName = "stereo"
-    """stereo (matched at the policy's size), ideal (no errors), full size (matched at 848x480), or one
-    kind of stereo's errors alone (rig/camera_errors.py)."""
+    """stereo (matched at the policy's size), ideal (no errors), full size (matched at 848x480), one kind of
+    stereo's errors alone (rig/camera_errors.py), or a generator's errors instead of all of stereo's, or of
+    one kind (deploy/generated_camera.py)."""
     off: tuple[float, float] = (0.0, 0.0)
     """How far the camera stands from where the trial says, in a random direction: metres, degrees."""
+    generator: Path | None = None
+    """File whose errors a generator's are; None takes the shipped one."""
 
     def make_world(self, config: Config) -> "RigWorld":
         """The world of the trials."""
@@ -55,21 +63,24 @@ class Change:
 
     def make_camera(self, config: Config, world: "RigWorld") -> "RigCamera":
         """The camera before `world`."""
+        from deploy.generated_camera import GENERATED, SHIPPED, GeneratedCamera
         from rig.camera import make_camera
         from rig.camera_errors import ERRORS, PartlyWrongCamera
 
-        if self.sight == "full size":
+        before, seen = (world.model, config.record.stereo, config.world.profile), self.sight
+        if seen == "full size":
             from deploy.full_size import FullSizeCamera
 
-            return FullSizeCamera(world.model, config.record.stereo, config.world.profile)
-        if self.sight in ERRORS:
-            return PartlyWrongCamera(world.model, config.record.stereo, config.world.profile, self.sight)
+            return FullSizeCamera(*before)
+        if seen in ERRORS:
+            return PartlyWrongCamera(*before, seen)
+        if seen in GENERATED:
+            return GeneratedCamera(*before, seen, self.generator or SHIPPED)
         if self.world == "meshes":
             from rig.mesh_world import MeshCamera
 
-            ideal = self.sight == "ideal"
-            return MeshCamera(world.model, config.record.stereo, config.world.profile, ideal)
-        return make_camera(config, world, ideal=self.sight == "ideal")
+            return MeshCamera(*before, seen == "ideal")
+        return make_camera(config, world, ideal=seen == "ideal")
 
     def displaced(self, T_world_cam: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "4 4"]:
         """(4, 4) where the camera stands instead of `T_world_cam`; the direction follows from `seed`."""

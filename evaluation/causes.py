@@ -4,6 +4,7 @@ DIR/<row>/trials.jsonl     outcome of every trial, kept and not run again
 DIR/causes.json, causes.md the table
 """
 
+import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +20,9 @@ from ddgrasp.progress import Progress
 from ddgrasp.trained import policy_objects
 from ddgrasp.versions import library_versions
 from deploy.changes import Change
+from deploy.depth_noise import DepthGenerator
 from deploy.fr3_trials import Fr3Bench
+from deploy.generated_camera import GENERATED, SHIPPED
 from deploy.trial_log import read_log
 from deploy.trials import Bench, Rig, TrialResult
 from evaluation import paired, rig_trials, wilson
@@ -47,9 +50,16 @@ class Row:
         """Modules of the extra [fr3] that it takes."""
         return FR3 if isinstance(self.bench, Fr3Bench) else FR3[2:] if self.bench.world == "meshes" else ()
 
-    def make(self) -> Callable[[Config, Path], Bench]:
-        """What makes a bench in every worker."""
-        return self.bench if isinstance(self.bench, Fr3Bench) else partial(Rig, change=self.bench)
+    @property
+    def generated(self) -> bool:
+        """Whether a generator takes part."""
+        return isinstance(self.bench, Change) and self.bench.sight in GENERATED
+
+    def make(self, generator: Path) -> Callable[[Config, Path], Bench]:
+        """What makes a bench in every worker; `generator` is the file for a row that is `generated`."""
+        if isinstance(self.bench, Fr3Bench):
+            return self.bench
+        return partial(Rig, change=replace(self.bench, generator=generator) if self.generated else self.bench)
 
 
 ROWS: dict[str, Row] = {
@@ -63,6 +73,15 @@ ROWS: dict[str, Row] = {
     ),
     "mismatches": Row(
         "values off by 1 px or more alone", "camera noise", Change(sight="mismatches"), against=IDEAL,
+    ),
+    "generator": Row(
+        "a generator's errors instead of the camera's", "camera noise", Change(sight="generator"),
+    ),
+    "generator_holes": Row(
+        "a generator's holes, the camera's values", "camera noise", Change(sight="generator's holes"),
+    ),
+    "generator_values": Row(
+        "a generator's values, the camera's holes", "camera noise", Change(sight="generator's values"),
     ),
     "full_size": Row("stereo matched at 848x480", "camera resolution", Change(sight="full size")),
     "meshes": Row("meshes instead of primitives", "object shape", Change("meshes")),
@@ -99,13 +118,20 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def run(
-    config: Config, policy: Path, names: Sequence[str], series: Series, out: Path, workers: int
+    config: Config,
+    policy: Path,
+    names: Sequence[str],
+    series: Series,
+    out: Path,
+    workers: int,
+    generator: Path = SHIPPED,
 ) -> dict[str, Any]:
     """The table of the rows `names`; writes it after every row. Trials that `out` has are not run again.
 
     Args:
       series: objects, trials, seed, seconds and retry, the same for every row; rig, camera and depth are a
         row's own and count for nothing. UserError for what rig fr3 alone has: contact, shapes, coarse camera.
+      generator: the file for rows with a generator's errors. UserError if there is such a row and it is none.
     """
     series = replace(series, rig="development")
     trained = policy_objects(policy, config)
@@ -116,6 +142,11 @@ def run(
         "seconds": series.seconds,
     }
     headers = {name: belong_to | {"row": name} for name in names}
+    generated = [name for name in names if ROWS[name].generated]
+    if generated:
+        file = DepthGenerator(generator).path
+        sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
+        headers |= {name: headers[name] | {"generator_sha256": sha256} for name in generated}
     for name, header in headers.items():
         rig_trials.check_log(out / name, header)
     made: dict[str, Any] = {}
@@ -125,7 +156,7 @@ def run(
         known = len(_known(folder))
         begun = time.monotonic()
         rig_trials.run_missing(
-            config, policy, trials, ROWS[name].make(), headers[name], folder, workers, progress,
+            config, policy, trials, ROWS[name].make(generator), headers[name], folder, workers, progress,
             _FILMED_FAILURES,
         )  # fmt: skip
         new = len(_known(folder)) - known

@@ -41,8 +41,11 @@ class Seen:
     observation: list[Float[np.ndarray, "40"]] = field(default_factory=list)
 
 
-def measure(config: Config, run_dir: Path, series: Series, progress: Progress) -> list[dict[str, Any]]:
-    """Rows of `tabulate`, with the policy in `run_dir`/export acting.
+def measure(
+    config: Config, run_dir: Path, series: Series, change: Change, progress: Progress
+) -> list[dict[str, Any]]:
+    """Rows of `tabulate`, with the policy in `run_dir`/export acting on the rig with that `change`, whatever
+    camera `series` names.
 
     Raises UserError where the run has no exported policy, or that of an earlier student.
     """
@@ -57,7 +60,7 @@ def measure(config: Config, run_dir: Path, series: Series, progress: Progress) -
         )
     policy = exported.directory / POLICY_FILE
     config = series.configured(config, policy)
-    rig = Rig(config, policy, Change(sight="ideal" if series.camera == "ideal" else "stereo"))
+    rig = Rig(config, policy, change)
     params = load_params(run_dir / "student" / PARAMS_FILE)
     outcomes, parts = [], []
     plan = series.plan()

@@ -9,13 +9,16 @@ import pytest
 from ddgrasp.errors import UserError
 from ddgrasp.layout import QPOS
 from ddgrasp.presets import get_preset
-from deploy.changes import Change
+from deploy.changes import Change, SightName
 from deploy.fr3_trials import Fr3Bench, Fr3Runner
+from deploy.generated_camera import GENERATED
+from deploy.trial_log import read_log
 from deploy.trials import Rig, Trial, TrialResult, drawn
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import causes, rig_trials
 from evaluation.report import trials_page
 from evaluation.rig_trials import Series
+from mjx_envs.camera import nominal_camera
 from rig.camera import RigCamera
 from rig.world import make_world
 
@@ -105,6 +108,54 @@ def test_every_trial_is_seen_in_its_changed_world_from_where_its_camera_stands(p
         np.testing.assert_array_equal(seen, expected)
         before, _ = _first_frame(plain, trial, rendered)
         assert np.mean(np.abs(seen - before) > 3) > 0.01
+
+
+def test_a_generators_errors_take_the_place_of_the_cameras_or_of_one_kind_of_them():
+    world = make_world(CONFIG.world)
+    world.reset(3, "cube")
+    pose = nominal_camera(PROFILE).T_world_cam
+    camera = RigCamera(world.model, CONFIG.record.stereo, PROFILE)
+    clean = camera.clean_mm(world.data, pose)
+    own = camera.depth_mm(world.data, pose, np.random.default_rng(7), "cube")
+
+    def seen(sight: SightName):
+        made = Change(sight=sight).make_camera(CONFIG, world)
+        return made.depth_mm(world.data, pose, np.random.default_rng(7), "cube")
+
+    whole, holes, values = (seen(name) for name in GENERATED)
+    np.testing.assert_array_equal(whole, seen("generator"))  # the same trial, the same errors
+    assert 0.02 < np.mean(whole == 0) < 0.3 and 0.02 < np.mean(own == 0) < 0.3
+    assert np.mean((whole == 0) != (own == 0)) > 0.01
+    np.testing.assert_array_equal(holes == 0, whole == 0)
+    np.testing.assert_array_equal(values == 0, own == 0)
+    both = (own > 0) & (whole > 0)
+    np.testing.assert_array_equal(holes[both], own[both])
+    np.testing.assert_array_equal(values[both], whole[both])
+    np.testing.assert_array_equal(holes[(own == 0) & (whole > 0)], clean[(own == 0) & (whole > 0)])
+
+
+def test_frames_of_a_trial_share_a_generators_noise_and_another_trial_has_its_own():
+    world = make_world(CONFIG.world)
+    world.reset(3, "cube")
+    pose, camera = nominal_camera(PROFILE).T_world_cam, Change(sight="generator").make_camera(CONFIG, world)
+    first, other = np.random.default_rng(7), np.random.default_rng(8)
+    frames = [camera.depth_mm(world.data, pose, rng) == 0 for rng in (first, first, other)]
+    assert np.mean(frames[0] != frames[1]) < 0.7 * np.mean(frames[0] != frames[2])
+
+
+def test_rows_with_a_generator_ask_for_its_file_before_anything_runs(tmp_path, policy):
+    out, other = tmp_path / "causes", tmp_path / "generator.onnx"
+    for content, wrong in ((None, "generator.onnx"), (policy.read_bytes(), "ddgrasp ddg export")):
+        if content:
+            other.write_bytes(content)
+        with pytest.raises(UserError, match=wrong):
+            causes.run(CONFIG, policy, ("development", "generator"), SERIES, out, 0, other)
+    assert not out.exists()
+    causes.run(CONFIG, policy, ("development", "generator"), SERIES, out, 0)
+    headers = {
+        name: read_log(out / name / rig_trials.TRIALS_FILE)[0] for name in ("development", "generator")
+    }
+    assert "generator_sha256" in headers["generator"] and "generator_sha256" not in headers["development"]
 
 
 def test_logs_of_other_lengths_are_not_paired_and_old_ones_without_go_on(tmp_path, policy):

@@ -69,8 +69,11 @@ class StudentPerception:
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run, with the stages student and export."""
-    camera: Literal["stereo", "ideal"] = "stereo"
-    """stereo (the rig's own) or ideal (without errors)."""
+    camera: Literal["stereo", "ideal", "generator"] = "stereo"
+    """stereo (the rig's own), ideal (without errors), or generator (depth without errors, with those that a
+    generator draws)."""
+    generator: Path = Path("pretrained/ddg/generator.onnx")
+    """What `ddgrasp ddg export` wrote, for camera generator."""
     objects: tuple[str, ...] = ("all",)
     """Names, or all."""
     trials: Count = 6
@@ -82,13 +85,15 @@ class StudentPerception:
         """Runs the trials and prints a row for each part of them."""
         config = load_config(self.run_dir, "export")
         from ddgrasp.progress import Progress
+        from deploy.changes import Change
         from evaluation import perception, perception_table
         from evaluation.rig_trials import Series
 
-        series = Series("development", self.objects, self.trials, number=self.number, camera=self.camera)
+        series = Series("development", self.objects, self.trials, number=self.number)
         check_tried(series)
         progress = Progress(name="student perception")
-        rows = perception.measure(config, self.run_dir, series, progress)
+        change = Change(sight=self.camera, generator=self.generator)
+        rows = perception.measure(config, self.run_dir, series, change, progress)
         print(perception_table.describe(rows))
         print(perception_table.save(self.run_dir / "student", self.camera, rows))
 

@@ -118,8 +118,9 @@ class StudyCauses:
     policy: Path
     """ONNX file that `ddgrasp export` wrote."""
     rows: tuple[str, ...] = ("all",)
-    """all, or of: ideal, holes, values, ripple, mismatches, full_size, meshes, off_2mm, off_10mm, furniture,
-    dark_table, spring, fr3, test_rig. What they are compared with is tried too."""
+    """all, or of: ideal, holes, values, ripple, mismatches, generator, generator_holes, generator_values,
+    full_size, meshes, off_2mm, off_10mm, furniture, dark_table, spring, fr3, test_rig. What they are compared
+    with is tried too."""
     objects: tuple[str, ...] = ("all",)
     """Names, or all."""
     trials: Count = 10
@@ -130,6 +131,8 @@ class StudyCauses:
     """A trial ends with success, or after this."""
     preset: str | None = None
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
+    generator: Path = Path("pretrained/ddg/generator.onnx")
+    """What `ddgrasp ddg export` wrote, for the rows with a generator's errors."""
     workers: Annotated[int, Range(1, 64)] = 2
     """Rigs that run side by side."""
     out: Path = Path("runs/causes")
@@ -149,9 +152,8 @@ class StudyCauses:
             check_tried(there := replace(series, rig="fr3"))
             there.names()
         check_folder("--out", self.out)
-        made = causes.run(
-            config_of(self.policy, self.preset), self.policy, rows, series, self.out, self.workers
-        )
+        config = config_of(self.policy, self.preset)
+        made = causes.run(config, self.policy, rows, series, self.out, self.workers, self.generator)
         print(self.out / causes.JSON_FILE, self.out / causes.TABLE_FILE, sep="\n")
         print(causes.markdown(made["rows"]))
 
