@@ -37,7 +37,7 @@ class Stage:
 STAGES = (
     Stage(
         "teacher", "ppo.stage", (), ("seed", "world", "teacher", "evaluation.teacher_trials"),
-        "PPO policy on the privileged state",
+        "policy on the privileged state",
     ),
     Stage("demos", "demos.stage", ("teacher",), ("demos",), "successful teacher episodes with clean depth"),
     Stage("record", "rig.stage", ("teacher",), ("record",), "RGB-D recordings from the development rig"),

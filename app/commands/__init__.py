@@ -212,12 +212,13 @@ def _described(name: str) -> str:
 
 
 _PRESET_HELP = (
-    "Presets (--preset): debug (tests), demo (19 to 28 minutes on two cores), laptop (random first weights,",
-    "the teacher from a scripted guide, twelve training objects; 50 to 81 minutes), ppo and ppo_paper",
-    "(laptop with PPO from nothing, six), camera (laptop, the generator for short recordings of a real",
-    "camera), student_paper (laptop with the paper's own student, six), paper (one GPU). Any value can be",
-    "given, for example --teacher.num-envs 64. --scale 0.001 makes all its counts that much smaller, never",
-    "its networks or pictures: a trial run, whose figures mean nothing.",
+    "Presets (--preset): debug (tests; teacher from the pretrained one), demo (teacher from the scripted",
+    "guide, student from the pretrained one; 19 to 28 minutes on two cores), laptop (random first weights,",
+    "teacher from the guide, twelve training objects; 50 to 81 minutes), ppo and ppo_paper (laptop with a",
+    "teacher by PPO from nothing, six), camera (laptop, the generator for short recordings of a real",
+    "camera), student_paper (laptop with the paper's own student, six), paper (PPO from nothing, one GPU).",
+    "Any value can be given, for example --teacher.num-envs 64. --scale 0.001 makes all its counts that much",
+    "smaller, never its networks or pictures: a trial run, whose figures mean nothing.",
     'Commands and options are completed after  eval "$(ddgrasp completion bash)"  (or zsh).',
 )
 
