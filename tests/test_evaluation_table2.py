@@ -1,6 +1,7 @@
 """Table II: statistics against known values, its rows, its tables from outcomes made up for the purpose."""
 
 import hashlib
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -414,6 +415,31 @@ def test_the_paper_s_generator_is_taken_from_elsewhere_and_stays_the_same(tmp_pa
         UserError, match=r"--paper-generator is '', .* was made otherwise \(--paper-generator"
     ):
         planned("--resume")
+    shutil.rmtree(paper)
+    assert planned("--paper-generator", paper, "--resume") == paper
+
+
+def test_a_start_that_is_gone_is_missed_by_rows_that_are_left_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "WEIGHTS_DIR", tmp_path / "no weights")  # row monocular is left out anyway
+    out, gone = tmp_path / "study", ("--student.init-from", "runs/no", "--ddg.init-from", "runs/no")
+
+    def finish(folder: Path, stage: str) -> None:
+        config = command(*gone).config
+        artifacts.finish(folder / stage, stage, config, seconds=1.0, metrics={})
+
+    def planned(*rows: str) -> tuple[str, ...]:
+        return command(*gone, "--out", str(out), "--resume", *rows).planned().rows
+
+    for stage in ("teacher", "ddg"):
+        finish(out / results.SHARED, stage)
+    for name in ("ideal", "dextrah", "learned_ungrafted", "learned"):
+        finish(out / results.STUDENTS / name, "student")
+    there = ("sim_gt", "rand_noise", "inpaint", "ddg_no_graft", "ddg")
+    assert planned("--rows", *there) == there
+    with pytest.raises(UserError, match="student.init_from is 'runs/no', which does not exist"):
+        planned()
+    finish(out / results.STUDENTS / "rig", "student")
+    assert planned() == (*there, "upper_bound")
 
 
 def test_a_table_without_its_network_is_made_without_that_row_which_is_said(tmp_path, monkeypatch):

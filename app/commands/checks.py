@@ -41,17 +41,20 @@ def _is_stated(kind: Any) -> bool:
     return origin is Literal or (origin is Annotated and any(isinstance(x, Range) for x in arguments[1:]))
 
 
-def check_config_values(config: Config, run_dir: Path | None = None) -> Config:
+def check_config_values(
+    config: Config, run_dir: Path | None = None, finished: Collection[str] = ()
+) -> Config:
     """`config` if the names and files in it exist; UserError with the remedy otherwise.
 
-    What a stage starts from is asked for no more where `run_dir` has it finished.
+    What a stage starts from is asked for no more where `run_dir` has it finished, or `finished` names it.
     """
     from ddg_jax import start
     from student_jax.source_check import check_source
 
     check_objects(config.world)
     check_learnable(config)
-    ahead = [stage for stage in CHECKPOINTS if not (run_dir and artifacts.is_finished(run_dir / stage))]
+    made = [stage for stage in CHECKPOINTS if run_dir and artifacts.is_finished(run_dir / stage)]
+    ahead = CHECKPOINTS.keys() - {*made, *finished}
     for stage in ("ddg", "student"):
         if stage in ahead:
             check_start(stage, f"{stage}.init_from", getattr(config, stage).init_from)

@@ -1,5 +1,6 @@
 """ddgrasp study: Table II with its ablations, and where a policy loses, by cause."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -18,6 +19,7 @@ from ddgrasp.config import UNIFORM, Config, DDGConfig
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
 from ddgrasp.install import check_fr3
+from ddgrasp.stages import CHECKPOINTS
 
 if TYPE_CHECKING:
     from app.table2 import Study
@@ -97,16 +99,17 @@ class StudyTable2(FromPreset):
         series.names()
         if self.rig == "fr3":
             check_fr3("--rig fr3")
-        config = rows.shared_config(self.config)
-        check_config_values(config)
-        shared = self.out / results.SHARED
+        config, shared = self.config, self.out / results.SHARED
         left_out = {} if self.rows else _impossible(config, names, shared)
         names = tuple(name for name in names if name not in left_out)
         for name in names:
-            _check_row(config, name, shared, self.paper_generator)
+            made = results.finished(self.out, rows.ROWS[name])
+            _check_row(config, name, shared, made, self.paper_generator)
             if rows.ROWS[name].paper_generator:
                 begun_by = rows.row_config(config, rows.ROWS[name], self.paper_generator)
                 artifacts.check_place(self.out / results.PAPER / "ddg", "ddg", begun_by)
+        if not results.has_students(self.out, names):
+            config = rows.shared_config(config)
         check_devices(config, shared)
         return Study(config, self.out, names, series, self.workers, left_out, self.paper_generator)
 
@@ -173,6 +176,7 @@ def _check_paper_generator(config: DDGConfig, given: str, made: Path) -> None:
                 f"--paper-generator is {given!r}, and {made} was made otherwise ({how}): give the same "
                 "again, or choose another --out."
             )
+        return
     check_start("ddg", "--paper-generator", given)
     if given:
         source = start.folder(replace(config, init_from=given))
@@ -185,11 +189,14 @@ def _check_paper_generator(config: DDGConfig, given: str, made: Path) -> None:
             )
 
 
-def _check_row(config: Config, name: str, shared: Path, paper_from: str = "") -> None:
+def _check_row(
+    config: Config, name: str, shared: Path, finished: Collection[str], paper_from: str = ""
+) -> None:
+    """UserError if the row cannot be made; nothing is asked of the starts of stages that are `finished`."""
     from evaluation.table2.rows import ROWS, row_config
     from evaluation.treatments import make_treatment
 
-    check_config_values(row_config(config, ROWS[name], paper_from))
+    check_config_values(row_config(config, ROWS[name], paper_from), finished=finished)
     make_treatment(ROWS[name].depth, config)
     if ROWS[name].source == "rig" and artifacts.is_finished(shared / "demos"):
         from demos.store import STORE, EpisodeStore
@@ -207,7 +214,7 @@ def _impossible(config: Config, names: tuple[str, ...], shared: Path) -> dict[st
     for name in names:
         if ROWS[name].source in ("monocular", "rig"):
             try:
-                _check_row(config, name, shared)
+                _check_row(config, name, shared, CHECKPOINTS)  # the starts are those of the other rows
             except UserError as error:
                 why[name] = str(error)
     return why

@@ -51,6 +51,16 @@ def has_students(out: Path, rows: Sequence[str]) -> bool:
     return all(artifacts.is_finished(out / STUDENTS / ROWS[row].student / "student") for row in rows)
 
 
+def finished(out: Path, row: Row) -> set[str]:
+    """Those of the stages that begin with a checkpoint which `row` finds made."""
+    folders = {
+        "teacher": SHARED,
+        "ddg": PAPER if row.paper_generator else SHARED,
+        "student": f"{STUDENTS}/{row.student}",
+    }
+    return {stage for stage, folder in folders.items() if artifacts.is_finished(out / folder / stage)}
+
+
 def collect(out: Path) -> dict[str, Any]:
     """What study.json holds of rows and trials.
 
