@@ -13,6 +13,7 @@ import time
 import jax
 import numpy as np
 
+from benchmarks.command import one_line
 from benchmarks.programs import PROGRAMS, Program
 from benchmarks.training_speed import filled
 from ddgrasp.presets import get_preset
@@ -45,6 +46,7 @@ def _of_shapes(argument: object) -> bool:
     return any(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in jax.tree.leaves(argument))
 
 
+@one_line
 def main() -> None:
     """Prints a line for each program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -52,12 +54,13 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--programs", nargs="+", default=NAMES, choices=PROGRAMS, metavar="NAME")
     options = parser.parse_args()
+    config = get_preset(options.preset)
     if compiler_options() is None:
         print("Nothing to compare: this jaxlib is not 0.10, or compiles for an accelerator.")
         return
     print(f"{'ms a call':<24}{'preferred':>10}{'Eigen':>10}{'ratio':>8}")
     for name in options.programs:
-        times = milliseconds(PROGRAMS[name](get_preset(options.preset)), options.rounds)
+        times = milliseconds(PROGRAMS[name](config), options.rounds)
         preferred, eigen = np.median(times, axis=0)
         ratio = np.median(times[:, 0] / times[:, 1])
         print(f"{name:<24}{preferred:>10.0f}{eigen:>10.0f}{ratio:>8.2f}", flush=True)

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import jax
 
+from benchmarks.command import one_line
 from benchmarks.programs import PROGRAMS, lower
 from ddgrasp import contract
 from ddgrasp.config import Config
@@ -111,6 +112,7 @@ def price(config: Config, row: Row, compiled: bool) -> Cost:
     return Cost(row.loops * counted.get("flops", 0.0), row.loops * moved.get("bytes accessed", 0.0))
 
 
+@one_line
 def main() -> None:
     """Prints a table of rows, sums per stage, and the whole."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)

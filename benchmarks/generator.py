@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import compare
+from benchmarks.command import one_line
 from ddg_jax.prior import make_prior
 from ddg_jax.representation import channels, correlations
 from ddg_jax.sample import Generator, condition, frame_noise, generate, grafted
@@ -112,6 +113,7 @@ def parts(config: DDGConfig, params: Any, batch: int, rounds: int) -> None:
         print(f"  {name:<16}{1e3 * np.median(taken) / batch:>8.2f}")
 
 
+@one_line
 def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)

@@ -19,6 +19,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from app.commands.checks import stage_folder
+from benchmarks.command import one_line
 from ddg_jax.sample import Generator, generate
 from ddg_jax.window import mixed
 from ddgrasp import contract
@@ -33,14 +35,15 @@ ABOVE_TABLE_M, NEAR_M = 0.012, 0.10
 _STREAM = 0x5E
 
 
+@one_line
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--model", type=Path, help="folder of a fitted generator")
+    parser.add_argument("--model", type=Path, help="a run with a fitted generator, or its folder ddg")
     parser.add_argument("--windows", type=float, nargs="*", default=[1.0, 1.25, 1.5])
     parser.add_argument("--scenes", type=int, default=6, help="of each object")
     args = parser.parse_args()
-    generator = Generator.load(args.model) if args.model else None
+    generator = Generator.load(stage_folder("--model", args.model, "ddg")) if args.model else None
     rows: dict[str, list[np.ndarray]] = {}
     for number, clean_m, sensed_m, T_world_cam, object_m in scenes(args.scenes):
         seen = {"camera": sensed_m}

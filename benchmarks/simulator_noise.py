@@ -19,6 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Float32
 
+from benchmarks.command import one_line
 from ddgrasp import contract
 from ddgrasp.config import DextrahConfig, KinectConfig, StereoConfig
 from ddgrasp.contract import CameraProfile
@@ -174,6 +175,7 @@ def _regions(depth_m: np.ndarray) -> float:
     return float(np.mean([len(hole_sizes_px(frame)) for frame in depth_m]))
 
 
+@one_line
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -183,11 +185,8 @@ def main() -> None:
     parser.add_argument("--width-px", type=int, default=320, help="pictures are brought to this width")
     parser.add_argument("--threads", type=int, default=0, help="of onnxruntime; 0 takes all cores")
     options = parser.parse_args()
-    try:
-        frames = load_real(options.data, options.width_px, options.score_frames)
-        measure(real_episodes(frames, with_rgb=False), options.generator, options.threads)
-    except UserError as error:
-        parser.error(str(error))
+    frames = load_real(options.data, options.width_px, options.score_frames)
+    measure(real_episodes(frames, with_rgb=False), options.generator, options.threads)
 
 
 if __name__ == "__main__":

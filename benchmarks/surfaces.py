@@ -15,9 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.command import one_line
 from ddg_jax.data import surfaces
 from ddgrasp.config import SURFACES
 from ddgrasp.depth import inverse_depth, to_metres, to_millimetres
+from ddgrasp.errors import UserError
 from evaluation.depth_score import features as score_features
 from evaluation.depth_score.data import REAL, SIM, Episode, load_episode
 from evaluation.depth_score.distances import fid
@@ -64,6 +66,7 @@ def measure(real: Sequence[Episode], sim: Sequence[Episode]) -> None:
         )
 
 
+@one_line
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -75,7 +78,9 @@ def main() -> None:
         for side in (REAL, SIM)
     )
     if not real or not sim:
-        parser.error(f"{options.data} has no trajectories: run `ddgrasp ddg score` and give its score/data.")
+        raise UserError(
+            f"{options.data} has no trajectories: run `ddgrasp ddg score` and give its score/data."
+        )
     measure(real, sim)
 
 

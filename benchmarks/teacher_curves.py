@@ -12,6 +12,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.command import one_line
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes, to_png
 from ddgrasp.progress import read_curves
@@ -20,16 +21,14 @@ _LINES = ("-", "--", ":", "-.")
 """Of the runs with one label."""
 
 
+@one_line
 def main() -> None:
     """Writes the picture and prints its path."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="LABEL=RUN")
     parser.add_argument("--out", type=Path, default=Path("docs/images/teacher_curves.png"))
     args = parser.parse_args()
-    try:
-        picture = draw([_named(text) for text in args.runs])
-    except UserError as error:
-        parser.exit(2, f"{error}\n")
+    picture = draw([_named(text) for text in args.runs])
     atomic_write_bytes(args.out, picture)
     print(args.out)
 

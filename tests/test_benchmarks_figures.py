@@ -1,5 +1,8 @@
 """What benchmarks measure and print: the programs that stages run, what is left out, too few frames."""
 
+import importlib
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +17,28 @@ from evaluation.depth_score.data import SIDES, Episode
 from learning import convolutions
 
 DEBUG = PRESETS["debug"]
+WRONG = {
+    "convolutions --preset lap": "Unknown preset 'lap'. Did you mean 'laptop'?",
+    "costs --preset lap": "Unknown preset 'lap'. Did you mean 'laptop'?",
+    "generator --preset lap": "Unknown preset 'lap'. Did you mean 'laptop'?",
+    "objects_seen --model no": "--model is no, which does not exist: give a run that has made ddg, or its",
+    "simulator_noise no": "no: no such folder; expected a recording or a folder of recordings.",
+    "surfaces no": "no has no trajectories: run `ddgrasp ddg score` and give its score/data.",
+    "teacher_curves ours=no": "no holds no teacher's evaluations: give the directory of a run.",
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_wrong_input_is_one_line(line, tmp_path, monkeypatch, capsys):
+    name, *arguments = line.split()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(f"benchmarks.{name}").main()
+    out, told = capsys.readouterr()
+    assert (ended.value.code, out) == (2, "")
+    assert told.startswith(WRONG[line]) and told.count("\n") == 1
+    assert not list(tmp_path.iterdir())
 
 
 def _options(jitted, arguments) -> str:
