@@ -1,6 +1,6 @@
 """Learning curves of teachers as one picture: success against control steps and against minutes.
 
-    python -m benchmarks.teacher_curves LABEL=RUN [LABEL=RUN ...] [--out docs/images/teacher_curves.png]
+    python -m benchmarks.teacher_curves LABEL=RUN [LABEL=RUN ...] [--out runs/teacher_curves.png]
 
 RUN is a run's directory; runs with the same label, such as several seeds, get one colour. Every point is a
 deterministic evaluation during training: the policy that is kept is the best of them, and is measured anew.
@@ -26,7 +26,7 @@ def main() -> None:
     """Writes the picture and prints its path."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="LABEL=RUN")
-    parser.add_argument("--out", type=Path, default=Path("docs/images/teacher_curves.png"))
+    parser.add_argument("--out", type=Path, default=Path("runs/teacher_curves.png"))
     args = parser.parse_args()
     picture = draw([_named(text) for text in args.runs])
     atomic_write_bytes(args.out, picture)

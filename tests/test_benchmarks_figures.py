@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import generator, objects_seen, simulator_noise
+from benchmarks import generator, objects_seen, simulator_noise, teacher_curves
 from benchmarks.programs import PROGRAMS
 from ddg_jax.train import init_params
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
+from ddgrasp.progress import CURVES
 from evaluation.depth_score.data import SIDES, Episode
 from learning import convolutions
 
@@ -39,6 +40,20 @@ def test_wrong_input_is_one_line(line, tmp_path, monkeypatch, capsys):
     assert (ended.value.code, out) == (2, "")
     assert told.startswith(WRONG[line]) and told.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_goes_to_runs_and_leaves_the_documentation_s_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (shown := tmp_path / "docs" / "images" / "teacher_curves.png").parent.mkdir(parents=True)
+    shown.write_bytes(b"as published")
+    curves = tmp_path / "a" / "teacher" / CURVES
+    curves.parent.mkdir(parents=True)
+    curves.write_text('{"step": 1, "eval_success": 0.5, "control_steps": 1e6, "minutes": 2.0}\n')
+    monkeypatch.setattr(sys, "argv", ["teacher_curves", "ours=a"])
+    teacher_curves.main()
+    assert capsys.readouterr().out == "runs/teacher_curves.png\n"
+    assert (tmp_path / "runs" / "teacher_curves.png").read_bytes()[:4] == b"\x89PNG"
+    assert shown.read_bytes() == b"as published"
 
 
 def _options(jitted, arguments) -> str:
