@@ -394,7 +394,7 @@ def _whose(action: np.ndarray | None, own: np.ndarray | None) -> By | None:
 
 def _state_problem(state: RobotState) -> str:
     if state.q_rad.shape != (7,) or not np.isfinite(state.q_rad).all() or not np.isfinite(state.width_m):
-        return f"bad joint state: {np.array2string(np.asarray(state.q_rad), precision=3)}"
+        return f"bad joint state: {np.array2string(state.q_rad, precision=3)} rad, gripper {state.width_m} m"
     if state.felt_nm is not None and not np.isfinite(state.felt_nm).all():
         return f"bad external torques: {np.array2string(np.asarray(state.felt_nm), precision=3)}"
     return ""

@@ -278,6 +278,15 @@ def test_an_arm_that_does_not_know_what_it_feels_is_held(tmp_path):
     assert report.holds == 1 and report.events[0].reason.startswith("bad external torques: [nan")
 
 
+def test_an_arm_that_does_not_know_how_far_its_hand_is_open_is_held_and_the_opening_named(tmp_path):
+    loop, robot, _ = make_loop(tmp_path, [depth_mm()], SimClock())
+    read, widths = robot.read_state, iter([0.08, float("nan"), 0.08])
+    robot.read_state = lambda: replace(read(), q_rad=np.zeros(7), width_m=next(widths))
+    report = loop.run(max_steps=3)
+    assert report.holds == 1
+    assert report.events[0].reason == "bad joint state: [0. 0. 0. 0. 0. 0. 0.] rad, gripper nan m"
+
+
 def test_after_a_contact_the_rest_of_the_chunk_is_not_played(tmp_path):
     loop, robot, _ = make_loop(tmp_path, [depth_mm()], SimClock(), info=describe(execute_steps=4))
     read, met = robot.read_state, iter(["", "", "", "16 N", *[""] * 4])
