@@ -59,6 +59,7 @@ def write_deployment(
     frames: int = 4,
     held: tuple[int, ...] = (),
     by: tuple[str, ...] = ("policy",) * 4,
+    colour: tuple[int, int] = SIZE,
     **about: str | int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Makes a deployment of four steps as `deploy.record` leaves it; returns (states, depth_mm).
@@ -70,7 +71,7 @@ def write_deployment(
     depth_mm = rng.integers(500, 900, (frames, *SIZE)).astype(np.uint16)
     with RecordingWriter(folder, {"sensor": "stereo, D455 profile"}) as writer:
         for picture in depth_mm:
-            writer.add(np.full((*SIZE, 3), 90, np.uint8), picture)
+            writer.add(np.full((*colour, 3), 90, np.uint8), picture)
     rows = [
         {
             "step": step,

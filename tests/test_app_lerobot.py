@@ -231,6 +231,16 @@ def test_colour_of_another_lens_is_called_so_on_the_card(tmp_path):
         assert ("**Colour**: in 1 of 2 episodes it is the colour camera's own picture" in text) == said
 
 
+def test_deployments_of_two_sizes_are_refused_before_any_is_written(tmp_path):
+    """With colour of its own lens, as from another camera; of what is not taken, sizes count for nothing."""
+    for name, colour in (("a", SIZE), ("b", SIZE), ("c", (24, 32))):
+        write_deployment(tmp_path / name, object="can" if name == "c" else "cube", colour=colour)
+    said = r"c has depth of \(48, 64\) and colour of \(24, 32, 3\), a of .*48, 64, 3.*: a dataset has one"
+    with pytest.raises(UserError, match=said):
+        open_source(tmp_path)
+    assert len(open_source(tmp_path, most=2).episodes) == len(open_source(tmp_path, ["cube"]).episodes) == 2
+
+
 @pytest.mark.parametrize("told", [{"q_rad": [0.0] * 6 + [None]}, {"q_rad": [0.0] * 6}, {"width_m": None}])
 def test_a_step_without_the_robot_s_state_is_no_step_of_a_dataset(tmp_path, told):
     """The loop holds the arm there and notes null; LeRobot would average it to no number at all."""

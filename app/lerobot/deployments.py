@@ -21,6 +21,8 @@ from sensors.recordings.recording import Recording, is_recording
 OBJECT = "object"
 """Where a report names what was to be grasped."""
 _NEEDED = ("q_rad", "width_m", "action")
+Sizes = tuple[tuple[int, ...], tuple[int, ...]]
+"""Shapes of an episode's depth and colour."""
 OPEN = -1.0
 """The gripper's command before the first action: the hand starts open."""
 
@@ -29,24 +31,27 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = (), most: int = 0
     """Those of `found` that can be used as episodes; the others are named with the reason.
 
     With `objects` only those whose report names one of them; the first `most`, 0 for all. Raises UserError if
-    none is left.
+    none is left, or two have pictures of different sizes.
     """
     if objects:
         noted = {str(deployment.report.get(OBJECT, "")) for deployment in found} - {""}
         if unknown := next((name for name in objects if name not in noted), None):
             raise unknown_name("object", unknown, noted)
         found = [deployment for deployment in found if deployment.report.get(OBJECT) in objects]
-    taken, episodes, left_out = [], [], []
+    taken, episodes, left_out, sizes = [], [], [], {}
     for deployment in found:
         if most and len(taken) == most:  # what is said of them is of these alone
             break
         try:
-            episodes.append(partial(_as_it_is, _read(deployment, _pictures(deployment))))
+            episode = _read(deployment, _pictures(deployment))
+            sizes.setdefault(_sizes(episode), episode.name)
+            episodes.append(partial(_as_it_is, episode))
             taken.append(deployment)
         except UserError as error:
             left_out.append(f"{deployment.folder.name}: {error}")
     if not taken:
         raise UserError(f"{found[0].folder.parent}: no episode can be used ({'; '.join(left_out)}).")
+    _check_one_size(sizes)
     about = {
         "Robot": f"Franka arm; driver or rig: {_each(taken, 'robot')}.",
         "Camera": "; ".join(dict.fromkeys(_seen(deployment) for deployment in taken)) + ".",
@@ -56,6 +61,23 @@ def read(found: Sequence[Deployment], objects: Sequence[str] = (), most: int = 0
         "the policy's. Success is what the rig knows or a person answered.",
     }
     return Source("deployments", "franka", about, episodes, left_out)
+
+
+def _sizes(episode: Episode) -> Sizes:
+    depth_mm, rgb = next(iter(episode.pictures()))
+    return depth_mm.shape, () if rgb is None else rgb.shape
+
+
+def _check_one_size(sizes: Mapping[Sizes, str]) -> None:
+    """UserError for more than one of `sizes` (-> an episode that has it): a dataset has one, and all episodes
+    before the first of another size would be encoded in vain."""
+    (first, one), *others = sizes.items()
+    if others:
+        other, another = others[0]
+        raise UserError(
+            f"{another} has depth of {other[0]} and colour of {other[1]}, {one} of {first[0]} and "
+            f"{first[1]}: a dataset has one size; put each into a folder of its own."
+        )
 
 
 def _as_it_is(episode: Episode) -> Episode:
