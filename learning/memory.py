@@ -28,9 +28,11 @@ class Need:
     disk: int = 0
     """Scratch files that it removes in the end."""
     remedy: str = ""
-    """What to lower."""
+    """What to lower for less memory."""
     scratch: str = ""
     """Folder in the stage's own where they lie, if an attempt that goes on finds them."""
+    elsewhere: str = "work on another disk (--out)"
+    """What to do instead of making room on the disk."""
 
     def __str__(self) -> str:
         parts = [f"{self.device / 1e9:.1f} GB for its programs", f"{self.host / 1e9:.1f} GB of arrays"]
@@ -60,7 +62,7 @@ def _places(need: Need, directory: Path) -> Iterator[tuple[str, int, int, str]]:
     there = next(path for path in (directory.absolute(), *directory.absolute().parents) if path.exists())
     written = _bytes_below(directory / need.stage / need.scratch) if need.scratch else 0
     free = shutil.disk_usage(there).free
-    yield f"of disk in {directory}", need.disk - written, free, "free some, or work on another disk (--out)"
+    yield f"of disk in {directory}", need.disk - written, free, f"free some, or {need.elsewhere}"
 
 
 def _bytes_below(folder: Path) -> int:

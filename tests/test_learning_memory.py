@@ -78,6 +78,29 @@ def test_a_students_trials_are_in_its_need():
     assert needed >= student_memory.acting_bytes(many, 4000) > student_memory.need(config).device
 
 
+def test_trials_by_themselves_are_told_or_refused_before_they_begin(tmp_path, monkeypatch, capsys):
+    config, run = PRESETS["debug"], tmp_path / "run"
+    need = student_memory.trials_need(config)
+    trials = config.evaluation.student_trials
+    assert need.disk == trials * config.world.episode_steps * 2 * 90 * 160
+    assert need.device >= student_memory.acting_bytes(config, trials)
+    artifacts.finish(run / "student", "student", config, seconds=1.0, metrics={})
+
+    def evaluate() -> None:
+        parse("student eval", [str(run), "--trials", "300"]).run()
+
+    with pytest.raises(UserError, match="params.msgpack"):  # it got as far as that
+        evaluate()
+    assert capsys.readouterr().err.startswith("student eval: about ")
+    free = SimpleNamespace(free=10**8)
+    monkeypatch.setattr("learning.memory.shutil.disk_usage", lambda path: free)
+    with pytest.raises(UserError, match=r"^Stage student eval needs about 0\.4 GB of disk in .*TMPDIR"):
+        evaluate()
+    monkeypatch.setattr(memory, "host_bytes", lambda: 10**6)
+    with pytest.raises(UserError, match=r"of memory on the host, .*lower the number of trials \(--trials\)"):
+        evaluate()
+
+
 def test_a_batch_of_demos_needs_its_pictures_once():
     """On disk all steps of all environments; drawing them is what the table of programs says."""
     config = PRESETS["debug"]

@@ -7,6 +7,7 @@ files, devices or packages above it.
 import contextlib
 import os
 import sys
+import tempfile
 import typing
 from collections.abc import Collection
 from pathlib import Path
@@ -246,6 +247,16 @@ def tell_fit(config: Config, data: Path, directory: Path, most: int | None = Non
     frames = depth_picture_count(recording_folders(data))
     need = ddg_memory.need(config, frames if most is None else min(most, frames))
     memory.check(need, directory)
+    print(need, file=sys.stderr, flush=True)
+
+
+def tell_trials(config: Config) -> None:
+    """`tell_needs` of a student's trials in its own simulation, which are no stage."""
+    from learning import memory
+    from student_jax.memory import trials_need
+
+    need = trials_need(config)
+    memory.check(need, Path(tempfile.gettempdir()))
     print(need, file=sys.stderr, flush=True)
 
 

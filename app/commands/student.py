@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config, say
-from app.commands.checks import check_folder, check_objects, check_tried
+from app.commands.checks import check_folder, check_objects, check_tried, tell_trials
 from ddgrasp import artifacts, contract
 from ddgrasp.config import Camera, Config, Robot
 from ddgrasp.config.checks import Count, Range, Seed
@@ -53,6 +53,7 @@ class StudentEval:
 
         evaluation = replace(config.evaluation, student_trials=self.trials)
         config = replace(config, seed=self.seed, evaluation=evaluation)
+        tell_trials(config)
         params = load_params(self.run_dir / "student" / PARAMS_FILE)
         source = make_source(config, self.run_dir / "ddg")
         teacher = teacher_policy.load(self.run_dir / "teacher")
