@@ -297,7 +297,6 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
       config: of camera and loop.
     """
     trained, config = policy_objects(policy, config), series.configured(config, policy)
-    config = replace(config, world=replace(config.world, objects=_listed()))
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
     deploy = config.deploy
@@ -329,7 +328,9 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any], alike: Sequence[
 
 
 def made_with(config: Config, policy: Path, trained: Sequence[str]) -> dict[str, Any]:
-    """Policy, what it was `trained` on, configuration and rule in the header of a log of trials."""
+    """Policy, what it was `trained` on, configuration and rule in the header of a log of trials, to which
+    other objects may be added: which ones the rig has counts for nothing."""
+    config = replace(config, world=replace(config.world, objects=_listed()))
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
         "config_hash": artifacts.config_hash(config, STAGE),

@@ -76,6 +76,23 @@ def test_the_table_is_kept_and_its_trials_are_not_run_again(tmp_path, policy):
         causes.run(CONFIG, policy, names, other, out, 0)
 
 
+def test_a_plain_shape_is_added_to_trials_that_stay(tmp_path, policy):
+    series, names = replace(SERIES, objects=("cube",)), causes.chosen(("off_10mm",))
+    more = replace(series, objects=("cube", "stick"))
+    causes.run(CONFIG, policy, names, series, tmp_path / "grown", 0)
+    log = tmp_path / "grown" / "off_10mm" / rig_trials.TRIALS_FILE
+    before = log.read_text()
+    made = causes.run(CONFIG, policy, names, more, tmp_path / "grown", 0)
+    assert [row["success"]["n"] for row in made["rows"]] == [2, 2] and log.read_text().startswith(before)
+    causes.run(CONFIG, policy, names, more, tmp_path / "at once", 0)
+    timed = ("sense_s", "infer_s", "act_s", "latency_s", "period_s")
+    alone, beside = (
+        [json.loads(line) | dict.fromkeys(timed) for line in path.read_text().splitlines()]
+        for path in (log, tmp_path / "at once" / "off_10mm" / rig_trials.TRIALS_FILE)
+    )
+    assert alone == beside, "a scene with room for more objects is the same to the others"
+
+
 def _first_frame(rig, trial, of):
     """(depth of a trial's first step, `of` its (model, data) at that moment)."""
     made = []
