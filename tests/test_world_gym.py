@@ -143,6 +143,24 @@ def test_without_autoreset_chosen_environments_begin_anew():
         env.step(np.zeros((2, 8), np.float32))
 
 
+@pytest.mark.parametrize(
+    ("mask", "said"),
+    [
+        ([0, 1], r"reset_mask is int64 \(2,\)"),  # numbers of environments, both of which were meant
+        (np.array(["no", "no"]), r"reset_mask is <U2 \(2,\)"),
+        ([True], r"reset_mask is bool \(1,\)"),
+        (True, r"reset_mask is bool \(\)"),
+    ],
+)
+def test_a_mask_that_is_none_is_refused_and_begins_nothing_anew(mask, said):
+    env = make_vec(autoreset_mode="Disabled")
+    env.reset(seed=3)
+    before = env.unwrapped._scenes
+    with pytest.raises(UserError, match=rf"^{said}; expected bool \(2,\): True for each environment that"):
+        env.reset(options={"reset_mask": mask})
+    assert env.unwrapped._scenes is before
+
+
 def test_the_camera_is_drawn_apart_from_the_object():
     env = gymnasium.make_vec(ID, num_envs=256, vectorization_mode="vector_entry_point", world=WORLD)
     env.reset(seed=0)

@@ -72,10 +72,13 @@ class PickVectorEnv(VectorEnv):
         seeds = _seeds(seed, self.num_envs)
         super().reset(seed=None if isinstance(seed, Sequence | np.ndarray) else seeds[0])
         everyone = np.ones(self.num_envs, bool)
-        mask = np.asarray((options or {}).get("reset_mask", everyone), bool)
-        if len(seeds) != self.num_envs or mask.shape != (self.num_envs,):
+        mask = np.asarray((options or {}).get("reset_mask", everyone))
+        if len(seeds) != self.num_envs:
+            raise UserError(f"seed has {len(seeds)} seeds; expected {self.num_envs}, or one number.")
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:  # numbers of environments, say
             raise UserError(
-                f"{len(seeds)} seeds, and a reset_mask of {mask.shape}; expected {self.num_envs} of each."
+                f"reset_mask is {mask.dtype} {mask.shape}; expected bool ({self.num_envs},): True for each "
+                "environment that begins anew."
             )
         for i, own in enumerate(seeds):
             if own is not None and mask[i]:
