@@ -15,7 +15,7 @@ from app.commands import parse
 from ddgrasp import artifacts, machine
 from ddgrasp.config import Config, StudentConfig
 from ddgrasp.errors import UserError
-from ddgrasp.progress import PICTURES, Progress
+from ddgrasp.progress import CURVES, PICTURES, Progress
 from ddgrasp.stages import get_stage
 from evaluation import wilson
 from evaluation.report import figures
@@ -280,6 +280,22 @@ def test_every_number_of_a_whole_run_has_a_meaning_and_a_unit_where_it_needs_one
     assert explain("deploy.sense_ms.p50") == ("ms", "reading camera and joints: half take no longer")
     assert explain("loss/v_loss") == ("", "training loss: the value network's")
     assert explain("nonsense.of.ours") == ("", "")
+
+
+def test_a_name_is_explained_if_all_of_its_parts_are(tmp_path):
+    rate = {"rate": 0.5, "n": 2, "successes": 1, "low": 0.1, "high": 0.9}
+    measured = {
+        "sense_ms": {"p50": 1.0, "p51": 1.0}, "since_ms": {"p50": 1.0}, "success": rate, "flag": True,
+        "objects": {"pear": rate}, "rows": [{"object": "pear", "jerk_max": 1.0, "jerk_least": 1.0}],
+        "safety": {"action": 3, "holds_more": 1}, "text": "of nobody",
+    }  # fmt: skip
+    (curves := tmp_path / "deploy" / CURVES).parent.mkdir()
+    curves.write_text('{"step": 1, "loss/v_loss": 1, "loss/w_loss": 1, "reward/lift": 1}\n')
+    report = {"stages": {"deploy": {}}, "deploy": measured}
+    assert unexplained(report, tmp_path) == [
+        "deploy.jerk_least", "deploy.safety.holds_more", "deploy.sense_ms.p51", "deploy.since_ms.p50",
+        "loss/w_loss",
+    ]  # fmt: skip
 
 
 def test_a_number_means_what_its_stage_measures():
