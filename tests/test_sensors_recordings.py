@@ -166,6 +166,23 @@ def test_writer_replaces_and_hides_until_complete(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
+def test_pictures_are_on_the_disk_before_the_file_that_says_they_are_all_there(tmp_path, monkeypatch):
+    synced, on_disk = [], os.fsync
+
+    def fsync(descriptor: int) -> None:
+        state = os.fstat(descriptor)
+        synced.append((state.st_ino, state.st_size))
+        on_disk(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    path = _write(tmp_path / "a", frames=2)
+    last = synced.index(((state := (path / "meta.json").stat()).st_ino, state.st_size))
+    for place in (path / "color", path / "depth", *path.glob("*/*")):
+        state = place.stat()
+        assert (state.st_ino, state.st_size) in synced[:last], place
+    assert len(list(path.glob("*/*"))) == 4
+
+
 def test_damaged_frames_are_named_and_the_rest_stays_readable(tmp_path):
     path = _write(tmp_path / "a", frames=7)
     truncated = path / "depth" / "000001.png"

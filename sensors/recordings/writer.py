@@ -13,7 +13,7 @@ import numpy as np
 from ddgrasp.alone import alone_in
 from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
-from ddgrasp.files import replace_folder
+from ddgrasp.files import fsync, replace_folder
 from sensors.recordings.recording import META_FILE
 
 BEGUN_FILE = "begun.json"
@@ -32,7 +32,8 @@ class RecordingWriter:
 
     Use as a context manager: frames go to a hidden folder beside the target, `meta.json` is
     written last, then the folder is renamed. Leaving by an exception (or Ctrl-C), or failing at the end,
-    removes the hidden folder; a previous recording of that name stays as it was.
+    removes the hidden folder; a previous recording of that name stays as it was. Pictures are on the disk
+    before `meta.json` is: a power cut leaves no recording that says it is whole and is not.
 
     Raises UserError on entering if another one is at work under that name.
     """
@@ -133,6 +134,10 @@ class RecordingWriter:
             "contract_version": CONTRACT_VERSION,
             "invalid_fraction_mean": round(self._invalid / self._frames, 4),
         }
+        # At the end: one that is awaited with every frame would hold up who records them.
+        for folder in (self._temporary / "color", self._temporary / "depth"):
+            for path in (*folder.iterdir(), folder):
+                fsync(path)
         text = json.dumps({**self.meta, **meta}, indent=1) + "\n"
         _write(self._temporary / META_FILE, text.encode(), sync=True)
         (self._temporary / BEGUN_FILE).unlink()
