@@ -1,6 +1,7 @@
 """What is scored, and what is refused before hours of work: frames, their colour, weights, kept episodes."""
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -10,13 +11,15 @@ import pytest
 from ddg_jax.prior import make_prior
 from ddg_jax.sample import Generator
 from ddgrasp import artifacts
-from ddgrasp.config import Config, DDGConfig, ScoreConfig
+from ddgrasp.config import Config, DDGConfig, PriorConfig, ScoreConfig
 from ddgrasp.errors import UserError
+from ddgrasp.files import atomic_write_json
 from ddgrasp.job import Job
+from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
 from ddgrasp.shipped import PRETRAINED
 from ddgrasp.stages import get_stage
-from evaluation.depth_score import curve, samplers, stage
+from evaluation.depth_score import curve, real, samplers, stage
 from evaluation.depth_score import data as score_data
 from evaluation.depth_score import episodes as score_episodes
 from evaluation.depth_score import table as score_table
@@ -24,6 +27,7 @@ from evaluation.depth_score.domains import COLUMNS, FLOOR, RAW, Column, Methods
 from evaluation.depth_score.figures import draw_embedding
 from evaluation.depth_score.resampling import Sample
 from foundation import store
+from job_support import make_job
 from sensors.recordings.writer import RecordingWriter
 
 QUIET = Progress(quiet=True)
@@ -48,6 +52,27 @@ def test_colour_of_recordings_that_are_not_scored_counts_for_nothing(tmp_path):
     write_recording(tmp_path / "b", aligned=True)
     assert score_data.load_real(tmp_path, 32, 8).unaligned == ()
     assert score_data.load_real(tmp_path, 32, 9).unaligned == (tmp_path / "a",)
+
+
+@pytest.mark.parametrize("by", ["column monocular", "prior of simulated colour"])
+def test_colour_of_another_view_is_refused_before_the_fit(tmp_path, by):
+    """By whoever would ask for it once the generator is there; what it is fitted on is aligned."""
+    folder, manifest = tmp_path / "depth_anything_v2_small", store.WeightsManifest
+    made = manifest("depth_anything_v2_small", "x.pth", "ab12", "Apache-2.0", "here", 1, {}, "today")
+    atomic_write_json(folder / store.MANIFEST, made)
+    write_recording(tmp_path / "rooms" / "a", aligned=True)
+    for name in ("b", "c"):
+        write_recording(tmp_path / "rooms" / name, aligned=False)
+    config = PRESETS["debug"]  # whose fit, if it came to that, takes seconds
+    if by == "column monocular":
+        config = replace(config, score=ScoreConfig(monocular_weights=str(folder)))
+    else:
+        prior = PriorConfig(source="depth_anything_v2", weights=str(folder), in_sim="rgb")
+        config = replace(config, ddg=replace(config.ddg, prior=prior))
+    inputs = {"data": tmp_path / "rooms", "fit_frames": 8, "score_frames": 16}
+    with pytest.raises(UserError, match=rf"rooms/b: colour is not aligned to depth, as .*{by}"):
+        real.run(make_job("score_real", config, tmp_path / "score_real", **inputs))
+    assert not list((tmp_path / "score_real").iterdir())
 
 
 @pytest.mark.parametrize("without", ["real_0000", "sim_0001"])

@@ -251,8 +251,9 @@ def check_colour(frames: RealFrames, with_rgb: bool) -> None:
     """UserError if colour is wanted that is not aligned to depth."""
     if with_rgb and frames.unaligned:
         raise UserError(
-            f"{frames.unaligned[0]}: colour is not aligned to depth, as column monocular needs it: align it "
-            "when recording, or leave monocular out of --columns."
+            f"{frames.unaligned[0]}: colour is not aligned to depth, as column monocular and a prior of "
+            "simulated colour need it: align it when recording, or do without them (--columns without "
+            "monocular, --ddg.prior.in-sim depth)."
         )
 
 

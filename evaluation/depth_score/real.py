@@ -46,6 +46,7 @@ def run(job: Job) -> Artifact:
     """Fits a generator on the first `fit_frames` of the recordings below `data` and scores it on the last
     `score_frames` (inputs by these names). The configuration is one of `real_config`.
     """
+    from ddg_jax.prior import make_prior
     from ddg_jax.sample import Generator
 
     config, root = job.config, job.inputs["data"]
@@ -66,7 +67,8 @@ def run(job: Job) -> Artifact:
             "more frames."
         )
     # Before hours of fitting:
-    score_data.check_colour(frames, monocular_network(config.score, config.ddg) is not None)
+    with_rgb = make_prior(config.ddg).needs_sim_rgb or monocular_network(config.score, config.ddg) is not None
+    score_data.check_colour(frames, with_rgb)
     extractors = [score_features.load(name) for name in config.score.features]
     if frames.apart:
         job.progress.note(_apart(frames))
