@@ -32,9 +32,4 @@ def drawing_bytes(config: Config, count: int, rgb: bool) -> int:
     nobody = TeacherPolicy(np.zeros(0), np.zeros(0), [])
     roller = Roller(replace(config, world=world), nobody, count, with_rgb=rgb)
     programs = roller.programs()
-    return max(traced_bytes(*_call(programs[name])) for name in ("depth", *["rgb"] * rgb))
-
-
-def _call(program: tuple) -> tuple:
-    jitted, arguments = program
-    return jitted, *arguments
+    return max(traced_bytes(programs[name]) for name in ("depth", *["rgb"] * rgb))

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.layout import ACTION, QPOS
 from demos.spool import Spool
+from learning.programs import Program, shape
 from mjx_envs import randomize
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.physics.interface import warn_of_dropped
@@ -141,12 +141,12 @@ class Roller:
             **self._objects(state),
         )
 
-    def programs(self) -> dict[str, tuple[Any, tuple[Any, ...]]]:
+    def programs(self) -> dict[str, Program]:
         """Its compiled pieces, each with the shapes of its arguments: to look at without running them."""
-        key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+        key = shape(2, dtype=jnp.uint32)
         state, cameras = jax.eval_shape(self._begin, key)
         geoms = jax.eval_shape(self._pose, state)
-        action = jax.ShapeDtypeStruct((self.count, contract.ACTION_SIZE), jnp.float32)
+        action = shape(self.count, contract.ACTION_SIZE)
         return {
             "begin": (self._begin, (key,)),
             "look": (self._look, (state,)),

@@ -14,6 +14,7 @@ from jax.extend import core
 
 from ddgrasp import machine
 from ddgrasp.errors import UserError
+from learning.programs import Program
 
 
 @dataclass(frozen=True)
@@ -114,12 +115,13 @@ def compiled_bytes(compiled: jax.stages.Compiled) -> int | None:
     return held + stats.temp_size_in_bytes
 
 
-def traced_bytes(jitted: Any, *arguments: Any) -> int:
-    """Bytes that a jitted function takes with `arguments`, or shapes, before anything is compiled.
+def traced_bytes(program: Program) -> int:
+    """Bytes that a program takes, before anything is compiled.
 
     The most that is alive at once if its operations run in the order written, each into an array of its own;
     arguments stay. What the compiler fuses takes less: measured against `compiled_bytes` by the tests.
     """
+    jitted, arguments = program
     return _peak(jitted.trace(*arguments).jaxpr.jaxpr)
 
 

@@ -13,6 +13,7 @@ from ddgrasp.config import GUIDE, Config, WorldConfig
 from ddgrasp.files import atomic_write_json, read_json
 from ddgrasp.progress import Progress
 from learning.checkpoints import Checkpoints
+from learning.programs import Program
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from mjx_envs.physics.interface import dropped_warning
@@ -85,11 +86,7 @@ def initial(config: Config, env: AutoReset) -> Callable[[], learner.LearnerState
     return partial(jax.jit(partial(learner.init, config.teacher, env), out_shardings=places), key)
 
 
-Programs = dict[str, tuple[jax.stages.Wrapped, tuple[Any, ...]]]
-"""Jitted functions by name, each with the shapes of its arguments."""
-
-
-def programs(config: Config, env: AutoReset) -> Programs:
+def programs(config: Config, env: AutoReset) -> dict[str, Program]:
     """What an iteration calls, in this order, on the mesh of `env`: each takes what the last one returned."""
     places, everywhere = learner.shardings(env.mesh), devices.replicated(env.mesh)
     over_envs = devices.over_envs(env.mesh)

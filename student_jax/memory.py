@@ -1,21 +1,14 @@
 """What training the student takes: of the device by shapes alone, of host and disk by counting frames."""
 
 from dataclasses import replace
-from functools import partial
-from typing import Any
-
-import jax
-import jax.numpy as jnp
 
 from ddgrasp import contract
 from ddgrasp.config import Config
 from demos.memory import drawing_bytes
 from learning.memory import Need, traced_bytes
 from learning.prefetch import AHEAD
-from student_jax import train
-from student_jax.act import act_on_depth
+from student_jax import programs
 from student_jax.data import CACHE, Window, kept_of_a_demo
-from student_jax.policy import Aux, param_shapes
 from student_jax.source_check import needs_rgb
 
 _ROW_BYTES = 4 * (9 + 8 + 40 + 1) + 17
@@ -70,34 +63,9 @@ def batch_bytes(config: Config) -> int:
 
 def training_bytes(config: Config) -> int:
     """What an optimiser step on pictures takes."""
-    student, profile = config.student, config.world.profile
-    count, steps = student.training.batch_size, max(1, student.training.steps)
-    size = (count, contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
-    batch = train.Batch(
-        depth_mm=_shape(*size, dtype=jnp.uint16),
-        crop_rc=_shape(count, 2, dtype=jnp.int32),
-        state=_shape(count, contract.POLICY_STATE_SIZE),
-        action=_shape(count, student.head.chunk, contract.ACTION_SIZE),
-        aux=Aux(_shape(count, 3), _shape(count, 2), _shape(count)),
-    )
-    trained, frozen = train.split(student, param_shapes(student, profile))
-    state = jax.eval_shape(partial(train.init_state, student, steps, 0), trained)
-    return traced_bytes(train.train_step, student, profile, steps, state, frozen, batch)
+    return traced_bytes(programs.train_step(config))
 
 
 def acting_bytes(config: Config, count: int) -> int:
     """What the actions for `count` environments take."""
-    student, profile = config.student, config.world.profile
-    depth_mm = _shape(count, contract.DEPTH_FRAMES, profile.height_px, profile.width_px, dtype=jnp.uint16)
-    state, noise = (
-        _shape(count, contract.POLICY_STATE_SIZE),
-        _shape(count, student.head.chunk, contract.ACTION_SIZE),
-    )
-    return traced_bytes(
-        act_on_depth, student, profile, param_shapes(student, profile), depth_mm, state, noise
-    )
-
-
-def _shape(*sizes: int, dtype: Any = jnp.float32) -> Any:
-    """Stands for an array."""
-    return jax.ShapeDtypeStruct(sizes, dtype)
+    return traced_bytes(programs.acting(config, count))

@@ -40,27 +40,17 @@ def test_what_is_alive_at_once_by_hand():
     def looped(x):
         return jax.lax.scan(lambda carry, _: (jnp.sin(carry), None), x, None, 100)[0]
 
-    assert traced_bytes(jax.jit(chain), floats(8)) == 3 * 8 * MB
-    assert traced_bytes(jax.jit(kept), floats(8)) == pytest.approx(4 * 8 * MB, rel=0.01)
-    assert traced_bytes(jax.jit(looped), floats(8)) == 2 * 8 * MB  # not 100
+    assert traced_bytes((jax.jit(chain), (floats(8),))) == 3 * 8 * MB
+    assert traced_bytes((jax.jit(kept), (floats(8),))) == pytest.approx(4 * 8 * MB, rel=0.01)
+    assert traced_bytes((jax.jit(looped), (floats(8),))) == 2 * 8 * MB  # not 100
 
 
 @pytest.mark.parametrize("name", ["generator: train step", "student: train step"])
 def test_estimates_are_near_what_xla_needs(name):
-    jitted, arguments = PROGRAMS[name](PRESETS["debug"])
+    jitted, arguments = program = PROGRAMS[name](PRESETS["debug"])
     compiled = compiled_bytes(jitted.lower(*arguments).compile())
     assert compiled is not None
-    assert 0.9 < traced_bytes(jitted, *arguments) / compiled < 2
-
-
-def test_the_stages_needs_are_those_of_their_programs():
-    config = PRESETS["debug"]
-    for name, need in (("generator: train step", ddg_memory.training_bytes(config.ddg)),
-                       ("student: train step", student_memory.training_bytes(config)),
-                       ("student: DAgger acting",
-                        student_memory.acting_bytes(config, config.student.dagger.episodes))):  # fmt: skip
-        jitted, arguments = PROGRAMS[name](config)
-        assert need == traced_bytes(jitted, *arguments)
+    assert 0.9 < traced_bytes(program) / compiled < 2
 
 
 def test_frames_of_the_paper_need_a_disk_not_memory():
@@ -107,8 +97,7 @@ def test_a_batch_of_demos_needs_its_pictures_once():
     need, pixels = demos_memory.need(config), 90 * 160
     assert need.disk == 6 * 45 * pixels * (2 + 3)
     assert need.device == max(
-        traced_bytes(jitted, *arguments)
-        for jitted, arguments in (PROGRAMS[f"rendering: {name}"](config) for name in ("depth", "colour"))
+        traced_bytes(PROGRAMS[f"rendering: {name}"](config)) for name in ("depth", "colour")
     )
     blind = replace(config, demos=replace(config.demos, rgb=False))
     assert demos_memory.need(blind).disk == 6 * 45 * pixels * 2
