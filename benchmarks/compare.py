@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from ddgrasp import tables
+
 Rates = Mapping[str, np.ndarray]
 """Name -> (rounds,) units of work per second."""
 
@@ -101,24 +103,16 @@ def as_json(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 def print_table(title: str, rows: Sequence[Row]) -> None:
     """Prints the rows to standard output."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
+    columns = ("What", "Unit", "Ours", "Rate", "Peer", "Rate", "Ratio", "Target", "Met")
+    made = tables.table(columns, map(_cells, rows), title, numbers=("Rate", "Ratio", "Target"))
+    tables.console(width=150).print(made)
 
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=150)
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for name in ("What", "Unit", "Ours", "Rate", "Peer", "Rate", "Ratio", "Target", "Met"):
-        table.add_column(name, justify="right" if name in ("Rate", "Ratio", "Target") else "left")
-    for row in rows:
-        met = {True: "yes", False: "NO", None: ""}[row.met]
-        target = "" if row.target is None else f">= {row.target:g}"
-        rates = (_number(row.ours_rate), _number(row.peer_rate))
-        table.add_row(
-            row.what, row.unit, row.ours, rates[0], row.peer, rates[1], _number(row.ratio), target, met
-        )
-    console.print(table)
+
+def _cells(row: Row) -> tuple[str, ...]:
+    met = {True: "yes", False: "NO", None: ""}[row.met]
+    target = "" if row.target is None else f">= {row.target:g}"
+    ours, peer = _number(row.ours_rate), _number(row.peer_rate)
+    return row.what, row.unit, row.ours, ours, row.peer, peer, _number(row.ratio), target, met
 
 
 def _number(value: float | None) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ddgrasp import tables
 from ddgrasp.config import RecordConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
@@ -126,9 +127,7 @@ def write(result: Comparison, out: Path) -> tuple[Path, Path]:
 
 def print_tables(result: Comparison) -> None:
     """Prints scalars, curves and losses per object, cameras side by side."""
-    from rich.console import Console
-
-    console = Console(markup=False, emoji=False)  # names of recordings are no markup
+    console = tables.console()
     groups = side_by_side(result, console.width)
     for group in groups:
         console.print(_table("", group, [(SCALARS[n], [_scalar(n, f) for f in group]) for n in SCALARS]))
@@ -165,33 +164,18 @@ def _curve_table(name: str, title: str, cameras: list[Figures]):
 
 
 def _table(title: str, cameras: list[Figures], rows: list[tuple[str, list[str]]]):
-    from rich import box
-    from rich.table import Table
-
-    table = Table(
-        title=title or None, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False
-    )
-    table.add_column("")
-    for camera in cameras:
-        table.add_column(camera.camera, justify="right")
-    for label, values in rows:
-        table.add_row(label, *values)
-    return table
+    names = [camera.camera for camera in cameras]
+    return tables.table(("", *names), [(label, *values) for label, values in rows], title, numbers=names)
 
 
 def _object_table(objects: dict[str, dict[str, float]]):
-    from rich import box
-    from rich.table import Table
-
-    table = Table(
-        title="rig, by object", title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False
-    )
-    for column in ("object", "pixels", "invalid", "flicker"):
-        table.add_column(column, justify="left" if column == "object" else "right")
-    for name, loss in sorted(objects.items(), key=lambda item: -item[1]["invalid_fraction"]):
-        invalid, flicker = (f"{100 * loss[k]:.1f} %" for k in ("invalid_fraction", "flicker_fraction"))
-        table.add_row(name, f"{loss['pixels']:.0f}", invalid, flicker)
-    return table
+    shares = ("invalid_fraction", "flicker_fraction")
+    rows = [
+        (name, f"{loss['pixels']:.0f}", *(f"{100 * loss[share]:.1f} %" for share in shares))
+        for name, loss in sorted(objects.items(), key=lambda item: -item[1]["invalid_fraction"])
+    ]
+    numbers = ("pixels", "invalid", "flicker")
+    return tables.table(("object", *numbers), rows, "rig, by object", numbers)
 
 
 def _scalar(name: str, camera: Figures) -> str:

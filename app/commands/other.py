@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from app.commands.checks import check_file, check_folder, is_shipped
-from ddgrasp import contract
+from ddgrasp import contract, tables
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from foundation.store import WEIGHTS_DIR
@@ -143,7 +143,6 @@ def _shared(paths: Sequence[tuple[str, ...]], most: int) -> int:
 
 
 def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     shown = Table(box=None)
@@ -151,7 +150,7 @@ def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         shown.add_column(title, overflow="fold")
     for row in rows:
         shown.add_row(*row)
-    Console(markup=False, emoji=False).print(shown)  # names of folders are no markup
+    tables.console().print(shown)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts
+from ddgrasp import artifacts, tables
 from ddgrasp.progress import PICTURES
 from evaluation.depth_score import curve, samplers
 from evaluation.depth_score import table as score_table
@@ -41,20 +41,9 @@ def render(result: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
 
 def print_result(directory: Path) -> None:
     """Prints the tables of a finished score, curve or comparison of samplers, and where the rest is."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(markup=False, emoji=False)  # names of folders are no markup
-    if not console.is_terminal:
-        console = Console(markup=False, emoji=False, width=220)
+    console = tables.console(width=220)
     for title, rows in _tables(artifacts.read_manifest(directory).metrics).items():
-        drawn = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False)
-        for column in rows[0]:
-            drawn.add_column(column, overflow="fold")
-        for row in rows:
-            drawn.add_row(*row.values())
-        console.print(drawn)
+        console.print(tables.table(list(rows[0]), [list(row.values()) for row in rows], title))
     for name in (JSON, curve.JSON, samplers.JSON, HTML, PICTURES):
         if (directory / name).exists():
             print(directory / name)

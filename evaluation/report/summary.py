@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts, contract
+from ddgrasp import artifacts, contract, tables
 from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
 from ddgrasp.stages import ON_REQUEST, STAGES, get_stage
@@ -195,13 +195,7 @@ def trial_run(report: Mapping[str, Any]) -> str:
 
 def print_summary(report: Mapping[str, Any]) -> None:
     """Prints verdict and table of `summary_rows` to standard output, a trial run's with a warning above."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(markup=False, emoji=False)  # names of folders are no markup
-    if not console.is_terminal:
-        console = Console(markup=False, emoji=False, width=140)
+    console = tables.console(width=140)
     if warning := trial_run(report):
         console.print(warning, style="bold", highlight=False)
     judged = targets(report)
@@ -211,12 +205,8 @@ def print_summary(report: Mapping[str, Any]) -> None:
             console.print(
                 f"  not met: {target['target']}: {target['measured']}", style="red", highlight=False
             )
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for title in ("Stage", "From", "Time", "Measured (success: rate of n, Wilson 95 % interval)"):
-        table.add_column(title, overflow="fold")
-    for row in summary_rows(report):
-        table.add_row(*row)
-    console.print(table)
+    columns = ("Stage", "From", "Time", "Measured (success: rate of n, Wilson 95 % interval)")
+    console.print(tables.table(columns, summary_rows(report)))
 
 
 def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
