@@ -4,9 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts
-from ddgrasp.files import atomic_write_json, read_json
-from evaluation import wilson
+from evaluation import beside, wilson
 
 BACKENDS_FILE = "backends.json"
 _KEPT = ("success", "objects", "saturated_actions", "contacts_dropped")
@@ -20,19 +18,12 @@ def save(directory: Path, results: Mapping[str, Mapping[str, Any]], seed: int) -
     rows = {row["backend"]: row for row in load(directory)}
     for name, result in results.items():
         rows[name] = {"backend": name, "seed": seed} | {key: result[key] for key in _KEPT}
-    path = directory / BACKENDS_FILE
-    teacher = artifacts.read_artifact(directory).hash
-    atomic_write_json(path, {"teacher": teacher, "backends": list(rows.values())})
-    return path
+    return beside.save(directory, BACKENDS_FILE, {"backends": list(rows.values())})
 
 
 def load(directory: Path) -> list[dict[str, Any]]:
     """A row for each backend that `save` wrote of the teacher now in `directory`."""
-    path = directory / BACKENDS_FILE
-    if not path.exists():
-        return []
-    saved = read_json(path)
-    return saved["backends"] if saved["teacher"] == artifacts.read_artifact(directory).hash else []
+    return beside.load(directory, BACKENDS_FILE).get("backends", [])
 
 
 def table(directory: Path, trained_on: str) -> list[dict[str, Any]]:

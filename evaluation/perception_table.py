@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts
-from ddgrasp.files import atomic_write_json, read_json
+from evaluation import beside
 
 PERCEPTION_FILE = "perception.json"
 
@@ -25,17 +24,10 @@ def save(directory: Path, camera: str, rows: Sequence[Mapping[str, Any]]) -> Pat
     """Writes the rows of one camera beside the student in `directory`; those of others stay, unless the
     student was made anew since. Returns the file."""
     kept = [row for row in load(directory) if row["camera"] != camera]
-    path = directory / PERCEPTION_FILE
     made = [{"camera": camera, **row} for row in rows]
-    student = artifacts.read_artifact(directory).hash
-    atomic_write_json(path, {"student": student, "rows": kept + made})
-    return path
+    return beside.save(directory, PERCEPTION_FILE, {"rows": kept + made})
 
 
 def load(directory: Path) -> list[dict[str, Any]]:
     """Rows that `save` wrote of the student now in `directory`."""
-    path = directory / PERCEPTION_FILE
-    if not path.exists():
-        return []
-    saved = read_json(path)
-    return saved["rows"] if saved["student"] == artifacts.read_artifact(directory).hash else []
+    return beside.load(directory, PERCEPTION_FILE).get("rows", [])

@@ -10,10 +10,10 @@ from jaxtyping import Real
 from ddgrasp import artifacts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import WorldConfig
-from ddgrasp.files import atomic_write_bytes, atomic_write_json, read_json, to_json
+from ddgrasp.files import atomic_write_bytes, atomic_write_json, to_json
 from ddgrasp.progress import PICTURES
 from ddgrasp.trained import trained_objects
-from evaluation import wilson
+from evaluation import beside, wilson
 from evaluation.report import figures
 
 TRIALS_FILE = "trials.json"
@@ -72,11 +72,8 @@ def save(
 def load(directory: Path) -> list[dict[str, Any]]:
     """The rows that `save` kept of the teacher now in `directory`, if it was tried in the world that it was
     trained in, whatever the objects."""
-    path = directory / TRIALS_FILE
-    if not path.exists():
-        return []
-    saved, teacher = read_json(path), artifacts.read_artifact(directory)
-    its_own = saved["teacher"] == teacher.hash and is_its_world(teacher, saved["world"])
+    saved = beside.load(directory, TRIALS_FILE)
+    its_own = saved and is_its_world(artifacts.read_artifact(directory), saved["world"])
     return saved["objects"] if its_own else []
 
 
