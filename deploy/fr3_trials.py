@@ -15,7 +15,8 @@ from deploy.devices import fr3_camera
 from deploy.devices.franka_robot import LOST
 from deploy.fr3_lab import Fr3Lab, PlacingRobot, Shapes, lab_config
 from deploy.interfaces import RobotError
-from deploy.loop import ControlLoop, LoopReport
+from deploy.loop import ControlLoop
+from deploy.loop_report import LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
 from deploy.treatment import Replacement, Treatment, treated

@@ -23,7 +23,7 @@ from ddgrasp.depth import to_millimetres
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from deploy.interfaces import Camera, Device, Filmed, Judge
 from deploy.interrupts import unbroken
-from deploy.loop import Step
+from deploy.loop_report import Step
 from rig.film import Film, contact_sheet
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any
 from ddgrasp import contract
 from ddgrasp.config import Config
 from deploy.interfaces import Filmed
-from deploy.loop import Step
+from deploy.loop_report import Step
 from deploy.record import DeploymentRecord
 from deploy.trials import Bench, Trial, TrialResult, Watch
 from rig.film import Film

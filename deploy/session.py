@@ -25,7 +25,8 @@ from deploy.devices.registry import check_devices, make_devices
 from deploy.dry_run import DryRun
 from deploy.interfaces import Camera, Clock, KnowsObject, Robot, TimedRobot
 from deploy.interrupts import note, terminable, unbroken
-from deploy.loop import ControlLoop, LoopReport
+from deploy.loop import ControlLoop
+from deploy.loop_report import LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.record import ENDED, REPORT_FILE, DeploymentRecord, verdict
 from deploy.setup import check_start, loop_settings, safety_filter, space_notice, speed_notice

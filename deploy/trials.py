@@ -25,7 +25,8 @@ from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
 from deploy.devices.rig_robot import SimRobot
 from deploy.interfaces import Depth, Filmed, RigCamera
-from deploy.loop import ControlLoop, LoopReport, Step
+from deploy.loop import ControlLoop
+from deploy.loop_report import LoopReport, Step
 from deploy.policy import OnnxPolicy
 from deploy.setup import loop_settings, safety_filter
 from deploy.timing import SECONDS, Timings

@@ -15,7 +15,7 @@ from ddgrasp.depth import to_millimetres
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path, atomic_write_bytes
 from deploy.interfaces import Depth, Filmed, Simulated
-from deploy.loop import Step
+from deploy.loop_report import Step
 from rig.film import colored
 
 VIDEO_CODECS = {".mp4": "mp4v", ".webm": "VP90"}

@@ -17,7 +17,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path
 from ddgrasp.install import pip_install
 from deploy.interfaces import Filmed, Staged
-from deploy.loop import Step
+from deploy.loop_report import Step
 from deploy.video import BrokenOff, millimetres
 
 WEB_PORT, GRPC_PORT = 9090, 9876

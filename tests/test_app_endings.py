@@ -197,7 +197,7 @@ import sys
 from app import cli
 from deploy import session
 from deploy.calibration import session as calibration
-from deploy.loop import LoopReport
+from deploy.loop_report import LoopReport
 def run(*given):
     say = given[-1] if callable(given[-1]) else print  # which it is without one
     say("an event")

@@ -30,7 +30,8 @@ from deploy.devices.options import Setup
 from deploy.devices.realsense_camera import RealSenseCamera
 from deploy.devices.replay_camera import ReplayCamera
 from deploy.interfaces import RobotError
-from deploy.loop import ControlLoop, LoopReport, LoopSettings
+from deploy.loop import ControlLoop, LoopSettings
+from deploy.loop_report import LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.safety import SafetyFilter, SafetyLimits
 from deploy.session import SessionOptions, deploy, for_devices

@@ -37,7 +37,8 @@ from deploy.devices.options import SessionOptions
 from deploy.dry_run import DryRun, draw
 from deploy.interfaces import RobotError
 from deploy.kinematics import grip_pose, grip_position
-from deploy.loop import ControlLoop, LoopReport, LoopSettings
+from deploy.loop import ControlLoop, LoopSettings
+from deploy.loop_report import LoopReport
 from deploy.policy import OnnxPolicy
 from deploy.session import ask_person, deploy
 from deploy.setup import safety_filter, speed_notice

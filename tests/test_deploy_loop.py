@@ -14,7 +14,8 @@ from deploy.clock import RealClock, SimClock
 from deploy.dry_run import DryRun
 from deploy.interfaces import CameraError, RobotError
 from deploy.kinematics import grip_position
-from deploy.loop import KEPT_EVENTS, ControlLoop, LoopSettings
+from deploy.loop import ControlLoop, LoopSettings
+from deploy.loop_report import KEPT_EVENTS
 from deploy.policy import OnnxPolicy
 from deploy.safety import SafetyFilter, SafetyLimits
 from deploy_support import (

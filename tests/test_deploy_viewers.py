@@ -20,7 +20,7 @@ from ddgrasp.shipped import PRETRAINED
 from deploy import viewers
 from deploy.devices.rig_camera import StereoCamera
 from deploy.interfaces import Frame, RobotState
-from deploy.loop import Step
+from deploy.loop_report import Step
 from deploy.policy import OnnxPolicy
 from deploy.video import ANIMATION_PANEL_PX, FAR_MM, NEAR_MM, PANEL_PX, VERDICT_S, Video, depth_picture
 from deploy.viewers import MujocoWindow, Rerun

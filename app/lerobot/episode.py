@@ -28,8 +28,8 @@ class Episode:
     held: Bool[np.ndarray, " T"]
     """Steps in which the control loop held the arm where it was, whatever the policy said."""
     by: Sequence[str] | None = None
-    """Who asked for each step's action, policy or retry (`deploy.loop.By`); empty where the loop held the arm
-    and where nobody noted it. None where no loop drove."""
+    """Who asked for each step's action, policy or retry (`deploy.loop_report.By`); empty where the loop held
+    the arm and where nobody noted it. None where no loop drove."""
     missed: int = 0
     """Control periods without a step, since the loop came late."""
     T_world_cam: Float32[np.ndarray, "4 4"] | None = None
