@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from benchmarks import gpu_check, gpu_sizes
+from benchmarks import gpu_check, gpu_sections, gpu_sizes
 from mjx_envs.render import render_check
 
 
@@ -40,7 +40,7 @@ def test_backends_that_leave_nothing_are_refused_in_one_line(monkeypatch, capsys
 
 
 def test_a_section_cut_off_is_an_error_and_the_next_one_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(gpu_check.SECTIONS, "frames", (gpu_check.frames, 0.1))
+    monkeypatch.setitem(gpu_check.SECTIONS, "frames", (gpu_sections.frames, 0.1))
     out = tmp_path / "check.json"
     assert gpu_check.run_all(["frames", "machine"], "cpu", out) == 1
     report = json.loads(out.read_text())
@@ -137,16 +137,16 @@ def test_frames_are_timed_for_every_size(tmp_path):
 
 def test_the_teacher_from_nothing_starts_from_nothing_and_the_guided_one_from_the_guide():
     for sizes in gpu_sizes.SIZES.values():
-        assert gpu_check.guided(sizes).start == "guide"
-        assert gpu_check.unguided(sizes).start == "nothing"
+        assert gpu_sections.guided(sizes).start == "guide"
+        assert gpu_sections.unguided(sizes).start == "nothing"
 
 
 def test_a_teacher_trains_until_an_evaluation_reaches_the_aim(monkeypatch):
     """One that PPO did not begin to train counts for nothing; a backend that cannot train stops no other."""
     report = {}
-    monkeypatch.setattr(gpu_check, "SUCCESS_AIM", 0.0)
+    monkeypatch.setattr(gpu_sections, "SUCCESS_AIM", 0.0)
     sizes = replace(gpu_sizes.CPU, physics=("abacus", "cpu"))
-    (error,) = gpu_check.ppo_from_nothing(sizes, lambda **values: report.update(values))
+    (error,) = gpu_sections.ppo_from_nothing(sizes, lambda **values: report.update(values))
     assert error.startswith("abacus: UserError: ")
     assert report["start"] == "nothing" and report["backend"] == "cpu"
     assert [row["iteration"] for row in report["evaluations"]] == [0, 1]
