@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ddgrasp import artifacts, config_file
+from ddgrasp import artifacts, attempts, config_file
 from ddgrasp.alone import alone_in
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
@@ -65,7 +65,7 @@ def check_place(config: Config, run_dir: Path, *, resume: bool, stages: Sequence
     if not resume:
         _refuse_occupied(run_dir, [stage.name for stage in stages])
     for stage in stages:
-        artifacts.check_place(run_dir / stage.name, stage.name, config)
+        attempts.check_place(run_dir / stage.name, stage.name, config)
 
 
 def make(
@@ -108,7 +108,7 @@ def _finished(job: Job) -> Artifact | None:
         return None
     artifact = artifacts.read_artifact(job.directory)
     artifacts.check_config(artifact, job.config)
-    artifacts.check_inputs(job.directory, {name: job.identity()[name] for name in job.inputs})
+    attempts.check_inputs(job.directory, {name: job.identity()[name] for name in job.inputs})
     job.progress.note(f"finished before ({artifact.manifest.seconds:.0f} s{_origin(artifact)})")
     return artifact
 
@@ -123,7 +123,7 @@ def _work(job: Job, leads: bool) -> Artifact:
     progress = job.progress
     commit()  # of the code that runs, which hours later may be another's
     progress.note(f"-> {job.directory}: {job.stage.makes}")
-    artifacts.begin(job.directory, job.stage.name, job.config, job.identity(), write=leads)
+    attempts.begin(job.directory, job.stage.name, job.config, job.identity(), write=leads)
     with _interruptible(job.stage.name):
         try:
             artifact = importlib.import_module(job.stage.module).run(job)
@@ -158,7 +158,7 @@ def _refuse_occupied(run_dir: Path, names: Sequence[str]) -> None:
             raise UserError(
                 f"{directory} holds a finished stage: continue with --resume, or choose another --out."
             )
-        if artifacts.has_work(directory):
+        if attempts.has_work(directory):
             raise UserError(
                 f"{directory} holds an unfinished stage: continue with --resume, or choose another --out."
             )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from app import pipeline
-from ddgrasp import artifacts, machine
+from ddgrasp import artifacts, attempts, machine
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, atomic_write_text, read_json, to_json
@@ -68,9 +68,9 @@ def check_place(study: Study, resume: bool) -> None:
     start = start_of(study.config, "student")
     for made in sorted((study.out / STUDENTS).glob("*/student")):
         if artifacts.is_finished(made):  # else rows differ in more than the depth
-            artifacts.check_start(made, start)
+            attempts.check_start(made, start)
     pipeline.create(study.out)
-    artifacts.begin(study.out, LAST_STAGE, study.config)
+    attempts.begin(study.out, LAST_STAGE, study.config)
     for name in study.rows:
         _check_trials(study, name)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts
+from ddgrasp import artifacts, attempts
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.progress import Progress
@@ -19,7 +19,7 @@ class Job:
     """One stage of one run. A stage reads `config` and `parents`, works in `directory`, ends with `finish`.
 
     What an interrupted attempt left in `directory` was begun with the same configuration and inputs
-    (`artifacts.begin`): a stage goes on from it without asking.
+    (`attempts.begin`): a stage goes on from it without asking.
     """
 
     stage: Stage
@@ -61,4 +61,4 @@ def start_of(config: Config, stage: str) -> dict[str, str]:
     found = holding(named, CHECKPOINTS[stage], stage) if named else None
     if found is None:
         return {}
-    return {artifacts.START: hashlib.sha256((found / CHECKPOINTS[stage]).read_bytes()).hexdigest()[:16]}
+    return {attempts.START: hashlib.sha256((found / CHECKPOINTS[stage]).read_bytes()).hexdigest()[:16]}

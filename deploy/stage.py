@@ -6,9 +6,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts, contract
+from ddgrasp import contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
+from ddgrasp.config_hash import config_hash
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes, to_json
 from ddgrasp.job import Job
@@ -75,7 +76,7 @@ def _header(config: Config, policy_path: Path) -> dict[str, Any]:
         )
     return {
         "policy_sha256": hashlib.sha256(policy_path.read_bytes()).hexdigest(),
-        "config_hash": artifacts.config_hash(config, STAGE),
+        "config_hash": config_hash(config, STAGE),
         "trial_s": contract.TRIAL_S,
         "objects": list(tried(config).world.objects),
     } | RULES

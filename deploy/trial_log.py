@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts
+from ddgrasp.config_hash import differences
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_text
 from deploy.trials import TrialResult
@@ -59,7 +59,7 @@ def read_own(path: Path, header: dict[str, Any]) -> list[TrialResult]:
     else than `header` says."""
     there, results = read_log(path)
     if results and there != header:
-        others = ", ".join(artifacts.differences(there, header))
+        others = ", ".join(differences(there, header))
         raise UserError(
             f"{path} was begun otherwise: {others}. Choose another --out, or delete {path.parent} and its "
             f"{len(results)} trials."

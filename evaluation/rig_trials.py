@@ -9,9 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from ddgrasp import artifacts, contract
+from ddgrasp import contract
 from ddgrasp.alone import alone_in
 from ddgrasp.config import Config
+from ddgrasp.config_hash import config_hash
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from ddgrasp.progress import Progress
@@ -333,7 +334,7 @@ def made_with(config: Config, policy: Path, trained: Sequence[str]) -> dict[str,
     config = replace(config, world=replace(config.world, objects=_listed()))
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
-        "config_hash": artifacts.config_hash(config, STAGE),
+        "config_hash": config_hash(config, STAGE),
         _DRAWS: _draws_hash(config),
         _TRAINED: list(trained),
     } | RULES

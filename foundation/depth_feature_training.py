@@ -17,7 +17,7 @@ import optax
 from jax import Array
 from jaxtyping import Float, Int
 
-from ddgrasp import artifacts
+from ddgrasp import artifacts, attempts
 from ddgrasp.alone import alone_in
 from ddgrasp.config import DepthFeatureConfig
 from ddgrasp.errors import UserError
@@ -95,7 +95,7 @@ def _train(config: DepthFeatureConfig, out: Path, quiet: bool) -> dict[str, Any]
 
 
 def _check_begun(config: DepthFeatureConfig, work: Path) -> None:
-    path = work / artifacts.STARTED
+    path = work / attempts.STARTED
     wanted = to_json(config)
     if path.exists() and read_json(path) != wanted:
         raise UserError(f"{work} was begun with other settings: use those, another --out, or delete it.")

@@ -12,7 +12,8 @@ import pytest
 from app import cli
 from app.commands import parse
 from app.commands.study import StudyTable2
-from ddgrasp import artifacts
+from ddgrasp import artifacts, attempts
+from ddgrasp.config_hash import config_hash
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.shipped import PRETRAINED
@@ -92,12 +93,10 @@ def test_rows_differ_in_the_student_s_section_alone_so_that_they_share_what_come
             ("teacher", "demos", "record") if row.paper_generator else ("teacher", "demos", "record", "ddg")
         )
         for stage in stages:
-            assert artifacts.config_hash(made, stage) == artifacts.config_hash(shared, stage)
+            assert config_hash(made, stage) == config_hash(shared, stage)
     by_student = {}
     for row in ROWS.values():
-        by_student.setdefault(row.student, set()).add(
-            artifacts.config_hash(rows.row_config(shared, row), "student")
-        )
+        by_student.setdefault(row.student, set()).add(config_hash(rows.row_config(shared, row), "student"))
     assert all(len(hashes) == 1 for hashes in by_student.values())
     assert len(set().union(*by_student.values())) == len(by_student) == len(ROWS) - 1
     assert ROWS["inpaint"].student == ROWS["sim_gt"].student
@@ -403,7 +402,7 @@ def test_the_paper_s_generator_is_taken_from_elsewhere_and_stays_the_same(tmp_pa
     begun = command(
         "--rows", "paper_ddg", "--out", str(tmp_path / "begun"), "--paper-generator", paper
     ).planned()
-    artifacts.begin(tmp_path / "begun" / "paper" / "ddg", "ddg", begun.row_config(ROWS["paper_ddg"]))
+    attempts.begin(tmp_path / "begun" / "paper" / "ddg", "ddg", begun.row_config(ROWS["paper_ddg"]))
     (tmp_path / "begun" / "paper" / "ddg" / "checkpoint").touch()
     with pytest.raises(
         UserError, match=r"paper/ddg was begun with another .*ddg.init_from is '\S+paper' there"

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from app import cli, pipeline
-from ddgrasp import artifacts
+from ddgrasp import artifacts, attempts
 from ddgrasp.presets import PRESETS
 from report_support import unexplained
 from tutorial_support import code, moved, small
@@ -83,7 +83,7 @@ def finished(tmp_path_factory):
         process = _fork(_run(out), log)
         try:
             deadline = time.monotonic() + TIMEOUT_S
-            while not (out / stage.name / artifacts.STARTED).exists() and process.is_alive():
+            while not (out / stage.name / attempts.STARTED).exists() and process.is_alive():
                 assert time.monotonic() < deadline, f"{stage.name} did not begin in time"
                 time.sleep(0.05)
             time.sleep(KILL_AFTER_S)

@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ddgrasp import artifacts, contract
+from ddgrasp import artifacts, attempts, contract
 from ddgrasp.config import Config, ExportConfig, WorldConfig
+from ddgrasp.config_hash import config_hash
 from ddgrasp.errors import UserError
 from ddgrasp.files import (
     atomic_path,
@@ -171,20 +172,20 @@ def test_every_finish_has_its_own_hash(tmp_path):
 
 def test_the_config_hash_covers_a_stage_and_what_it_is_made_from_only():
     changed = dataclasses.replace(CONFIG, export=dataclasses.replace(CONFIG.export, latency_runs=7))
-    assert artifacts.config_hash(changed, "export") != artifacts.config_hash(CONFIG, "export")
-    assert artifacts.config_hash(changed, "teacher") == artifacts.config_hash(CONFIG, "teacher")
+    assert config_hash(changed, "export") != config_hash(CONFIG, "export")
+    assert config_hash(changed, "teacher") == config_hash(CONFIG, "teacher")
     renamed = dataclasses.replace(CONFIG, preset="mine")
-    assert artifacts.config_hash(renamed, "export") == artifacts.config_hash(CONFIG, "export")
+    assert config_hash(renamed, "export") == config_hash(CONFIG, "export")
     reseeded = dataclasses.replace(CONFIG, seed=1)
-    assert artifacts.config_hash(reseeded, "teacher") != artifacts.config_hash(CONFIG, "teacher")
+    assert config_hash(reseeded, "teacher") != config_hash(CONFIG, "teacher")
 
 
 def test_an_accepted_difference_is_no_part_of_what_a_stage_is(tmp_path):
     looser = dataclasses.replace(CONFIG, export=dataclasses.replace(CONFIG.export, max_abs_diff=1e-3))
-    assert artifacts.config_hash(looser, "export") == artifacts.config_hash(CONFIG, "export")
-    artifacts.begin(tmp_path, "deploy", CONFIG)
+    assert config_hash(looser, "export") == config_hash(CONFIG, "export")
+    attempts.begin(tmp_path, "deploy", CONFIG)
     (tmp_path / "student").touch()
-    artifacts.begin(tmp_path, "deploy", looser)
+    attempts.begin(tmp_path, "deploy", looser)
     _finish(tmp_path / "export")
     artifacts.require(tmp_path, "export", looser)
 
@@ -210,9 +211,9 @@ def _changed(name: str, value: object) -> Config:
 )
 def test_what_a_stage_reads_of_another_section_is_part_of_what_it_is(name, value, stage):
     changed = _changed(name, value)
-    assert artifacts.config_hash(changed, stage) != artifacts.config_hash(CONFIG, stage)
+    assert config_hash(changed, stage) != config_hash(CONFIG, stage)
     before = get_stage(stage).parents
-    assert all(artifacts.config_hash(changed, p) == artifacts.config_hash(CONFIG, p) for p in before)
+    assert all(config_hash(changed, p) == config_hash(CONFIG, p) for p in before)
 
 
 @pytest.mark.parametrize(
@@ -224,19 +225,19 @@ def test_what_a_stage_reads_of_another_section_is_part_of_what_it_is(name, value
     ],
 )
 def test_how_a_result_comes_about_may_change_on_resume(name, stage, tmp_path):
-    artifacts.begin(tmp_path, stage, CONFIG)
+    attempts.begin(tmp_path, stage, CONFIG)
     (tmp_path / "work").touch()
-    artifacts.check_place(tmp_path, stage, _changed(name, 3))
+    attempts.check_place(tmp_path, stage, _changed(name, 3))
 
 
 @pytest.mark.parametrize("name", ["deploy.franka.host", "deploy.realsense.serial"])
 def test_a_lab_s_own_devices_do_not_forbid_to_go_on(name, tmp_path):
-    artifacts.begin(tmp_path, "deploy", CONFIG)
+    attempts.begin(tmp_path, "deploy", CONFIG)
     (tmp_path / "work").touch()
     section, field = name.split(".")[1:]
     mine = dataclasses.replace(getattr(CONFIG.deploy, section), **{field: "192.168.0.7"})
     deploy = dataclasses.replace(CONFIG.deploy, **{section: mine})
-    artifacts.check_place(tmp_path, "deploy", dataclasses.replace(CONFIG, deploy=deploy))
+    attempts.check_place(tmp_path, "deploy", dataclasses.replace(CONFIG, deploy=deploy))
 
 
 def test_an_artifact_of_another_config_is_refused_naming_both_values(tmp_path):
@@ -244,32 +245,32 @@ def test_an_artifact_of_another_config_is_refused_naming_both_values(tmp_path):
     other = dataclasses.replace(CONFIG, export=ExportConfig(latency_runs=7))
     with pytest.raises(UserError, match=r"export\.latency_runs is 200 there, 7 here") as error:
         artifacts.require(tmp_path, "export", other)
-    assert artifacts.config_hash(CONFIG, "export") in str(error.value)
-    assert artifacts.config_hash(other, "export") in str(error.value)
+    assert config_hash(CONFIG, "export") in str(error.value)
+    assert config_hash(other, "export") in str(error.value)
     assert "\n" not in str(error.value)
     artifacts.require(tmp_path, "export", CONFIG)
 
 
 def test_an_unfinished_attempt_of_another_config_is_refused(tmp_path):
-    artifacts.begin(tmp_path / "teacher", "teacher", CONFIG)
+    attempts.begin(tmp_path / "teacher", "teacher", CONFIG)
     (tmp_path / "teacher" / "checkpoint").touch()
-    artifacts.begin(tmp_path / "teacher", "teacher", CONFIG)
+    attempts.begin(tmp_path / "teacher", "teacher", CONFIG)
     other = dataclasses.replace(CONFIG, world=WorldConfig(episode_steps=7))
     with pytest.raises(UserError, match=r"world\.episode_steps is 60 there, 7 here"):
-        artifacts.begin(tmp_path / "teacher", "teacher", other)
+        attempts.begin(tmp_path / "teacher", "teacher", other)
 
 
 @pytest.mark.parametrize("damage", ["whole", "config", "inputs"])
 def test_notes_that_are_none_are_named(tmp_path, damage):
     (directory := tmp_path / "teacher").mkdir()
     begun = {"contract_version": contract.CONTRACT_VERSION, "inputs": {}, "config": to_json(CONFIG)}
-    (directory / artifacts.STARTED).write_text(json.dumps([] if damage == "whole" else begun | {damage: []}))
+    (directory / attempts.STARTED).write_text(json.dumps([] if damage == "whole" else begun | {damage: []}))
     (directory / "checkpoint").touch()
     with pytest.raises(UserError, match=r"teacher/started\.json does not say how a stage was begun: delete"):
-        artifacts.begin(directory, "teacher", CONFIG)
+        attempts.begin(directory, "teacher", CONFIG)
     artifacts.finish(directory, "teacher", CONFIG, seconds=1, metrics={})
     with pytest.raises(UserError, match=r"teacher/started\.json does not say how a stage was begun: delete"):
-        artifacts.check_inputs(directory, {})
+        attempts.check_inputs(directory, {})
     path = directory / artifacts.MANIFEST
     made = read_json(path)
     path.write_text(json.dumps([] if damage == "whole" else made | {damage.replace("inputs", "parents"): 3}))
@@ -278,40 +279,40 @@ def test_notes_that_are_none_are_named(tmp_path, damage):
 
 
 def test_an_unfinished_attempt_with_other_inputs_is_refused(tmp_path):
-    artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a"})
+    attempts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a"})
     (tmp_path / "ddg" / "checkpoint").touch()
     with pytest.raises(UserError, match="data is '/a' there, '/b' here"):
-        artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/b"})
+        attempts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/b"})
     with pytest.raises(UserError, match="begun with other inputs: model is None there, 'x' here"):
-        artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a", "model": "x"})
+        attempts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a", "model": "x"})
     with pytest.raises(UserError, match="begun with other inputs: data is '/a' there, None here"):
-        artifacts.begin(tmp_path / "ddg", "ddg", CONFIG)
+        attempts.begin(tmp_path / "ddg", "ddg", CONFIG)
 
 
 def test_an_attempt_that_left_nothing_binds_nobody(tmp_path):
-    artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a typing error"})
+    attempts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/a typing error"})
     (tmp_path / "ddg" / ".tmp-123-params").write_bytes(b"half")
     (tmp_path / "ddg" / ".tmp-123-checkpoint" / "0").mkdir(parents=True)
     (tmp_path / "ddg" / ".tmp-123-checkpoint" / "0" / "state").write_bytes(b"half")
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "ddg" / ".tmp-123-link").symlink_to(tmp_path / "elsewhere")
-    assert not artifacts.has_work(tmp_path / "ddg")
-    artifacts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/b"})
-    assert [file.name for file in (tmp_path / "ddg").iterdir()] == [artifacts.STARTED]
+    assert not attempts.has_work(tmp_path / "ddg")
+    attempts.begin(tmp_path / "ddg", "ddg", CONFIG, {"data": "/b"})
+    assert [file.name for file in (tmp_path / "ddg").iterdir()] == [attempts.STARTED]
     assert (tmp_path / "elsewhere").is_dir()
-    assert read_json(tmp_path / "ddg" / artifacts.STARTED)["inputs"] == {"data": "/b"}
+    assert read_json(tmp_path / "ddg" / attempts.STARTED)["inputs"] == {"data": "/b"}
 
 
 def test_empty_folders_bind_nobody_and_a_file_in_them_does(tmp_path):
     directory, other = tmp_path / "teacher", dataclasses.replace(CONFIG, seed=5)
-    artifacts.begin(directory, "teacher", CONFIG)
+    attempts.begin(directory, "teacher", CONFIG)
     (directory / "checkpoints" / "0").mkdir(parents=True)
-    assert not artifacts.has_work(directory)
-    artifacts.begin(directory, "teacher", other)
+    assert not attempts.has_work(directory)
+    attempts.begin(directory, "teacher", other)
     (directory / "checkpoints" / "0" / "state").touch()
-    assert artifacts.has_work(directory)
+    assert attempts.has_work(directory)
     with pytest.raises(UserError, match="teacher was begun with another configuration .*seed is 5 there, 0"):
-        artifacts.begin(directory, "teacher", CONFIG)
+        attempts.begin(directory, "teacher", CONFIG)
 
 
 def test_an_artifact_of_another_contract_version_is_refused(tmp_path):
@@ -361,9 +362,9 @@ def test_a_manifest_of_other_values_than_this_project_writes_is_named(tmp_path, 
         return
     begun = {"contract_version": contract.CONTRACT_VERSION, "inputs": {}, "config": to_json(CONFIG)}
     path.rename(directory / "checkpoint")
-    (directory / artifacts.STARTED).write_text(json.dumps(begun | damage))
+    (directory / attempts.STARTED).write_text(json.dumps(begun | damage))
     with pytest.raises(UserError, match=r"started\.json does not say how a stage was begun: delete"):
-        artifacts.begin(directory, "export", CONFIG)
+        attempts.begin(directory, "export", CONFIG)
 
 
 def test_an_absent_stage_is_named_with_the_remedy(tmp_path):

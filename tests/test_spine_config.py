@@ -16,7 +16,6 @@ from app.cli import main
 from app.commands import parse
 from app.commands.checks import check_config_values
 from ddg_jax import prior, sensor
-from ddgrasp.artifacts import config_hash
 from ddgrasp.config import (
     Config,
     DDGConfig,
@@ -42,6 +41,7 @@ from ddgrasp.config import (
 from ddgrasp.config.checks import FreeText, Range, check_value, kinds
 from ddgrasp.config.score import Monocular
 from ddgrasp.config.sensors import SENSORS
+from ddgrasp.config_hash import config_hash
 from ddgrasp.errors import UserError
 from ddgrasp.learnable import check_learnable
 from ddgrasp.presets import PRESETS

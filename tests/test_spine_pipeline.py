@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboardX.record_writer import RecordWriter
 
 from app import pipeline
-from ddgrasp import artifacts, events
+from ddgrasp import artifacts, attempts, events
 from ddgrasp.alone import alone_in
 from ddgrasp.config import Config, WorldConfig
 from ddgrasp.errors import UserError
@@ -178,9 +178,9 @@ def test_what_a_stage_begins_with_is_known_by_its_content(stages, tmp_path):
     start.write_bytes(b"second")
     made()  # what is finished does not need it
     with pytest.raises(UserError, match="was made with other inputs: start is '"):  # a study asks
-        artifacts.check_start(run / "teacher", start_of(config, "teacher"))
+        attempts.check_start(run / "teacher", start_of(config, "teacher"))
     start.unlink()
-    artifacts.check_start(run / "teacher", start_of(config, "teacher"))
+    attempts.check_start(run / "teacher", start_of(config, "teacher"))
 
 
 def test_a_child_of_a_replaced_parent_is_refused(stages, tmp_path):

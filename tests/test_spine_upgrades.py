@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ddgrasp import artifacts, contract, upgrades
+from ddgrasp import artifacts, attempts, contract, upgrades
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json, read_json, to_json
 from ddgrasp.presets import PRESETS
@@ -129,12 +129,12 @@ def test_a_stage_begun_by_version_1_goes_on(tmp_path):
     directory.mkdir()
     (directory / "checkpoint").touch()
     started = {"contract_version": contract.CONTRACT_VERSION, "inputs": {}, "config": FLAT}
-    atomic_write_json(directory / artifacts.STARTED, started)
-    artifacts.begin(directory, "student", CONFIG)
+    atomic_write_json(directory / attempts.STARTED, started)
+    attempts.begin(directory, "student", CONFIG)
     other = dataclasses.replace(CONFIG.student.training, steps=5)
     other = dataclasses.replace(CONFIG, student=dataclasses.replace(CONFIG.student, training=other))
     with pytest.raises(UserError, match=r"student\.training\.steps is 3000 there, 5 here"):
-        artifacts.begin(directory, "student", other)
+        attempts.begin(directory, "student", other)
 
 
 def test_the_hash_of_version_1_is_the_one_that_version_recorded():

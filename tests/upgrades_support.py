@@ -4,15 +4,15 @@ import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ddgrasp import artifacts, upgrades
+from ddgrasp import config_hash, upgrades
 from ddgrasp.config import Config
 from ddgrasp.files import to_json
 
 
 def config_hash_of_version(version: int, config: Config, sections: Sequence[str]) -> str:
-    """`artifacts.config_hash` as an earlier version of the fields had it for a stage that read `sections`."""
+    """`config_hash` as an earlier version of the fields had it for a stage that read `sections`."""
     value = downgraded(to_json(config), version)
-    return artifacts._hash({name: value[name] for name in sections})
+    return config_hash._hash({name: value[name] for name in sections})
 
 
 def _flatten(made: dict[str, Any]) -> None:

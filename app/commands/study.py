@@ -14,7 +14,7 @@ from app.commands.checks import (
     check_tried,
     tell_needs,
 )
-from ddgrasp import artifacts, contract
+from ddgrasp import artifacts, attempts, contract
 from ddgrasp.config import UNIFORM, Config, DDGConfig
 from ddgrasp.config.checks import Count, Range
 from ddgrasp.errors import UserError
@@ -107,7 +107,7 @@ class StudyTable2(FromPreset):
             _check_row(config, name, shared, made, self.paper_generator)
             if rows.ROWS[name].paper_generator:
                 begun_by = rows.row_config(config, rows.ROWS[name], self.paper_generator)
-                artifacts.check_place(self.out / results.PAPER / "ddg", "ddg", begun_by)
+                attempts.check_place(self.out / results.PAPER / "ddg", "ddg", begun_by)
         if not results.has_students(self.out, names):
             config = rows.shared_config(config)
         check_devices(config, shared)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ddgrasp import artifacts, contract, tables
+from ddgrasp import artifacts, attempts, contract, tables
 from ddgrasp.artifacts import Artifact
 from ddgrasp.errors import UserError
 from ddgrasp.stages import ON_REQUEST, STAGES, get_stage
@@ -58,7 +58,7 @@ def build_report(run_dir: Path) -> dict[str, Any]:
         "machine": latest.machine,
         "versions": latest.versions,
         "outdated": outdated,
-        "begun": [s.name for s in STAGES if s.name not in found and artifacts.has_work(run_dir / s.name)],
+        "begun": [s.name for s in STAGES if s.name not in found and attempts.has_work(run_dir / s.name)],
         "stages": {},
     }
     for name, manifest in finished.items():
