@@ -188,20 +188,17 @@ def _joined(metas: list[dict[str, Any]], key: str) -> str:
 
 
 @exact
-def parity(generator: Generator, session: ort.InferenceSession, *, steps: int = 0, seed: int = 0) -> Parity:
+def parity(generator: Generator, session: ort.InferenceSession) -> Parity:
     """The file against `ddg_jax.sample.generate`, every scene an episode of its own, the same noise in both.
 
     Args:
       generator: what the file was made of.
       session: the file.
-      steps: network evaluations, the configuration's by default.
-      seed: of scenes and noise.
     """
-    config, steps = generator.config, steps or generator.config.sampling.steps
-    depth_m = scenes(
-        np.random.default_rng(seed), PARITY_SCENES, (config.depth.height_px, config.depth.width_px)
-    )
-    key, episode = jax.random.key(seed), np.arange(PARITY_SCENES)
+    config, steps = generator.config, generator.config.sampling.steps
+    size = (config.depth.height_px, config.depth.width_px)
+    depth_m = scenes(np.random.default_rng(0), PARITY_SCENES, size)
+    key, episode = jax.random.key(0), np.arange(PARITY_SCENES)
     wanted = generate(key, generator, depth_m, episode=episode, steps=steps)
     noise = jax_noise(config, key, PARITY_SCENES, steps)
     reported, predicted, mask = run(session, depth_m, noise, steps)

@@ -23,9 +23,9 @@ class Checkpoints:
     Every process of a training opens the same folder and makes the same calls.
     """
 
-    def __init__(self, directory: Path, keep: int = KEPT):
+    def __init__(self, directory: Path):
         self.directory = directory
-        options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
+        options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, enable_async_checkpointing=False)
         # Named, or Orbax guesses from the newest one what all hold, which a damaged one does not say.
         handler = ocp.StandardCheckpointHandler()
         self._manager = ocp.CheckpointManager(directory.absolute(), options=options, item_handlers=handler)

@@ -42,11 +42,9 @@ class Schedule(NamedTuple):
         return len(self.betas)
 
 
-def linear_betas(
-    steps: int, first: float = FIRST_LINEAR_BETA, last: float = LAST_LINEAR_BETA
-) -> Float64[np.ndarray, " {steps}"]:
-    """beta_k from `first` to `last` in equal steps, (K,) float64 (Ho et al. 2020, section 4)."""
-    return np.linspace(first, last, steps)
+def linear_betas(steps: int) -> Float64[np.ndarray, " {steps}"]:
+    """beta_k in equal steps, (K,) float64 (Ho et al. 2020, section 4)."""
+    return np.linspace(FIRST_LINEAR_BETA, LAST_LINEAR_BETA, steps)
 
 
 def cosine_betas(steps: int, terminal_time: float = 1.0) -> Float64[np.ndarray, " {steps}"]:

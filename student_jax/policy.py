@@ -231,9 +231,8 @@ def sample_actions(
     config: StudentConfig,
     profile: CameraProfile,
     steps: int = 0,
-    crop_rc: Int[AnyArray, "B 2"] | None = None,
 ) -> Float[jax.Array, "B chunk 8"]:
     """The whole policy: (B, 3, H, W) metres, (B, 9), (B, chunk, 8) noise -> (B, chunk, 8) in [-1, 1]."""
     policy = StudentPolicy(config, profile)
-    seen = policy.apply({"params": params}, depth_m, state, crop_rc, method="encode")
+    seen = policy.apply({"params": params}, depth_m, state, method="encode")
     return sample_from_seen(params, cast(Seen, seen), state, noise, config, profile, steps)

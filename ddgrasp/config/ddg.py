@@ -21,7 +21,7 @@ from ddgrasp.config.checks import (
 from ddgrasp.errors import UserError
 
 Representation = Literal["depth", "deviation"]
-DEPTH, DEVIATION = REPRESENTATIONS = get_args(Representation)
+DEPTH, DEVIATION = get_args(Representation)
 Surface = Literal["filtered", "planes", "piecewise"]
 FILTERED, PLANES, PIECEWISE = SURFACES = get_args(Surface)
 PriorSource = Literal["inverse_depth", "metric_inverse_depth", "video_depth_anything", "depth_anything_v2"]
@@ -31,7 +31,7 @@ NoiseSchedule = Literal["cosine", "linear"]
 HoleLoss = Literal["squared", "cross_entropy"]
 SQUARED, CROSS_ENTROPY = HOLE_LOSSES = get_args(HoleLoss)
 LossWeight = Literal["uniform", "truncated"]
-UNIFORM, TRUNCATED = LOSS_WEIGHTS = get_args(LossWeight)
+UNIFORM, TRUNCATED = get_args(LossWeight)
 Sampler = Literal["dpm_solver", "ddim", "ddpm", "progressive"]
 DPM_SOLVER, DDIM, DDPM, PROGRESSIVE = SAMPLERS = get_args(Sampler)
 Spacing = Literal["leading", "trailing", "linspace", "quadratic"]

@@ -1,7 +1,7 @@
 """The student: a diffusion policy that sees depth alone."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from ddgrasp.config.checks import (
     Batch,
@@ -22,7 +22,6 @@ from ddgrasp.config.sensors import Sensor
 from ddgrasp.errors import UserError
 
 Channel = Literal["relief", "valid", "depth"]
-CHANNELS: tuple[Channel, ...] = get_args(Channel)
 Stem = Literal["conv7", "space_to_depth"]
 Norm = Literal["group", "none"]
 Pooling = Literal["spatial_softmax", "tokens", "mean"]

@@ -18,6 +18,8 @@ from deploy.devices.options import Setup
 from deploy.interfaces import CameraError, Clock, Frame, Robot
 from sensors.recordings.realsense import load_pyrealsense2, project
 
+STREAM_HZ = 30
+_TIMEOUT_MS = 200
 INTRINSICS_TOLERANCE = 0.1
 """A focal length or a principal point further than this share of the focal length from the stream's nominal
 one is another camera, or another mode."""
@@ -49,8 +51,6 @@ class RealSenseCamera:
         *,
         serial: str = "",
         stream: contract.CameraProfile = contract.D455_STREAM,
-        stream_hz: int = 30,
-        timeout_ms: int = 200,
         say: Callable[[str], None] = lambda text: None,
     ):
         """`profile` is the policy's camera, no larger than `stream`, the mode that the camera is run in;
@@ -61,7 +61,6 @@ class RealSenseCamera:
                 f"{stream.width_px}x{stream.height_px}: export it with world.camera_scale 0.5 or less."
             )
         self._clock, self._profile, self._serial, self._say = clock, profile, serial, say
-        self._stream_hz, self._timeout_ms = stream_hz, timeout_ms
         self._pipeline: Any = None
         self._name = ""
         self._unit_m, self._mode, self._stream = contract.DEPTH_UNIT_M, stream, stream
@@ -76,13 +75,13 @@ class RealSenseCamera:
         if self._serial:
             config.enable_device(self._serial)
         size = self._mode.width_px, self._mode.height_px
-        config.enable_stream(rs.stream.depth, *size, rs.format.z16, self._stream_hz)
-        config.enable_stream(rs.stream.color, *size, rs.format.rgb8, self._stream_hz)
+        config.enable_stream(rs.stream.depth, *size, rs.format.z16, STREAM_HZ)
+        config.enable_stream(rs.stream.color, *size, rs.format.rgb8, STREAM_HZ)
         try:
             active = pipeline.start(config)
         except RuntimeError as error:
             raise UserError(
-                f"no RealSense depth and colour streams {size[0]}x{size[1]} at {self._stream_hz} Hz "
+                f"no RealSense depth and colour streams {size[0]}x{size[1]} at {STREAM_HZ} Hz "
                 f"({error}); check the USB 3 cable and deploy.realsense.serial {self._serial!r}."
             ) from error
         self._pipeline = pipeline
@@ -111,7 +110,7 @@ class RealSenseCamera:
         try:
             frames = self._pipeline.poll_for_frames()
             if not frames and self._frame is None:
-                frames = self._pipeline.wait_for_frames(self._timeout_ms)
+                frames = self._pipeline.wait_for_frames(_TIMEOUT_MS)
         except RuntimeError as error:
             raise CameraError(str(error)) from error
         taken = frames.get_depth_frame() if frames else None

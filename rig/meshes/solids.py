@@ -115,9 +115,9 @@ def rounded_box(size: Vector, radius: float) -> trimesh.Trimesh:
     return trimesh.convex.convex_hull((centres[:, None] + ball).reshape(-1, 3))
 
 
-def lathe(profile: Points, transform: Float64[np.ndarray, "4 4"] | None = None) -> trimesh.Trimesh:
+def lathe(profile: Points) -> trimesh.Trimesh:
     """The surface of revolution about z of `profile` (radius, height), closed or ending on the axis."""
-    mesh = trimesh.creation.revolve(np.asarray(profile, float), sections=SIDES, transform=transform)
+    mesh = trimesh.creation.revolve(np.asarray(profile, float), sections=SIDES)
     mesh.fix_normals()
     return mesh
 

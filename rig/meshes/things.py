@@ -23,7 +23,7 @@ from rig.meshes.solids import (
     without,
 )  # fmt: skip
 
-_STEEL, _BLACK = (0.72, 0.73, 0.75), (0.12, 0.12, 0.13)
+_STEEL = (0.72, 0.73, 0.75)
 
 
 def cube() -> tuple[Part, ...]:

@@ -71,10 +71,10 @@ def hole_statistics(depth: Stream) -> dict[str, float]:
     }
 
 
-def hole_sizes_px(depth_mm: Frame, connectivity: int = 8) -> Int[np.ndarray, " holes"]:
-    """(n,) pixel counts of the connected invalid regions of one (H, W) frame."""
+def hole_sizes_px(depth_mm: Frame) -> Int[np.ndarray, " holes"]:
+    """(n,) pixel counts of the invalid regions of one (H, W) frame, connected along sides or corners."""
     holes = (depth_mm <= 0).astype(np.uint8)
-    _, _, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=connectivity)
+    _, _, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=8)
     return stats[1:, cv2.CC_STAT_AREA]
 
 
