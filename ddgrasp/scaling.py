@@ -5,6 +5,7 @@ batch sizes apart. What comes out of it is good for nothing.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 from ddgrasp.config import Config
@@ -63,7 +64,7 @@ def scaled(config: Config, factor: float) -> Config:
     values: Any = {name: _scaled(value_of(config, name), factor, least) for name, least in SCALED.items()}
     minibatches = values["teacher.minibatches"]
     values["teacher.num_envs"] = minibatches * max(1, values["teacher.num_envs"] // minibatches)
-    return _with(config, values | {"scale": float(factor)})
+    return with_values(config, values | {"scale": float(factor)})
 
 
 def value_of(config: Any, name: str) -> Any:
@@ -77,10 +78,10 @@ def _scaled(count: int, factor: float, least: int) -> int:
     return count if factor == 1 else min(count, max(least, round(count * factor)))
 
 
-def _with(section: Any, values: dict[str, Any]) -> Any:
+def with_values(section: Any, values: Mapping[str, Any]) -> Any:
     """The dataclass `section` with other values in it, by dotted name, all at once."""
     own = {name: value for name, value in values.items() if "." not in name}
     for part in {name.partition(".")[0] for name in values if "." in name}:
         inner = {name.partition(".")[2]: v for name, v in values.items() if name.startswith(f"{part}.")}
-        own[part] = _with(getattr(section, part), inner)
+        own[part] = with_values(getattr(section, part), inner)
     return dataclasses.replace(section, **own)

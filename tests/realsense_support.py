@@ -1,5 +1,6 @@
 """librealsense without a camera: its software device fed with synthetic frames, and a stand-in."""
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -8,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 SIZE = (48, 64)
 NAME, SERIAL = "Synthetic D455", "000123"
@@ -235,3 +237,10 @@ class ScriptedLibrary:
             get_data=lambda: pixels, get_frame_number=lambda: number,
             get_frame_timestamp_domain=lambda: self.timestamp_domain.hardware_clock,
         )  # fmt: skip
+
+
+def scripted(monkeypatch: pytest.MonkeyPatch, numbers: Iterable[Any], **how: Any) -> ScriptedLibrary:
+    """The library that drivers load from now on."""
+    library = ScriptedLibrary(numbers, **how)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", library)
+    return library

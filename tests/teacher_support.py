@@ -1,13 +1,15 @@
-"""PPO learners without environments, made by hand: quick to have, and enough for what does not act."""
+"""Teachers made by hand: quick to have, and enough where nothing is learned."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.training.acme import running_statistics, specs
 
 from ddgrasp.config import TeacherConfig
 from ppo import learner
+from ppo.policy import TeacherPolicy
 
 
 def learner_without_envs(config: TeacherConfig) -> learner.LearnerState:
@@ -17,3 +19,9 @@ def learner_without_envs(config: TeacherConfig) -> learner.LearnerState:
     normalizer = running_statistics.init_state(specs.Array((40,), jnp.dtype("float32")))
     begun, zero = learner.make_optimizer(config).init(params), jnp.zeros((), jnp.int32)
     return learner.LearnerState(params, normalizer, begun, None, key, zero, zero)  # pyright: ignore
+
+
+def still_teacher() -> TeacherPolicy:
+    """A policy of zeros: the arm keeps its pose."""
+    layer = np.zeros((40, 16), np.float32), np.zeros(16, np.float32)
+    return TeacherPolicy(np.zeros(40, np.float32), np.ones(40, np.float32), [layer])

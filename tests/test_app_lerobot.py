@@ -20,6 +20,7 @@ from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from ddgrasp.stages import get_stage
 from lerobot_support import LENGTHS, OBJECTS, SIZE, write_demos, write_deployment, write_noisy
+from recording_support import set_meta
 
 NAMES = get_preset("debug").world.objects
 QUIET = Progress(quiet=True)
@@ -211,14 +212,10 @@ def test_who_acted_is_in_every_step_and_counted_on_the_card(tmp_path):
     assert (contents.retried, contents.unnoted) == (0, 0)
 
 
-def set_json(path: Path, **values) -> None:
-    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
-
-
 def test_colour_of_another_lens_is_called_so_on_the_card(tmp_path):
     for name in ("real", "rig"):
         write_deployment(tmp_path / name)
-    set_json(tmp_path / "real" / "meta.json", color_aligned_to_depth=False)  # as a RealSense's
+    set_meta(tmp_path / "real", color_aligned_to_depth=False)  # as a RealSense's
     source = open_source(tmp_path)
     episodes = [read() for read in source.episodes]
     assert [episode.color_aligned for episode in episodes] == [False, True]

@@ -1,6 +1,5 @@
 """The built-in prior and the loading of recordings, by value on small pictures."""
 
-import json
 import tracemalloc
 from dataclasses import replace
 from functools import partial
@@ -17,7 +16,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
 from learning import memory
-from sensors.recordings.writer import RecordingWriter
+from recording_support import flat, set_meta, write_depth
 from sensors.statistics.holes import fill_from_background
 
 
@@ -138,11 +137,9 @@ def test_resizing_never_mixes_holes_into_surfaces():
 def recordings(tmp_path):
     rng = np.random.default_rng(0)
     for name in ("a", "b"):
-        with RecordingWriter(tmp_path / name, {}) as writer:
-            for _ in range(3):
-                depth = rng.integers(700, 900, (36, 64)).astype(np.uint16)
-                depth[:, :5] = 0
-                writer.add(np.zeros((36, 64, 3), np.uint8), depth)
+        depth_mm = rng.integers(700, 900, (3, 36, 64)).astype(np.uint16)
+        depth_mm[..., :5] = 0
+        write_depth(tmp_path / name, depth_mm)
     return tmp_path
 
 
@@ -195,10 +192,8 @@ def test_the_held_out_frames_alone_are_those_that_all_of_them_hold_out(recording
 def test_what_is_held_out_is_so_among_the_frames_that_can_be_used(tmp_path, last_mm):
     """Of the first recording half is there again, of the last all or nothing can be used."""
     for name, repeated in (("a", 10), ("b", 0)):
-        with RecordingWriter(tmp_path / name, {"repeated_frames": repeated}) as writer:
-            for number in range(20):
-                depth_mm = 800 + number // 2 if name == "a" else last_mm and last_mm + number
-                writer.add(np.zeros((18, 32, 3), np.uint8), np.full((18, 32), depth_mm, np.uint16))
+        depths_mm = (800 + n // 2 if name == "a" else last_mm and last_mm + n for n in range(20))
+        write_depth(tmp_path / name, (flat((18, 32), mm) for mm in depths_mm), repeated_frames=repeated)
     config = replace(WIDE, training=DDGTrainingConfig(holdout_fraction=0.1))
     given = tmp_path, config, prior.make_prior(config), 0, Progress(quiet=True)
     _, held = data.load_frames(*given).split(0.1)
@@ -206,12 +201,8 @@ def test_what_is_held_out_is_so_among_the_frames_that_can_be_used(tmp_path, last
 
 
 def _record(path, frames: int = 2, size=(36, 64), **changes):
-    with RecordingWriter(path, {}) as writer:
-        for _ in range(frames):
-            writer.add(np.zeros((*size, 3), np.uint8), np.full(size, 900, np.uint16))
-    for name, value in changes.items():
-        meta = json.loads((path / "meta.json").read_text())
-        (path / "meta.json").write_text(json.dumps(meta | {name: value}))
+    write_depth(path, frames * [flat(size, 900)])
+    set_meta(path, **changes)
 
 
 class Notes(Progress):
@@ -236,11 +227,9 @@ def load(root, config=WIDE):
 @pytest.mark.parametrize("follow", [False, True])
 def test_frames_go_together_only_where_a_recording_says_that_they_follow_each_other(tmp_path, follow):
     """A table, then a box on it within what counts as one surface."""
-    with RecordingWriter(tmp_path / "a", {"consecutive_frames": follow}) as writer:
-        for height_mm in (0, 49):
-            depth = np.full((36, 64), 1300, np.uint16)
-            depth[12:24, 20:40] -= np.uint16(height_mm)  # 0.03 of 0.77 per metre
-            writer.add(np.zeros((36, 64, 3), np.uint8), depth)
+    table, box = flat((36, 64), 1300), flat((36, 64), 1300)
+    box[12:24, 20:40] -= np.uint16(49)  # 0.03 of 0.77 per metre
+    write_depth(tmp_path / "a", [table, box], consecutive_frames=follow)
     metric = PriorConfig(source="metric_inverse_depth", decoy_holes=0.0)
     frames, _ = load(tmp_path, DDGConfig(depth=WIDE.depth, prior=metric))
     assert (np.ptp(frames.prior[0].astype(float)) > 0.01) == follow  # the table alone is flat
@@ -249,9 +238,8 @@ def test_frames_go_together_only_where_a_recording_says_that_they_follow_each_ot
 
 def test_a_frame_that_came_again_is_learnt_from_once(tmp_path):
     """A deployment whose camera stalled holds a picture for every step."""
-    with RecordingWriter(tmp_path / "a", {"repeated_frames": 3}) as writer:
-        for depth_mm in (800, 801, 801, 801, 801, 800):
-            writer.add(np.zeros((36, 64, 3), np.uint8), np.full((36, 64), depth_mm, np.uint16))
+    seen = (flat((36, 64), depth_mm) for depth_mm in (800, 801, 801, 801, 801, 800))
+    write_depth(tmp_path / "a", seen, repeated_frames=3)
     frames, said = load(tmp_path)
     np.testing.assert_allclose(frames.depth_m[:, 0, 0], [0.8, 0.801, 0.8], rtol=1e-6)
     assert said[0].endswith("left out 3 frame(s) that came again") and frames.skipped_frames == 3

@@ -29,7 +29,7 @@ from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress, read_curves
 from job_support import make_job
 from learning.params import load_params
-from sensors.recordings.writer import RecordingWriter
+from recording_support import flat, write_depth
 
 CONFIG = Config(
     preset="test",
@@ -47,13 +47,12 @@ CONFIG = Config(
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     root = tmp_path_factory.mktemp("recordings")
+    frames = [flat((32, 48), 900) for _ in range(4)]
+    for t, depth in enumerate(frames):
+        depth[8:20, 20 + 2 * t : 30 + 2 * t] = 600
+        depth[8:20, 16 + 2 * t : 20 + 2 * t] = 0
     for name in ("a", "b"):
-        with RecordingWriter(root / name, {"consecutive_frames": True}) as writer:
-            for t in range(4):
-                depth = np.full((32, 48), 900, np.uint16)
-                depth[8:20, 20 + 2 * t : 30 + 2 * t] = 600
-                depth[8:20, 16 + 2 * t : 20 + 2 * t] = 0
-                writer.add(np.zeros((32, 48, 3), np.uint8), depth)
+        write_depth(root / name, frames, consecutive_frames=True)
     return root
 
 

@@ -17,7 +17,7 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config, DDGConfig, DDGDepthConfig, SamplingConfig, UNetConfig
 from ddgrasp.progress import Progress
 from learning.params import save_params
-from sensors.recordings.writer import RecordingWriter
+from recording_support import flat, write_depth
 
 CONFIG = DDGConfig(
     depth=DDGDepthConfig(height_px=16, width_px=24),
@@ -66,12 +66,11 @@ def make(tmp_path, **frames: int) -> None:
     save_params(tmp_path / "ddg" / PARAMS_FILE, params)
     metrics = {"frames": frames} if frames else {}
     artifacts.finish(tmp_path / "ddg", "ddg", Config(preset="test", ddg=CONFIG), seconds=1, metrics=metrics)
-    with RecordingWriter(tmp_path / "recording", {}) as writer:
-        for t in range(4):
-            depth = np.full((32, 48), 900, np.uint16)
-            depth[8:20, 16 + t : 20 + t] = 0
-            depth[: 2 * t] = 0
-            writer.add(np.zeros((32, 48, 3), np.uint8), depth)
+    recorded = [flat((32, 48), 900) for _ in range(4)]
+    for t, depth in enumerate(recorded):
+        depth[8:20, 16 + t : 20 + t] = 0
+        depth[: 2 * t] = 0
+    write_depth(tmp_path / "recording", recorded)
 
 
 @pytest.mark.parametrize(

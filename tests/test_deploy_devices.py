@@ -44,7 +44,7 @@ from deploy_support import (
     describe,
     write_policy,
 )
-from sensors.recordings.writer import RecordingWriter
+from recording_support import flat, write_depth
 
 SIZE = (45, 80)
 
@@ -52,11 +52,8 @@ SIZE = (45, 80)
 @pytest.fixture
 def recording(tmp_path) -> Path:
     """Four frames, 700, 710, 720 and 730 mm everywhere."""
-    path = tmp_path / "recording"
-    with RecordingWriter(path, {"consecutive_frames": True}) as writer:
-        for index in range(4):
-            writer.add(np.zeros((*SIZE, 3), np.uint8), np.full(SIZE, 700 + 10 * index, np.uint16))
-    return path
+    frames = (flat(SIZE, 700 + 10 * index) for index in range(4))
+    return write_depth(tmp_path / "recording", frames, consecutive_frames=True)
 
 
 def test_replay_follows_the_clock_and_ends_on_its_last_frame(recording):
@@ -86,8 +83,7 @@ def test_a_recording_of_another_size_is_played_as_the_policys_camera_would_have_
     columns = np.tile(np.arange(1, 849, dtype=np.uint16), (480, 1))
     mine = {"fx_px": contract.D455_STREAM.fx_px}
     for name, meta in (("known", mine), ("unknown", {})):
-        with RecordingWriter(tmp_path / name, meta) as writer:
-            writer.add(np.zeros((480, 848, 3), np.uint8), columns)
+        write_depth(tmp_path / name, [columns], **meta)
     known, unknown = (
         ReplayCamera.open(tmp_path / name, SimClock(), PROFILE).read().depth for name in ("known", "unknown")
     )

@@ -1,7 +1,6 @@
 """The RealSense's camera and imager before a scripted library: begun, read, ended, and gone wrong."""
 
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,7 +14,8 @@ from deploy.clock import SimClock
 from deploy.devices.realsense_camera import RealSenseCamera
 from deploy.devices.realsense_imager import SKIPPED, RealSenseImager
 from deploy.interfaces import CameraError
-from realsense_support import FX_PX, SERIAL, SIZE, ScriptedLibrary, depth_mm, rgb
+from realsense_support import FX_PX, SERIAL, SIZE, depth_mm, rgb
+from realsense_support import scripted as script
 
 STREAM = replace(
     contract.D455_STREAM, width_px=SIZE[1], height_px=SIZE[0], fx_px=FX_PX, fy_px=FX_PX, cx_px=SIZE[1] / 2,
@@ -28,13 +28,7 @@ UNPLUGGED = "No device connected"
 @pytest.fixture
 def scripted(monkeypatch):
     """Makes the library that drivers load."""
-
-    def make(*numbers, **how) -> ScriptedLibrary:
-        library = ScriptedLibrary(numbers, **how)
-        monkeypatch.setitem(sys.modules, "pyrealsense2", library)
-        return library
-
-    return make
+    return lambda *numbers, **how: script(monkeypatch, numbers, **how)
 
 
 def camera(serial: str = "", say: Callable[[str], None] = lambda text: None) -> RealSenseCamera:

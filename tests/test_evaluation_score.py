@@ -47,6 +47,7 @@ from evaluation.depth_score.episodes import Scored, collect, score_episodes
 from evaluation.depth_score.figures import draw_efficiency
 from evaluation.report.stage import write_report
 from job_support import make_job
+from recording_support import flat, set_meta, write_depth
 from sensors.inpainting import inpainted
 from sensors.recordings.writer import RecordingWriter
 from weights_support import depth_anything_v2_small
@@ -208,8 +209,7 @@ def test_disparity_is_the_recorded_cameras_own(tmp_path):
 def test_recordings_of_frames_that_may_not_follow_each_other_are_known(tmp_path):
     for name, follow in (("a", False), ("b", True), ("c", False)):
         write_recording(tmp_path / name, 8, (48, 64))
-        meta = tmp_path / name / "meta.json"
-        meta.write_text(json.dumps({**json.loads(meta.read_text()), "consecutive_frames": follow}))
+        set_meta(tmp_path / name, consecutive_frames=follow)
     assert score_data.load_real(tmp_path, 32, 16).apart == {2: tmp_path / "c"}
     assert score_data.load_real(tmp_path / "b", 32, 8).apart == {}
     (tmp_path / "b" / "color" / "000003.jpg").unlink()  # between others
@@ -217,10 +217,8 @@ def test_recordings_of_frames_that_may_not_follow_each_other_are_known(tmp_path)
 
 
 def test_a_picture_that_came_again_stands_on_one_side_alone(tmp_path):
-    with RecordingWriter(tmp_path / "a", {"fx_px": 40.0, "baseline_m": 0.05, "repeated_frames": 4}) as writer:
-        for number in range(20):
-            depth_mm = 800 + (number - number % 2 if number < 8 else number)
-            writer.add(np.zeros((48, 64, 3), np.uint8), np.full((48, 64), depth_mm, np.uint16))
+    seen = [flat((48, 64), 800 + (n - n % 2 if n < 8 else n)) for n in range(20)]
+    write_depth(tmp_path / "a", seen, fx_px=40.0, baseline_m=0.05, repeated_frames=4)
     real = score_data.load_real(tmp_path / "a", 32, 18)
     assert real.total == 20 and (real.depth_mm[:, 0, 0] - 800).tolist() == [2, 4, 6, *range(8, 20)]
 
@@ -258,8 +256,7 @@ def test_scored_recordings_are_of_one_camera_and_long_enough(tmp_path, capsys):
 
 def test_colour_of_another_view_is_no_monocular_network_s(tmp_path):
     write_recording(tmp_path / "room", 8, (48, 64))
-    meta = tmp_path / "room" / "meta.json"
-    meta.write_text(json.dumps({**json.loads(meta.read_text()), "color_aligned_to_depth": False}))
+    set_meta(tmp_path / "room", color_aligned_to_depth=False)
     frames = score_data.load_real(tmp_path / "room", 32, 8)
     assert len(score_data.real_episodes(frames, with_rgb=False)) == 2
     with pytest.raises(UserError, match="room: colour is not aligned to depth"):

@@ -1,6 +1,5 @@
 """What is scored, and what is refused before hours of work: frames, their colour, weights, kept episodes."""
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +27,7 @@ from evaluation.depth_score.figures import draw_embedding
 from evaluation.depth_score.resampling import Sample
 from foundation import store
 from job_support import make_job
-from sensors.recordings.writer import RecordingWriter
+from recording_support import flat, set_meta, write_depth
 
 QUIET = Progress(quiet=True)
 
@@ -40,11 +39,8 @@ def episode(side: str, colour: bool = True) -> score_data.Episode:
 
 
 def write_recording(path: Path, aligned: bool) -> None:
-    with RecordingWriter(path, {"fx_px": 40.0, "sensor": "RealSense D435"}) as writer:
-        for _ in range(8):
-            writer.add(np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 700, np.uint16))
-    meta = path / "meta.json"
-    meta.write_text(json.dumps({**json.loads(meta.read_text()), "color_aligned_to_depth": aligned}))
+    write_depth(path, 8 * [flat((48, 64), 700)], fx_px=40.0, sensor="RealSense D435")
+    set_meta(path, color_aligned_to_depth=aligned)
 
 
 def test_colour_of_recordings_that_are_not_scored_counts_for_nothing(tmp_path):

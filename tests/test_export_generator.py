@@ -29,7 +29,7 @@ from export import prior_graph
 from export.builder import GraphBuilder, tensor
 from export.generator_graph import build_model
 from export.parity import open_session
-from sensors.recordings.writer import RecordingWriter
+from recording_support import flat, write_depth
 from sensors.statistics import holes
 
 SMALL = DDGConfig(
@@ -231,11 +231,9 @@ def test_optics_in_the_file_are_those_of_what_the_generator_sees(tmp_path, sizes
     finished(made(CAMERA), tmp_path / "ddg")
     config = replace(CAMERA, depth=replace(CAMERA.depth, height_px=24, width_px=32))
     for number, (size, fx) in enumerate(zip(sizes, fx_px, strict=True)):
-        with RecordingWriter(tmp_path / "all" / str(number), {"fx_px": fx}) as writer:
-            depth_mm = np.full(size, 9000, np.uint16)
-            rows, columns = (size[0] - 48) // 2, (size[1] - 64) // 2
-            depth_mm[rows : rows + 48, columns : columns + 64] = 1000
-            writer.add(np.zeros((*size, 3), np.uint8), depth_mm)
+        depth_mm, rows, columns = flat(size, 9000), (size[0] - 48) // 2, (size[1] - 64) // 2
+        depth_mm[rows : rows + 48, columns : columns + 64] = 1000
+        write_depth(tmp_path / "all" / str(number), [depth_mm], fx_px=fx)
     camera = exported.describe(artifacts.read_artifact(tmp_path / "ddg"), config, tmp_path / "all").camera
     assert (camera["height_px"], camera["width_px"], camera["fx_px"]) == window
     assert camera["near_m"] == camera["far_m"] == 1.0
@@ -245,8 +243,7 @@ def test_recordings_that_a_fit_leaves_out_do_not_keep_a_generator_from_its_file(
     finished(made(CAMERA), tmp_path / "ddg")
     artifact, room = artifacts.read_artifact(tmp_path / "ddg"), tmp_path / "room"
     for name in ("good", "torn"):
-        with RecordingWriter(room / name, {"sensor": name}) as writer:
-            writer.add(np.zeros((36, 64, 3), np.uint8), np.full((36, 64), 1000, np.uint16))
+        write_depth(room / name, [flat((36, 64), 1000)], sensor=name)
     next((room / "torn" / "depth").iterdir()).write_bytes(b"no picture")
     camera = exported.describe(artifact, CAMERA, room).camera
     assert (camera["name"], camera["near_m"]) == ("good", 1.0)
@@ -258,10 +255,8 @@ def test_recordings_that_a_fit_leaves_out_do_not_keep_a_generator_from_its_file(
 def test_the_file_names_the_recordings_camera(tmp_path):
     generator = made(CAMERA)
     finished(generator, tmp_path / "ddg")
-    room = tmp_path / "room"
-    with RecordingWriter(room, {"sensor": "D435", "fx_px": 40.0, "licence": "MIT"}) as writer:
-        depth_mm = np.linspace(700, 1500, 48 * 64).reshape(48, 64).astype(np.uint16)
-        writer.add(np.zeros((48, 64, 3), np.uint8), depth_mm)
+    depth_mm = np.linspace(700, 1500, 48 * 64).reshape(48, 64).astype(np.uint16)
+    room = write_depth(tmp_path / "room", [depth_mm], sensor="D435", fx_px=40.0, licence="MIT")
     artifact = artifacts.read_artifact(tmp_path / "ddg")
     described = exported.describe(artifact, CAMERA, room)
     assert (described.licence, described.manifest_hash) == ("MIT", artifact.hash)

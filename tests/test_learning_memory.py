@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from app.commands import parse
@@ -18,7 +17,7 @@ from ddgrasp.presets import PRESETS
 from demos import memory as demos_memory
 from learning import memory
 from learning.memory import Need, check, compiled_bytes, traced_bytes
-from sensors.recordings.writer import RecordingWriter
+from recording_support import flat, write_depth
 from student_jax import memory as student_memory
 from student_jax.data import kept_of_a_demo
 
@@ -153,9 +152,7 @@ def test_a_batch_that_cannot_fit_is_refused_before_any_work(tmp_path):
 @pytest.fixture
 def recordings(tmp_path):
     """A folder with one recording of eight frames."""
-    with RecordingWriter(tmp_path / "data" / "a", {"fx_px": 40.0, "sensor": "RealSense D435"}) as writer:
-        for _ in range(8):
-            writer.add(np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 700, np.uint16))
+    write_depth(tmp_path / "data" / "a", 8 * [flat((48, 64), 700)], fx_px=40.0, sensor="RealSense D435")
     return tmp_path / "data"
 
 

@@ -12,8 +12,8 @@ from ddgrasp.contract import D455
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from evaluation import camera_comparison as compare
+from recording_support import write_depth
 from rig.scenes import StandingScene, standing_scenes
-from sensors.recordings.writer import RecordingWriter
 from sensors.statistics import curves, figures
 from sensors.statistics.curves import Stream
 
@@ -139,10 +139,8 @@ def test_published_figures_name_what_is_compared():
 
 def test_real_recordings_without_a_focal_length_are_left_out_by_name(tmp_path):
     depth = plane_mm(20.0).astype(np.uint16)
-    rgb = np.zeros((*SIZE, 3), np.uint8)
     for name, meta in (("a", {"sensor": "D435", "fx_px": FX_PX}), ("b", {"sensor": "unknown"})):
-        with RecordingWriter(tmp_path / name, meta) as writer:
-            writer.add(rgb, depth)
+        write_depth(tmp_path / name, [depth], **meta)
     measured, skipped = compare.measure_real(tmp_path, D455.scaled(0.125), Progress(quiet=True))
     assert [m.camera for m in measured] == ["a 160x90"]
     assert len(skipped) == 1 and "add fx_px and baseline_m" in skipped[0]

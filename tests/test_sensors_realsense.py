@@ -24,6 +24,7 @@ from realsense_support import (
     SoftwareCamera,
     depth_mm,
     full_after,
+    scripted,
 )
 from sensors.recordings import realsense
 from sensors.recordings import writer as writing
@@ -44,12 +45,6 @@ def rs():
 
 def record(out: Path, *args) -> None:
     parse("record realsense", ["--out", str(out), *SMALL, *map(str, args)]).run()
-
-
-def scripted(monkeypatch, numbers, **how) -> ScriptedLibrary:
-    library = ScriptedLibrary(numbers, **how)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", library)
-    return library
 
 
 def numbers_in(path: Path) -> list[int]:

@@ -1,6 +1,5 @@
 """Recordings: round trip, damaged frames, wrong units, real files."""
 
-import json
 import os
 import shutil
 from pathlib import Path
@@ -14,6 +13,7 @@ from app.commands.ddg import DDGFit
 from ddgrasp.errors import UserError
 from ddgrasp.files import TEMPORARY
 from ddgrasp.presets import PRESETS
+from recording_support import set_meta
 from sensors.recordings import writer as writer_module
 from sensors.recordings.recording import Recording, contents, depth_picture_count, find_recordings
 from sensors.recordings.writer import RecordingWriter
@@ -33,11 +33,6 @@ def _write(path: Path, frames: int = 4) -> Path:
         for seed in range(frames):
             writer.add(*_frame(seed))
     return path
-
-
-def _set_meta(path: Path, **values) -> None:
-    meta = json.loads((path / "meta.json").read_text())
-    (path / "meta.json").write_text(json.dumps({**meta, **values}))
 
 
 def _replace_depth(path: Path, index: int, image: np.ndarray) -> None:
@@ -74,7 +69,7 @@ def test_contents_change_with_what_is_there_and_not_with_where_it_is(tmp_path):
     assert contents(tmp_path / "all/a") == contents(tmp_path / "elsewhere/a")
     _write(tmp_path / "elsewhere" / "c", frames=1)
     assert contents(tmp_path / "elsewhere").startswith("3 recordings of 9 pictures, ")
-    _set_meta(tmp_path / "all" / "a", fx_px=21.0)
+    set_meta(tmp_path / "all" / "a", fx_px=21.0)
     assert contents(tmp_path / "all") != first
 
 
@@ -220,7 +215,7 @@ def test_a_frame_that_is_left_out_between_others_ends_consecutive_frames(tmp_pat
     for index in damaged:
         (path / "color" / f"{index}.jpg").unlink()
     assert Recording.open(path).consecutive == consecutive
-    _set_meta(path, consecutive_frames=False)
+    set_meta(path, consecutive_frames=False)
     assert not Recording.open(path).consecutive
 
 
@@ -294,7 +289,7 @@ def test_a_unit_that_leaves_no_depth_is_refused_in_one_line(tmp_path, counts, un
     path = _write(tmp_path / "a")
     for index in range(4):
         _replace_depth(path, index, np.full((24, 32), counts, np.uint16))
-    _set_meta(path, depth_unit_m=unit_m)
+    set_meta(path, depth_unit_m=unit_m)
     with pytest.raises(UserError, match=f"a: with depth_unit_m {unit_m:g} no pixel of 4 of its") as error:
         Recording.open(path)
     assert "\n" not in str(error.value)
@@ -304,7 +299,7 @@ def test_declared_unit_is_converted_to_millimetres(tmp_path):
     path = _write(tmp_path / "a")
     for index in range(4):
         _replace_depth(path, index, _frame(index)[1] * 10)
-    _set_meta(path, depth_unit_m=0.0001)
+    set_meta(path, depth_unit_m=0.0001)
     np.testing.assert_array_equal(Recording.open(path).depth_mm(1), _frame(1)[1])
 
 
@@ -314,19 +309,19 @@ def test_depth_in_metres_is_as_fine_as_the_declared_unit(tmp_path):
     counts[0, :3] = 0, 4, 9006  # 4 is less than half a millimetre: a hole in millimetres, so one in metres
     for index in range(4):
         _replace_depth(path, index, counts)
-    _set_meta(path, depth_unit_m=0.0001)
+    set_meta(path, depth_unit_m=0.0001)
     recording = Recording.open(path)
     assert recording.depth_mm(0)[0, :4].tolist() == [0, 0, 901, 900]
     np.testing.assert_allclose(recording.depth_m(0)[0, :4], [0, 0, 0.9006, 0.9004], rtol=1e-6)
     assert recording.depth_m(0).dtype == np.float32
-    _set_meta(path, depth_unit_m=0.0002)
+    set_meta(path, depth_unit_m=0.0002)
     assert Recording.open(path).depth_m(0)[1, 1] == np.float32(1.8008)
 
 
 @pytest.mark.parametrize("value", [None, "mm", 1.0])
 def test_undeclared_unit_is_refused(tmp_path, value):
     path = _write(tmp_path / "a")
-    _set_meta(path, depth_unit_m=value)
+    set_meta(path, depth_unit_m=value)
     with pytest.raises(UserError, match="depth_unit_m is"):
         Recording.open(path)
 
@@ -337,7 +332,7 @@ def test_undeclared_unit_is_refused(tmp_path, value):
 )
 def test_fields_of_another_kind_are_refused(tmp_path, fields):
     path = _write(tmp_path / "a")
-    _set_meta(path, **fields)
+    set_meta(path, **fields)
     with pytest.raises(UserError, match=f"meta.json: {next(iter(fields))} is "):
         Recording.open(path)
 
@@ -391,6 +386,6 @@ def test_truncated_copy_of_a_real_recording_stays_readable(tmp_path):
 
 def test_recording_of_another_contract_version_is_refused(tmp_path):
     path = _write(tmp_path / "a")
-    _set_meta(path, contract_version=99)
+    set_meta(path, contract_version=99)
     with pytest.raises(UserError, match="contract version 99, this code has"):
         Recording.open(path)

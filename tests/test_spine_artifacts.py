@@ -29,6 +29,7 @@ from ddgrasp.files import (
     user_cache,
 )
 from ddgrasp.presets import PRESETS
+from ddgrasp.scaling import with_values
 from ddgrasp.stages import get_stage
 
 CONFIG = Config(preset="debug")
@@ -190,16 +191,6 @@ def test_an_accepted_difference_is_no_part_of_what_a_stage_is(tmp_path):
     artifacts.require(tmp_path, "export", looser)
 
 
-def _changed(name: str, value: object) -> Config:
-    """`CONFIG` with the field of that dotted name at `value`."""
-
-    def change(section, path):
-        here = getattr(section, path[0])
-        return dataclasses.replace(section, **{path[0]: change(here, path[1:]) if len(path) > 1 else value})
-
-    return change(CONFIG, name.split("."))
-
-
 @pytest.mark.parametrize(
     ("name", "value", "stage"),
     [
@@ -210,7 +201,7 @@ def _changed(name: str, value: object) -> Config:
     ],
 )
 def test_what_a_stage_reads_of_another_section_is_part_of_what_it_is(name, value, stage):
-    changed = _changed(name, value)
+    changed = with_values(CONFIG, {name: value})
     assert config_hash(changed, stage) != config_hash(CONFIG, stage)
     before = get_stage(stage).parents
     assert all(config_hash(changed, p) == config_hash(CONFIG, p) for p in before)
@@ -227,7 +218,7 @@ def test_what_a_stage_reads_of_another_section_is_part_of_what_it_is(name, value
 def test_how_a_result_comes_about_may_change_on_resume(name, stage, tmp_path):
     attempts.begin(tmp_path, stage, CONFIG)
     (tmp_path / "work").touch()
-    attempts.check_place(tmp_path, stage, _changed(name, 3))
+    attempts.check_place(tmp_path, stage, with_values(CONFIG, {name: 3}))
 
 
 @pytest.mark.parametrize("name", ["deploy.franka.host", "deploy.realsense.serial"])

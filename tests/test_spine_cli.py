@@ -26,6 +26,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes
 from ddgrasp.install import pip_install
 from ddgrasp.presets import PRESETS
+from ddgrasp.scaling import with_values
 from ddgrasp.stages import CHECKPOINTS
 
 ROOT = Path(__file__).parents[1]
@@ -288,13 +289,7 @@ def test_unknown_objects_suggest_the_nearest():
 
 def _with(section: str, **values):
     """The preset debug with other values in a section, for example student.encoder."""
-    return _changed(PRESETS["debug"], section.split("."), values)
-
-
-def _changed(config, path, values):
-    if path:
-        values = {path[0]: _changed(getattr(config, path[0]), path[1:], values)}
-    return dataclasses.replace(config, **values)
+    return with_values(PRESETS["debug"], {f"{section}.{name}": value for name, value in values.items()})
 
 
 @pytest.mark.parametrize(
@@ -369,14 +364,14 @@ def test_a_start_of_another_network_is_refused_before_any_stage(tmp_path):
     ddg = dataclasses.replace(demo.ddg, unet=unet, init_from="pretrained/ddg")
     with pytest.raises(UserError, match=r"ddg has ddg\.unet\.widths .* configuration \(8, 16, 24\)"):
         check_config_values(dataclasses.replace(demo, ddg=ddg))
-    for section, values, expected in (
-        ("student.head", {"chunk": demo.student.head.chunk + 1}, "params.msgpack does not fit this"),
-        ("student.head", {"blocks": 2}, "block2.* is in the file, not in the network"),
-        ("student.picture", {"channels": ("valid", "relief")}, r"student.picture.channels \('relief'"),
-        ("student.encoder", {"output_stride": 16}, "output_stride 8, this configuration 16"),
+    for name, value, expected in (
+        ("student.head.chunk", demo.student.head.chunk + 1, "params.msgpack does not fit this"),
+        ("student.head.blocks", 2, "block2.* is in the file, not in the network"),
+        ("student.picture.channels", ("valid", "relief"), r"student.picture.channels \('relief'"),
+        ("student.encoder.output_stride", 16, "output_stride 8, this configuration 16"),
     ):
         with pytest.raises(UserError, match=expected):
-            check_networks(_changed(demo, section.split("."), values), tmp_path)
+            check_networks(with_values(demo, {name: value}), tmp_path)
 
 
 def test_a_stage_by_itself_is_refused_what_a_run_is(tmp_path):

@@ -23,13 +23,13 @@ from demos.rollout import Roller, successful
 from demos.store import EpisodeStore
 from mjx_envs.randomize import ObjectTable
 from mjx_envs.views import Views, observed
-from ppo.policy import TeacherPolicy
 from rig.camera import camera_pose, make_camera
 from rig.world import make_world
 from student_jax import frames_io
 from student_jax.act import SourceCamera
 from student_jax.depth_source import VIEWED, check_demos, make_source
 from student_jax.rig_source import RigSource
+from teacher_support import still_teacher
 
 CONFIG = Config(
     preset="test",
@@ -49,15 +49,8 @@ CONFIG = Config(
 
 
 @pytest.fixture(scope="module")
-def still() -> TeacherPolicy:
-    """The arm keeps its pose."""
-    layer = np.zeros((40, 16), np.float32), np.zeros(16, np.float32)
-    return TeacherPolicy(np.zeros(40, np.float32), np.ones(40, np.float32), [layer])
-
-
-@pytest.fixture(scope="module")
-def roller(still) -> Roller:
-    return Roller(CONFIG, still, 12)
+def roller() -> Roller:
+    return Roller(CONFIG, still_teacher(), 12)
 
 
 def test_a_frame_is_what_the_rigs_own_camera_takes_of_the_scene():
@@ -112,9 +105,9 @@ def _clean(views: Views) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def episodes(still, tmp_path_factory) -> list:
+def episodes(tmp_path_factory) -> list:
     """What demos keep of rollouts that all count as successful."""
-    roller = Roller(CONFIG, still, 3, keep=tmp_path_factory.mktemp("spool"))
+    roller = Roller(CONFIG, still_teacher(), 3, keep=tmp_path_factory.mktemp("spool"))
     made = roller.run(jax.random.PRNGKey(1), lambda scene: scene.expert)
     return list(successful(replace(made, success=np.ones(3, bool))))
 

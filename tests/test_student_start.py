@@ -12,11 +12,11 @@ from ddgrasp.config import Config, EncoderConfig, HandViewConfig, HeadConfig, St
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning.params import save_params
-from ppo.policy import TeacherPolicy
 from student_jax import dagger, start
 from student_jax.dagger import Trainer
 from student_jax.depth_source import make_source
 from student_jax.policy import PARAMS_FILE, init_params, param_shapes
+from teacher_support import still_teacher
 
 STUDENT = StudentConfig(
     depth_source="ideal",
@@ -45,12 +45,11 @@ def run(params, tmp_path) -> Path:
 def test_a_start_is_taken_leaf_by_leaf(params, run, tmp_path):
     config = replace(CONFIG, student=replace(STUDENT, init_from=str(run)))
     start.check(config)
-    still = TeacherPolicy(np.zeros(40), np.ones(40), [(np.zeros((40, 16)), np.zeros(16))])
     source = make_source(config, tmp_path)
-    begun = Trainer(config, still, source, tmp_path / "new", Progress(quiet=True))
+    begun = Trainer(config, still_teacher(), source, tmp_path / "new", Progress(quiet=True))
     begun._restore()
     jax.tree.map(np.testing.assert_array_equal, begun.params, params)
-    fresh = Trainer(CONFIG, still, source, tmp_path / "fresh", Progress(quiet=True))
+    fresh = Trainer(CONFIG, still_teacher(), source, tmp_path / "fresh", Progress(quiet=True))
     fresh._restore()
     assert np.any(fresh.params["encoder"]["features"]["kernel"] != params["encoder"]["features"]["kernel"])
 
@@ -91,11 +90,12 @@ def test_a_start_whose_holes_were_left_open_is_taken_and_that_is_said(
             self.said.append(text)
 
     monkeypatch.setattr(dagger, "init_params", lambda *_: params)
-    still = TeacherPolicy(np.zeros(40), np.ones(40), [(np.zeros((40, 16)), np.zeros(16))])
     for filled in (False, True):
         student = replace(finished, picture=replace(finished.picture, fill_holes=filled))
         start._check_meaning(student)
         config = replace(CONFIG, student=student)
-        Trainer(config, still, make_source(config, tmp_path), tmp_path / str(filled), Notes())._restore()
+        Trainer(
+            config, still_teacher(), make_source(config, tmp_path), tmp_path / str(filled), Notes()
+        )._restore()
     (said,) = Notes.said
     assert "trained with student.picture.fill_holes False, here it is True" in said

@@ -24,7 +24,7 @@ from mjx_envs.objects import OBJECTS
 from mjx_envs.physics import interface, mjx_collision, mjx_kinematics
 from mjx_envs.physics.mjx_jax import JaxPhysics
 from ppo import rollout, warmup
-from ppo.policy import TeacherPolicy
+from teacher_support import still_teacher
 from xla_support import optimized
 
 BATCH = 64
@@ -197,19 +197,13 @@ class Overfull:
         return dataclasses.replace(self._physics.step(params, state, ctrl), dropped=jnp.int32(3))
 
 
-def _still() -> TeacherPolicy:
-    """A policy of zeros: the arm keeps its pose."""
-    layer = np.zeros((40, 16), np.float32), np.zeros(16, np.float32)
-    return TeacherPolicy(np.zeros(40, np.float32), np.ones(40, np.float32), [layer])
-
-
 @pytest.mark.parametrize("lost", [False, True])
 def test_an_evaluation_reports_what_its_physics_lost(lost, capsys):
     env = GraspEnv(WorldConfig(episode_steps=3))
     if lost:
         env.physics = Overfull(env.physics)
     keys = jax.random.split(jax.random.PRNGKey(0), 4)
-    seen = rollout.roll_out(env, _still(), keys, _nothing)
+    seen = rollout.roll_out(env, still_teacher(), keys, _nothing)
     said = capsys.readouterr().err
     assert seen.dropped == (3 * int(seen.running.sum()) if lost else 0)
     assert ("36 contacts in 12 control steps were more than the physics backend holds" in said) == lost
@@ -217,7 +211,7 @@ def test_an_evaluation_reports_what_its_physics_lost(lost, capsys):
 
 
 def test_demos_and_dagger_report_what_their_physics_lost(capsys):
-    roller = Roller(Config("test", world=WorldConfig(episode_steps=3)), _still(), 4, with_depth=False)
+    roller = Roller(Config("test", world=WorldConfig(episode_steps=3)), still_teacher(), 4, with_depth=False)
     roller.env.physics = Overfull(roller.env.physics)
     roller.run(jax.random.PRNGKey(0), lambda scene: scene.expert)
     said = capsys.readouterr().err
@@ -227,7 +221,7 @@ def test_demos_and_dagger_report_what_their_physics_lost(capsys):
 def test_cloning_the_guide_reports_what_its_physics_lost(capsys):
     env = GraspEnv(WorldConfig(episode_steps=3))
     env.physics = Overfull(env.physics)
-    observations, _ = warmup.Collector(env, 4)(_still(), seed=0, guide_share=1.0)
+    observations, _ = warmup.Collector(env, 4)(still_teacher(), seed=0, guide_share=1.0)
     assert len(observations) == 12
     assert capsys.readouterr().err.startswith("warning: 36 contacts in 12 control steps were more")
 
