@@ -31,13 +31,17 @@ from ddgrasp.config import (
     Sensor,
     SensorConfig,
 )
+from ddgrasp.config.features import DepthFeatureConfig
 from demos.rollout import Roller
+from foundation import depth_feature_training
+from foundation.depth_feature_data import MEASURED
 from learning.programs import Program, key, shape
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import evaluate, policy, rollout, train
-from student_jax import depth_source
+from student_jax import act, depth_source, device_frames
 from student_jax import programs as student
+from student_jax.data import Window
 
 
 def lower(program: Program, platform: str) -> jax.stages.Lowered:
@@ -145,9 +149,51 @@ def camera_model(name: Sensor, config: Config) -> Program:
 # --- student --------------------------------------------------------------------------------------
 
 
+def perceiving(config: Config) -> Program:
+    """What perception reports of an episode's frames."""
+    _, (*settings, depth, state, _) = student.acting(config, config.world.episode_steps)
+    return act.perceived, (*settings, depth, state)
+
+
+def frames_put(config: Config) -> Program:
+    """A block of training frames into the device's memory."""
+    rows, window = _frames_on_device(config)
+    size = dict(dtype=jnp.uint16)
+    blocks = (shape(rows, *window.shape, **size), shape(device_frames.BLOCK, *window.shape, **size))
+    return device_frames.put, (*blocks, shape(dtype=jnp.int32))
+
+
+def frames_gathered(config: Config) -> Program:
+    """The pictures of a batch out of the device's memory, where they take more than one array."""
+    rows, window = _frames_on_device(config)
+    part, count = shape(rows, *window.shape, dtype=jnp.uint16), config.student.training.batch_size
+    index = shape(count * contract.DEPTH_FRAMES, dtype=jnp.int32)
+    return device_frames.gathered, (rows, window.margins, (part, part), index)
+
+
+def _frames_on_device(config: Config) -> tuple[int, Window]:
+    """(frames in one array, what is kept of each)."""
+    window = Window.seen(config.world.profile, config.student.training.crop_shift_px)
+    height, width = window.shape
+    return device_frames.PART_ELEMENTS // (height * width), window
+
+
 def dagger_acting(config: Config) -> Program:
     """The student's actions for all environments of a DAgger round."""
     return student.acting(config, config.student.dagger.episodes)
+
+
+# --- score ----------------------------------------------------------------------------------------
+
+
+def feature_step(config: Config) -> Program:
+    """An optimiser step of the score's own features, at their own sizes."""
+    del config
+    features = DepthFeatureConfig()
+    count, width = features.batch_size, features.width_px
+    state = jax.eval_shape(lambda: depth_feature_training.init_state(features))
+    depth, family = shape(count, width * 3 // 4, width), shape(count, dtype=jnp.int32)
+    return depth_feature_training.train_step, (features, state, depth, family, shape(count, len(MEASURED)))
 
 
 PROGRAMS: dict[str, Callable[[Config], Program]] = {
@@ -173,7 +219,11 @@ PROGRAMS: dict[str, Callable[[Config], Program]] = {
     "student: features": student.encode,
     "student: train step": student.train_step,
     "student: head step": student.head_step,
+    "student: frames to the device": frames_put,
+    "student: frames out of the device's memory": frames_gathered,
     "student: DAgger acting": dagger_acting,
+    "student: perceiving": perceiving,
     "student: acting on poses": student.acting_on_poses,
+    "features: train step": feature_step,
 }
 """Name -> maker of the program for a configuration."""

@@ -170,14 +170,20 @@ def _optimizer(config: DepthFeatureConfig) -> optax.GradientTransformation:
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
-def _step(
-    config: DepthFeatureConfig, state: TrainState, depth_m: Array, family: Array, target: Array
+def train_step(
+    config: DepthFeatureConfig,
+    state: TrainState,
+    depth_m: Float[Array, "B H W"],
+    family: Int[Array, " B"],
+    target: Float[Array, "B measurements"],
 ) -> tuple[TrainState, Metrics]:
+    """One optimiser step; `target` is standardised."""
     value, grads = jax.value_and_grad(loss)(state.params, depth_m, family, target)
     return updated(state, _optimizer(config), grads, ema_decay=0.0), {"loss": value}
 
 
-def _init(config: DepthFeatureConfig) -> TrainState:
+def init_state(config: DepthFeatureConfig) -> TrainState:
+    """State before the first step."""
     keys = jax.random.split(jax.random.key(config.seed))
     trunk = depth_features.Trunk().init(keys[0], jnp.zeros((1, 32, 32)))["params"]
     heads = Heads().init(keys[1], jnp.zeros((1, depth_features.FEATURES)))["params"]
@@ -195,10 +201,10 @@ def _optimise(
     def step_once(state: TrainState, number: int) -> tuple[TrainState, Metrics]:
         batch = _draw(pool, config.batch_size, config.seed, 2, number)
         target = (batch.measured - scale[0]) / scale[1]
-        return _step(config, state, batch.depth_m, batch.family, target)
+        return train_step(config, state, batch.depth_m, batch.family, target)
 
     state, _ = run_steps(
-        _init(config), config.steps, step_once, work / CHECKPOINTS,
+        init_state(config), config.steps, step_once, work / CHECKPOINTS,
         every=config.checkpoint_every, label="training", progress=progress,
     )  # fmt: skip
     return state.params

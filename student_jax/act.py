@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 
 from ddgrasp import contract
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
 from ddgrasp.depth import to_metres
 from ddgrasp.gripper import ClosingLatch, WidthChange
@@ -109,11 +110,18 @@ def perceive(
     state: Float[np.ndarray, "B 9"],
 ) -> Aux:
     """What the network reports of the frames that a policy is given: where to grasp, and whether it holds."""
-    return jax.tree.map(np.asarray, _perceive(config, profile, params, depth_mm, state))
+    return jax.tree.map(np.asarray, perceived(config, profile, params, depth_mm, state))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _perceive(config, profile, params, depth_mm, state):
+def perceived(
+    config: StudentConfig,
+    profile: contract.CameraProfile,
+    params: Any,
+    depth_mm: UInt16[AnyArray, "B 3 H W"],
+    state: Float[AnyArray, "B 9"],
+) -> Aux:
+    """What `perceive` gives, on the device."""
     policy = StudentPolicy(config, profile)
     seen: Any = policy.apply({"params": params}, to_metres(depth_mm), state, method="encode")
     return seen.aux

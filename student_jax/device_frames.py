@@ -19,7 +19,7 @@ PART_ELEMENTS = 2**31 - 1
 """The most that one array on the device holds, so that 32 bits count them."""
 ROOM_SHARE = 0.8
 """The rest is for what the estimate of a training step misses (docs/accelerators.md)."""
-_BLOCK = 256
+BLOCK = 256
 """Frames that go there at a time."""
 
 
@@ -39,7 +39,7 @@ class DepthOnDevice:
 
     def read(self, index: Int[np.ndarray, " n"]) -> UInt16[Array, "n H W"]:
         """See `DepthRows`."""
-        return _gathered(self._rows, self._margins, self._parts, jnp.asarray(index, jnp.int32))
+        return gathered(self._rows, self._margins, self._parts, jnp.asarray(index, jnp.int32))
 
 
 def room_bytes(config: Config) -> int:
@@ -59,22 +59,28 @@ def room_bytes(config: Config) -> int:
 def _copied(stored: RowReader, first: int, last: int) -> Array:
     """Pictures first..last, a block at a time: neither host nor device holds them twice."""
     part = jnp.zeros((last - first, *stored.shape[1:]), jnp.uint16)
-    size = min(_BLOCK, last - first)
+    size = min(BLOCK, last - first)
     for start in range(0, last - first, size):
         start = min(start, last - first - size)  # one size, compiled once
-        part = _put(part, stored.read(first + start + np.arange(size)), start)
+        part = put(part, stored.read(first + start + np.arange(size)), start)
     return part
 
 
 @partial(jax.jit, donate_argnums=0)
-def _put(part: Array, block: Array, start: int) -> Array:
+def put(part: UInt16[Array, "N H W"], block: UInt16[Array, "B H W"], start: int) -> UInt16[Array, "N H W"]:
+    """`part` with `block` from picture `start` on."""
     return jax.lax.dynamic_update_slice(part, block, (start, 0, 0))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _gathered(
-    rows: int, margins: tuple[tuple[int, int], tuple[int, int]], parts: tuple[Array, ...], index: Array
-) -> Array:
+def gathered(
+    rows: int,
+    margins: tuple[tuple[int, int], tuple[int, int]],
+    parts: tuple[UInt16[Array, "N h w"], ...],
+    index: Int[Array, " n"],
+) -> UInt16[Array, "n H W"]:
+    """Pictures `index` of all `parts`, of which each but the last has so many `rows`; `margins` around them
+    are invalid."""
     made = parts[0][jnp.clip(index, 0, len(parts[0]) - 1)]
     for number, part in enumerate(parts[1:], 1):
         within = jnp.clip(index - number * rows, 0, len(part) - 1)
