@@ -36,10 +36,14 @@ class Need:
     """What to do instead of making room on the disk."""
 
     def __str__(self) -> str:
-        parts = [f"{self.device / 1e9:.1f} GB for its programs", f"{self.host / 1e9:.1f} GB of arrays"]
+        parts = [f"{_readable(self.device)} for its programs", f"{_readable(self.host)} of arrays"]
         if self.disk:
-            parts.append(f"{self.disk / 1e9:.1f} GB of disk for a time")
+            parts.append(f"{_readable(self.disk)} of disk for a time")
         return f"{self.stage}: about {', '.join(parts)}"
+
+
+def _readable(count: int) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 1e8 else f"{count / 1e6:.0f} MB"
 
 
 def check(need: Need, directory: Path) -> None:

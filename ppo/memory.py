@@ -9,7 +9,7 @@ import mujoco
 from ddgrasp import contract
 from ddgrasp.config import GUIDE, Config, TeacherConfig
 from ddgrasp.errors import UserError
-from learning.memory import compiled_bytes, device_limit, host_bytes, nbytes
+from learning.memory import Need, compiled_bytes, device_limit, host_bytes, nbytes
 from mjx_envs.grasp_env import AutoReset
 from ppo import learner, warmup
 
@@ -21,15 +21,15 @@ CLONE_COPIES = 2
 _SIGNS = ("RESOURCE_EXHAUSTED", "Out of memory", "MemoryError", "out of memory")
 
 
-def check(config: Config, env: AutoReset) -> None:
-    """UserError if the environments and their experience, or what the guide is cloned on, cannot fit.
-    Allocates and compiles nothing."""
+def check(config: Config, env: AutoReset) -> Need:
+    """What the environments and their experience take; UserError if they, or what the guide is cloned on,
+    cannot fit. Allocates and compiles nothing."""
     teacher = config.teacher
     _check_clone(teacher)
     state = jax.eval_shape(lambda key: learner.init(teacher, env, key), jax.random.PRNGKey(0)).env_state
     step = 2 * state.obs.size + teacher.num_envs * (2 * env.env.action_size + 4)  # floats in a transition
     per_batch = 3 * nbytes(state) + EXPERIENCE_COPIES * teacher.unroll_steps * step * 4
-    _compare(config, env, per_batch // env.mesh.size)
+    return _compare(config, env, per_batch // env.mesh.size)
 
 
 def _check_clone(teacher: TeacherConfig) -> None:
@@ -67,8 +67,8 @@ def explained(config: Config) -> Iterator[None]:
 _REMEDY = "lower teacher.num_envs or teacher.unroll_steps, or use more devices"
 
 
-def _compare(config: Config, env: AutoReset, device_bytes: int) -> None:
-    """`device_bytes`: needed on each device of the mesh."""
+def _compare(config: Config, env: AutoReset, device_bytes: int) -> Need:
+    """What is needed, `device_bytes` on each device of the mesh; UserError if there is less."""
     local = env.mesh.local_devices
     share = config.teacher.num_envs // env.mesh.size * len(local)
     engine = share * mujoco.mj_sizeModel(env.env.mj_model) if config.world.backend == "cpu" else 0
@@ -83,3 +83,4 @@ def _compare(config: Config, env: AutoReset, device_bytes: int) -> None:
                 f"teacher.num_envs {config.teacher.num_envs} needs about {needed / 1e9:.1f} GB of memory on "
                 f"the {place}, which has {free / 1e9:.1f} GB for it: {_REMEDY}."
             )
+    return Need("teacher", device_bytes, engine)

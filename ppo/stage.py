@@ -10,6 +10,7 @@ from ddgrasp.config import Config
 from ddgrasp.files import atomic_path
 from ddgrasp.install import pip_install
 from ddgrasp.job import Job
+from learning.memory import Need
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
 from ppo import hosts, learner, memory
@@ -20,11 +21,13 @@ from ppo.train import train, training_world
 _TEST_SEED = 20_000
 
 
-def check(config: Config) -> None:
-    """UserError if the teacher cannot be trained so, or not on these devices; takes a second and changes
-    nothing."""
+def check(config: Config) -> Need | None:
+    """What training the teacher takes, None where one is only loaded; takes a second and changes nothing.
+
+    UserError if it cannot be trained so, or not on these devices.
+    """
     if _loads(config):
-        return
+        return None
     episode = config.world.episode_steps
     if config.teacher.unroll_steps > episode:  # an environment has one episode ready (`AutoReset`)
         raise config.teacher.error("unroll_steps", f"1 to {episode} (world.episode_steps)")
@@ -32,7 +35,7 @@ def check(config: Config) -> None:
         learner.check_start(config.teacher, teacher_policy.load_state(config.teacher.start))
     mesh = devices.make_mesh()
     learner.check_divisible(config.teacher, mesh.size)
-    memory.check(config, AutoReset(GraspEnv(training_world(config)), mesh))
+    return memory.check(config, AutoReset(GraspEnv(training_world(config)), mesh))
 
 
 def run(job: Job) -> Artifact:

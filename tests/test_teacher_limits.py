@@ -1,6 +1,7 @@
 """What stops a teacher: numbers that are not finite, named by term, and batches larger than the memory."""
 
 import dataclasses
+import re
 from types import SimpleNamespace
 
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from app.commands.checks import check_devices
 from config_support import unchecked
 from ddgrasp.config import Config, EvalConfig, RewardConfig, TeacherConfig, WorldConfig
 from ddgrasp.errors import UserError
@@ -97,6 +99,15 @@ def test_more_environments_than_memory_are_refused_with_the_size():
         UserError, match=r"num_envs 1073741824 needs about \d+\.\d GB .* lower teacher.num_envs"
     ):
         stage.check(dataclasses.replace(CONFIG, teacher=teacher))
+
+
+def test_what_training_takes_is_told_before_and_of_a_loaded_teacher_nothing(tmp_path, capsys):
+    check_devices(CONFIG, tmp_path)
+    told = capsys.readouterr().err
+    assert re.fullmatch(r"teacher: about \d+ MB for its programs, \d+ MB of arrays\n", told), told
+    loaded = dataclasses.replace(TEACHER, start="pretrained/teacher", total_steps=0)
+    check_devices(dataclasses.replace(CONFIG, teacher=loaded), tmp_path)
+    assert capsys.readouterr().err == ""
 
 
 def test_more_gradient_steps_than_can_be_counted_are_refused():

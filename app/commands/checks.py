@@ -178,7 +178,8 @@ def stage_folder(option: str, path: Path, stage: str) -> Path:
 
 
 def check_devices(config: Config, run_dir: Path) -> None:
-    """UserError if pictures cannot be drawn here, or the teacher, unless it is finished, not be trained."""
+    """UserError if pictures cannot be drawn here, or the teacher, unless it is finished, not be trained; what
+    that takes on standard error."""
     if config.world.renderer == "warp":  # any other draws anywhere, and to import MJX takes seconds
         from mjx_envs.physics.mjx_warp import require_gpu
 
@@ -186,7 +187,8 @@ def check_devices(config: Config, run_dir: Path) -> None:
     if not artifacts.is_finished(run_dir / "teacher"):
         from ppo.stage import check
 
-        check(config)
+        if need := check(config):
+            print(need, file=sys.stderr, flush=True)
 
 
 ON_PICTURES = ("demos", "ddg", "student")
