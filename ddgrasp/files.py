@@ -37,9 +37,9 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
     try:
         yield temporary
-        fsync(temporary)
+        _fsync(temporary)
         os.replace(temporary, path)
-        fsync(path.parent)
+        _fsync(path.parent)
     except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -89,7 +89,7 @@ def _folder_beside(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
     try:
         yield temporary
-        fsync(path.parent)
+        _fsync(path.parent)
     except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
         _name(error, temporary, path)
@@ -192,8 +192,7 @@ def to_tuples(value: Any) -> Any:
     return tuple(to_tuples(item) for item in value) if isinstance(value, list) else value
 
 
-def fsync(path: Path) -> None:
-    """What is written of the file, or which names are in the folder, is on the disk when this returns."""
+def _fsync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -124,14 +124,18 @@ class DepthGenerator:
             raise UserError(f"steps is {steps}; {self.path} takes {least} to {self.info.most_steps}.")
         return steps
 
-    def _check(self, frames: Array) -> None:
-        height, width = frames.shape[1:]
+    def check_shape(self, height_px: int, width_px: int, count: int = 1) -> None:
+        """UserError unless the generator takes `count` frames of that size."""
         shape = self.info.width_px / self.info.height_px
-        if not (height and width and len(frames)) or abs(width / height / shape - 1) > ASPECT_TOLERANCE:
+        if not (height_px and width_px and count) or abs(width_px / height_px / shape - 1) > ASPECT_TOLERANCE:
             raise UserError(
-                f"Depth is {len(frames)} frames of {width}x{height}; {self.path} takes the shape of "
+                f"Depth is {count} frames of {width_px}x{height_px}; {self.path} takes the shape of "
                 f"{self.info.width_px}x{self.info.height_px}: render with that aspect ratio, or crop."
             )
+
+    def _check(self, frames: Array) -> None:
+        count, height, width = frames.shape
+        self.check_shape(height, width, count)
         low, high = float(frames.min()), float(frames.max())
         if not (low >= 0 and high <= FARTHEST_SANE_M):  # neither is so for NaN
             raise UserError(

@@ -1,5 +1,6 @@
 """The development rig's camera with a generator's errors in the place of its own, all or one kind of them."""
 
+import hashlib
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -33,7 +34,7 @@ class GeneratedCamera(RigCamera):
         """`file` is what `ddgrasp ddg export` wrote. UserError if it is none, or of another shape."""
         super().__init__(model, config, profile)
         self.generated: GeneratedName = generated
-        self._generator = DepthGenerator(file, threads=1)
+        self._generator = _opened(file, profile)
         self._of: np.random.Generator | None = None
         self._noise: EpisodeNoise
 
@@ -59,6 +60,17 @@ class GeneratedCamera(RigCamera):
         if self.generated == "generator's holes":
             return joined(generated_mm, sensed_mm, clean_mm)
         return joined(sensed_mm, generated_mm, clean_mm)
+
+
+def digest(file: Path, profile: contract.CameraProfile) -> str:
+    """SHA-256 of the generator in `file`; UserError if it is none, or of another shape than `profile`."""
+    return hashlib.sha256(_opened(file, profile).path.read_bytes()).hexdigest()
+
+
+def _opened(file: Path, profile: contract.CameraProfile) -> DepthGenerator:
+    generator = DepthGenerator(file, threads=1)
+    generator.check_shape(profile.height_px, profile.width_px)
+    return generator
 
 
 def joined(

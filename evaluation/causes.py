@@ -4,7 +4,6 @@ DIR/<row>/trials.jsonl     outcome of every trial, kept and not run again
 DIR/causes.json, causes.md the table
 """
 
-import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +19,8 @@ from ddgrasp.progress import Progress
 from ddgrasp.trained import policy_objects
 from ddgrasp.versions import library_versions
 from deploy.changes import Change
-from deploy.depth_noise import DepthGenerator
 from deploy.fr3_trials import Fr3Bench
-from deploy.generated_camera import GENERATED, SHIPPED
+from deploy.generated_camera import GENERATED, SHIPPED, digest
 from deploy.trial_log import read_log
 from deploy.trials import Bench, Rig, TrialResult
 from evaluation import paired, rig_trials, wilson
@@ -142,11 +140,11 @@ def run(
         "seconds": series.seconds,
     }
     headers = {name: belong_to | {"row": name} for name in names}
-    generated = [name for name in names if ROWS[name].generated]
-    if generated:
-        file = DepthGenerator(generator).path
-        sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
-        headers |= {name: headers[name] | {"generator_sha256": sha256} for name in generated}
+    about = {"number": series.number, "policy": str(policy)}
+    if generated := [name for name in names if ROWS[name].generated]:
+        drawn_by = {"generator_sha256": digest(generator, config.world.profile)}
+        headers |= {name: headers[name] | drawn_by for name in generated}
+        about |= {"generator": str(generator)} | drawn_by
     for name, header in headers.items():
         rig_trials.check_log(out / name, header)
     made: dict[str, Any] = {}
@@ -162,7 +160,7 @@ def run(
         new = len(_known(folder)) - known
         if new:
             _add_time(folder, time.monotonic() - begun, new, workers)
-        made = write(out, {"number": series.number, "policy": str(policy)})
+        made = write(out, about)
     return made
 
 

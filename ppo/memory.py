@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import replace
 
 import jax
 import mujoco
@@ -25,22 +26,27 @@ def check(config: Config, env: AutoReset) -> Need:
     """What the environments and their experience take; UserError if they, or what the guide is cloned on,
     cannot fit. Allocates and compiles nothing."""
     teacher = config.teacher
-    _check_clone(teacher)
+    clone = _check_clone(teacher)
     state = jax.eval_shape(lambda key: learner.init(teacher, env, key), jax.random.PRNGKey(0)).env_state
     step = 2 * state.obs.size + teacher.num_envs * (2 * env.env.action_size + 4)  # floats in a transition
     per_batch = 3 * nbytes(state) + EXPERIENCE_COPIES * teacher.unroll_steps * step * 4
-    return _compare(config, env, per_batch // env.mesh.size)
+    needed = _compare(config, env, per_batch // env.mesh.size)
+    return replace(needed, host=max(needed.host, clone))  # one after the other
 
 
-def _check_clone(teacher: TeacherConfig) -> None:
-    """UserError if the batches of a round, all drawn before its first step, cannot fit: `ppo.warmup`."""
+def _check_clone(teacher: TeacherConfig) -> int:
+    """Bytes of the batches of a round, all drawn before its first step (`ppo.warmup`), 0 where nothing is
+    cloned; UserError if they cannot fit."""
+    if teacher.start != GUIDE:
+        return 0
     numbers = contract.OBSERVATION_SIZE + contract.ACTION_SIZE
     needed = CLONE_COPIES * teacher.clone_steps * warmup.BATCH * numbers * 4
-    if teacher.start == GUIDE and needed > (free := host_bytes()):
+    if needed > (free := host_bytes()):
         raise UserError(
             f"teacher.clone_steps {teacher.clone_steps} needs about {needed / 1e9:.1f} GB of memory on the "
             f"host, which has {free / 1e9:.1f} GB for it: lower it, or take more teacher.clone_rounds."
         )
+    return needed
 
 
 def check_compiled(config: Config, env: AutoReset, compiled: jax.stages.Compiled) -> None:

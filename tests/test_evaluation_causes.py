@@ -1,7 +1,9 @@
 """Where a policy loses, by cause: which rows there are, and the table that they leave behind."""
 
+import hashlib
 import json
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from rig.world import make_world
 
 CONFIG = get_preset("debug")
 PROFILE = CONFIG.world.profile
+ROOT = Path(__file__).parents[1]
 SERIES = Series("development", objects=("cube", "can"), trials=1, seconds=0.5)
 
 
@@ -167,8 +170,13 @@ def test_rows_with_a_generator_ask_for_its_file_before_anything_runs(tmp_path, p
             other.write_bytes(content)
         with pytest.raises(UserError, match=wrong):
             causes.run(CONFIG, policy, ("development", "generator"), SERIES, out, 0, other)
+    other_shape = ROOT / "pretrained" / "d435" / "generator.onnx"
+    with pytest.raises(UserError, match="takes the shape of 320x240"):
+        causes.run(CONFIG, policy, ("development", "generator"), SERIES, out, 0, other_shape)
     assert not out.exists()
-    causes.run(CONFIG, policy, ("development", "generator"), SERIES, out, 0)
+    made = causes.run(CONFIG, policy, ("development", "generator"), SERIES, out, 0)
+    sha256 = hashlib.sha256((ROOT / "pretrained" / "ddg" / "generator.onnx").read_bytes()).hexdigest()
+    assert made["generator_sha256"] == sha256
     told = ["generator_sha256" in read_log(path)[0] for path in sorted(out.glob("*/trials.jsonl"))]
     assert told == [False, True]
 

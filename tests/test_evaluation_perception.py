@@ -1,5 +1,6 @@
 """What perception is off by, from positions and angles set by hand; and what is kept of it."""
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -120,6 +121,26 @@ def run_dir(tmp_path) -> Path:
     write_policy(tmp_path / "export" / POLICY_FILE, info, bias=constant_bias(0.0))
     artifacts.finish(tmp_path / "export", "export", config, seconds=1.0, metrics={}, parents=[student])
     return tmp_path
+
+
+def test_a_student_is_measured_before_the_camera_that_is_asked_for(run_dir, monkeypatch):
+    monkeypatch.setattr(rig_trials, "Series", partial(rig_trials.Series, seconds=0.2))
+    shares, keep = [], perception._keep
+
+    def kept(seen: perception.Seen, depth: np.ndarray, *rest: np.ndarray) -> None:
+        shares.append(float(np.mean(depth == 0)))
+        keep(seen, depth, *rest)
+
+    monkeypatch.setattr(perception, "_keep", kept)
+    command, holes = ["student", "perception", str(run_dir), "--objects", "cube", "--trials", "1"], {}
+    for camera in ("ideal", "stereo", "generator"):
+        shares.clear()
+        assert cli.main([*command, "--camera", camera]) == 0
+        holes[camera] = np.mean(shares)
+    assert holes["ideal"] < 0.001 < 0.02 < min(holes["stereo"], holes["generator"])
+    assert holes["stereo"] != holes["generator"]
+    cameras = sorted({row["camera"] for row in perception_table.load(run_dir / "student")})
+    assert cameras[1:] == ["ideal", "stereo"] and re.fullmatch(r"generator \w{8}", cameras[0])
 
 
 def test_a_student_is_measured_beside_the_rig_s_truth_and_not_an_earlier_one(run_dir, monkeypatch, capsys):

@@ -441,6 +441,12 @@ def test_a_start_that_is_gone_is_missed_by_rows_that_are_left_alone(tmp_path, mo
     assert planned() == (*there, "upper_bound")
 
 
+def test_rows_of_the_paper_s_generator_ask_for_the_start_of_the_one_that_all_rows_share(tmp_path):
+    gone = ("--out", str(tmp_path), "--ddg.init-from", "runs/no")
+    with pytest.raises(UserError, match="ddg.init_from is 'runs/no', which does not exist"):
+        command(*gone, "--rows", "paper_ddg").planned()
+
+
 def test_a_table_without_its_network_is_made_without_that_row_which_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "WEIGHTS_DIR", tmp_path / "no weights")
     study = command("--out", str(tmp_path)).planned()

@@ -196,7 +196,7 @@ def test_training_freezes_an_extractor_that_loads(tmp_path):
 
 def test_frozen_statistics_standardise_the_features_of_training_pictures(pool, monkeypatch):
     monkeypatch.setattr(training, "_TEST_MAPS", 96)
-    params = training._init(TINY).params
+    params = training.init_state(TINY).params
     frozen = training._frozen(params, pool, 0)
     depth_m = training._draw(pool, training._TEST_MAPS, 0, 3).depth_m
     parts = np.split(depth_m, len(depth_m) // 16)
@@ -209,7 +209,7 @@ def test_frozen_statistics_standardise_the_features_of_training_pictures(pool, m
 
 def test_the_test_counts_treatments_named_rightly_and_variance_explained(pool, monkeypatch):
     monkeypatch.setattr(training, "_TEST_MAPS", 96)
-    params = jax.tree.map(jnp.zeros_like, training._init(TINY).params)
+    params = jax.tree.map(jnp.zeros_like, training.init_state(TINY).params)
     batch = training._draw(pool, training._TEST_MAPS, 0, 4)
     named = list(data.TREATMENTS).index("filled")
     params["heads"]["Dense_1"]["bias"] = jnp.zeros(len(data.TREATMENTS)).at[named].set(1.0)

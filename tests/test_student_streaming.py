@@ -188,7 +188,7 @@ def test_frames_on_the_device_are_those_on_disk(tmp_path, monkeypatch, kept, row
         store.append(steps | {"depth_mm": cut}, {"from_demo": np.bool_(True)})
     height, width = store.reader("depth_mm").shape[1:]
     monkeypatch.setattr(device_frames, "PART_ELEMENTS", rows * height * width)
-    monkeypatch.setattr(device_frames, "_BLOCK", 5)
+    monkeypatch.setattr(device_frames, "BLOCK", 5)
     size = 2 * sum(LENGTHS) * height * width
     disk, device = (frames_io.load(store.path, window, room) for room in (size - 1, size))
     assert not isinstance(disk.depth_mm, device_frames.DepthOnDevice)

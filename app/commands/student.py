@@ -87,16 +87,20 @@ class StudentPerception:
         config = load_config(self.run_dir, "export")
         from ddgrasp.progress import Progress
         from deploy.changes import Change
+        from deploy.generated_camera import digest
         from evaluation import perception, perception_table
         from evaluation.rig_trials import Series
 
         series = Series("development", self.objects, self.trials, number=self.number)
         check_tried(series)
         progress = Progress(name="student perception")
+        camera = self.camera
+        if camera == "generator":
+            camera = f"generator {digest(self.generator, config.world.profile)[:8]}"
         change = Change(sight=self.camera, generator=self.generator)
         rows = perception.measure(config, self.run_dir, series, change, progress)
         print(perception_table.describe(rows))
-        print(perception_table.save(self.run_dir / "student", self.camera, rows))
+        print(perception_table.save(self.run_dir / "student", camera, rows))
 
 
 @dataclass(frozen=True)

@@ -110,6 +110,7 @@ class StudyTable2(FromPreset):
                 attempts.check_place(self.out / results.PAPER / "ddg", "ddg", begun_by)
         if not results.has_students(self.out, names):
             config = rows.shared_config(config)
+            check_config_values(config, shared, finished=("student",))  # the paper's rows have another `ddg`
         check_devices(config, shared)
         return Study(config, self.out, names, series, self.workers, left_out, self.paper_generator)
 

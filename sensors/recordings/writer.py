@@ -13,7 +13,7 @@ import numpy as np
 from ddgrasp.alone import alone_in
 from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
-from ddgrasp.files import fsync, replace_folder
+from ddgrasp.files import replace_folder
 from sensors.recordings.recording import META_FILE
 
 BEGUN_FILE = "begun.json"
@@ -134,10 +134,7 @@ class RecordingWriter:
             "contract_version": CONTRACT_VERSION,
             "invalid_fraction_mean": round(self._invalid / self._frames, 4),
         }
-        # At the end: one that is awaited with every frame would hold up who records them.
-        for folder in (self._temporary / "color", self._temporary / "depth"):
-            for path in (*folder.iterdir(), folder):
-                fsync(path)
+        os.sync()  # once at the end: one awaited with every frame would hold up who records them
         text = json.dumps({**self.meta, **meta}, indent=1) + "\n"
         _write(self._temporary / META_FILE, text.encode(), sync=True)
         (self._temporary / BEGUN_FILE).unlink()
