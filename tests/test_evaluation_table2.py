@@ -2,6 +2,7 @@
 
 import hashlib
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -319,8 +320,15 @@ def test_the_kept_logs_give_the_pairs_of_the_page(tmp_path, kept, rows_and_p):
     trials.parent.mkdir()
     trials.symlink_to(KEPT / kept, target_is_directory=True)
     (of,) = results.collect(tmp_path)["sets"].values()
-    assert {t["row"]: (t["only_reference"], t["only_row"]) for t in of["tables"]["main"]} == rows_and_p
+    assert _pairs(of["tables"]["main"]) == rows_and_p
     assert not any(of["apart"].values())
+    if kept == "development-test-10":
+        ripple = _pairs(of["tables"]["ripple"])
+        assert (ripple["ddg_ripple"], ripple["rand_noise_ripple"]) == ((19, 23), (46, 21))
+
+
+def _pairs(tests: Sequence[dict]) -> dict[str, tuple[int, int]]:
+    return {test["row"]: (test["only_reference"], test["only_row"]) for test in tests}
 
 
 def test_a_study_without_trials_has_a_page(tmp_path):
