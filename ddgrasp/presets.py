@@ -138,9 +138,9 @@ LAPTOP = Config(
     evaluation=EvalConfig(student_trials=60),
 )
 """Everything trained here on two cores, the teacher from the guide. 81 minutes on two Intel Xeon cores,
-50 to 69 on two AMD EPYC ones (docs/results.md). Six plain shapes besides the paper's objects teach a student more
-than those. Demos have no colour, which takes most of their time and which row Monocular of Table II alone
-needs."""
+50 to 69 on two AMD EPYC ones (docs/results.md). Six plain shapes besides the paper's objects teach a student
+more than those. Demos have no colour, which takes most of their time and which row Monocular of Table II
+alone needs."""
 
 _FROM_NOTHING = TeacherConfig(
     start="nothing",
