@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 WorldName = Literal["as it is", "meshes", "furniture", "dark table", "spring"]
 SightName = Literal[
     "stereo", "ideal", "full size",
-    "holes", "values", "ripple", "mismatches",
+    "holes", "small holes", "large holes", "values", "ripple", "mismatches",
     "generator", "generator's holes", "generator's values",
 ]  # fmt: skip
 _STREAM = 0x4F6666

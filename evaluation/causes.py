@@ -64,6 +64,12 @@ ROWS: dict[str, Row] = {
     REFERENCE: Row("development rig", "", Change()),
     IDEAL: Row("camera without errors", "camera noise", Change(sight="ideal")),
     "holes": Row("camera's holes alone", "camera noise", Change(sight="holes"), against=IDEAL),
+    "small_holes": Row(
+        "camera's holes of up to 16 pixels alone", "camera noise", Change(sight="small holes"), against=IDEAL,
+    ),
+    "large_holes": Row(
+        "camera's larger holes alone", "camera noise", Change(sight="large holes"), against=IDEAL,
+    ),
     "values": Row("camera's values alone, no holes", "camera noise", Change(sight="values"), against=IDEAL),
     "ripple": Row(
         "values off by less than 1 px of disparity alone", "camera noise", Change(sight="ripple"),

@@ -122,9 +122,9 @@ class StudyCauses:
     policy: Path
     """ONNX file that `ddgrasp export` wrote."""
     rows: tuple[str, ...] = ("all",)
-    """all, or of: ideal, holes, values, ripple, mismatches, generator, generator_holes, generator_values,
-    full_size, meshes, off_2mm, off_10mm, furniture, dark_table, spring, fr3, test_rig. What they are compared
-    with is tried too."""
+    """all, or of: ideal, holes, small_holes, large_holes, values, ripple, mismatches, generator,
+    generator_holes, generator_values, full_size, meshes, off_2mm, off_10mm, furniture, dark_table, spring,
+    fr3, test_rig. What they are compared with is tried too."""
     objects: tuple[str, ...] = ("all",)
     """Names, or all."""
     trials: Count = 10
