@@ -1,14 +1,14 @@
 """Where do a camera and a generator see objects? Measured on the rig, where the truth is known.
 
-    python -m benchmarks.objects_seen [--model RUN/ddg] [--windows 0 1 1.25 1.5] [--scenes 6]
+    python -m benchmarks.objects_seen [--model RUN/ddg] [--windows 1 1.25 1.5] [--boxes 3 5 7] [--scenes 6]
 
 The twelve objects on the table, the arm at its start, the same scenes for every line. Object pixels are those
 more than 12 mm above the table within 10 cm of the object. A line has their number over clean depth's, how
 many of clean depth's are holes, by how much inverse depth is off in the whole picture (median and 99th
 percentile, 1/m), and how far the mean of the object's points is from clean depth's, in millimetres, robot's
 base frame (x from the base to the camera, z up): mean, and root mean square over scenes; scenes in which a
-line has no object pixels are not in these, and `none` counts them. Lines `window` are clean depth through
-`ddg_jax.window.mixed`.
+line has no object pixels are not in these, and `none` counts them. Lines `window` and `box` are clean depth
+through `ddg_jax.window.mixed`.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from benchmarks.command import one_line
 from ddg_jax.sample import Generator, generate
 from ddg_jax.window import mixed
 from ddgrasp import contract
+from ddgrasp.config import GraftConfig
 from ddgrasp.depth import to_metres
 from ddgrasp.layout import QPOS
 from ddgrasp.presets import get_preset
@@ -40,14 +41,17 @@ def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--model", type=Path, help="a run with a fitted generator, or its folder ddg")
-    parser.add_argument("--windows", type=float, nargs="*", default=[1.0, 1.25, 1.5])
+    parser.add_argument("--windows", type=float, nargs="*", default=[1.0, 1.25, 1.5], help="Gaussians, px")
+    parser.add_argument("--boxes", type=int, nargs="*", default=[3, 5, 7], help="odd widths, px")
     parser.add_argument("--scenes", type=int, default=6, help="of each object")
     args = parser.parse_args()
     generator = Generator.load(stage_folder("--model", args.model, "ddg")) if args.model else None
+    windows = {f"window {w:g} px": GraftConfig(window_px=w) for w in args.windows}
+    windows |= {f"box {w} px": GraftConfig(window_px=w, window_shape="box") for w in args.boxes}
     rows: dict[str, list[np.ndarray]] = {}
     for number, clean_m, sensed_m, T_world_cam, object_m in scenes(args.scenes):
         seen = {"camera": sensed_m}
-        seen |= {f"window {w:g} px": mixed(clean_m[None], w)[0] for w in args.windows}
+        seen |= {name: mixed(clean_m[None], window)[0] for name, window in windows.items()}
         if generator is not None:
             made = generate(jax.random.key(0), generator, clean_m[None], episode=number)
             seen["generator"] = made.depth_m[0]

@@ -86,7 +86,7 @@ def noisy_episodes(
     def stream() -> Iterator[tuple[np.ndarray, int, int]]:
         for i in range(int(np.searchsorted(starts, begin, side="right")) - 1, len(lengths)):
             clip = read(i)
-            clean_m = mixed(depth.to_metres(clip.depth_mm), generator.config.graft.window_px)
+            clean_m = mixed(depth.to_metres(clip.depth_mm), generator.config.graft)
             waiting.append((i, clean_m))
             c = condition(generator, clean_m, clip.rgb, one_episode=True)
             yield from ((c[t], clip.number, t) for t in range(max(0, begin - starts[i]), lengths[i]))

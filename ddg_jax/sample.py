@@ -221,7 +221,7 @@ def generate(
     _check_numbers("episode", np.asarray(episode), len(depth_m), alone=True)
     if frame is not None:
         _check_numbers("frame", np.asarray(frame), len(depth_m), alone=False)
-    depth_m = mixed(depth_m, generator.config.graft.window_px)
+    depth_m = mixed(depth_m, generator.config.graft)
     c = condition(generator, depth_m, rgb, one_episode=np.ndim(episode) == 0)
     x = predict(key, generator, c, episode=episode, frame=frame, steps=steps)
     return grafted(generator.config, depth_m, x)

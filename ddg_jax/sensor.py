@@ -63,7 +63,7 @@ def learned(generator: Generator) -> Sense:
 
     def window_on_host(depth_m) -> np.ndarray:
         depth = np.asarray(depth_m)
-        return mixed(depth.reshape(-1, *depth.shape[-2:]), config.graft.window_px).reshape(depth.shape)
+        return mixed(depth.reshape(-1, *depth.shape[-2:]), config.graft).reshape(depth.shape)
 
     def sense_frame(key: Array, depth_m: Array, rgb: Array | None) -> Array:
         check_aspect(depth_m.shape, config)

@@ -4,6 +4,7 @@ OpenCV's filters are written out: a median by exchanges of two, a bilateral filt
 """
 
 import math
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from onnx import TensorProto
 from ddg_jax.inverse_depth import NORMALISED_LIMIT, STATISTICS_STRIDE
 from ddg_jax.network_prior import NETWORKS
 from ddg_jax.prior import NEAREST_M, MetricInverseDepthPrior
-from ddgrasp.config import PIECEWISE, DDGConfig
+from ddgrasp.config import BOX, PIECEWISE, DDGConfig, GraftConfig
 from ddgrasp.errors import UserError
 from export.builder import GraphBuilder
 from sensors.statistics import holes
@@ -32,7 +33,13 @@ def check_prior(config: DDGConfig) -> None:
         )
     blur_px = 0.0 if config.prior.source in NETWORKS else config.prior.blur_px
     least = min(config.depth.height_px, config.depth.width_px)
-    for name, sigma_px in (("prior.blur_px", blur_px), ("graft.window_px", config.graft.window_px)):
+    window_px, is_box = config.graft.window_px, config.graft.window_shape == BOX
+    if is_box and window_px // 2 >= least:
+        raise UserError(
+            f"ddg.graft.window_px is {window_px:g}: the ONNX file cannot hold a box that reaches across all "
+            f"of the map's {least} pixels: export a generator with less than {2 * least:g}."
+        )
+    for name, sigma_px in (("prior.blur_px", blur_px), ("graft.window_px", 0.0 if is_box else window_px)):
         if _blur_length(sigma_px) // 2 >= least:
             raise UserError(
                 f"ddg.{name} is {sigma_px:g}: the ONNX file cannot hold a Gaussian that reaches across "
@@ -82,20 +89,33 @@ def write_normalised(g: GraphBuilder, inverse: str, size: tuple[int, int]) -> st
 # --- filters ---------------------------------------------------------------------------------------
 
 
-def write_window(g: GraphBuilder, depth: str, window_px: float) -> str:
-    """`window.mixed`: inverse depth averaged over valid pixels by a Gaussian."""
-    if window_px == 0:
+def write_window(g: GraphBuilder, depth: str, graft: GraftConfig) -> str:
+    """`window.mixed`: inverse depth averaged over valid pixels by a Gaussian or a box."""
+    if graft.window_px == 0:
         return depth
+    averaged = partial(write_box, width_px=int(graft.window_px))
+    if graft.window_shape != BOX:
+        averaged = partial(write_blur, sigma_px=graft.window_px)
     valid = g.op("Greater", depth, g.constant(0.0))
-    weight = write_blur(g, g.op("Cast", valid, to=TensorProto.FLOAT), window_px)
-    mean = write_blur(g, write_inverse(g, depth), window_px)
+    weight = averaged(g, g.op("Cast", valid, to=TensorProto.FLOAT))
+    mean = averaged(g, write_inverse(g, depth))
     return g.op("Where", valid, g.op("Div", weight, mean), g.constant(0.0))
 
 
 def write_blur(g: GraphBuilder, x: str, sigma_px: float) -> str:
     """cv2.GaussianBlur of float pictures, whose kernel reaches four standard deviations."""
     length = _blur_length(sigma_px)
-    kernel = cv2.getGaussianKernel(length, sigma_px, cv2.CV_32F).ravel()
+    return _write_separable(g, x, cv2.getGaussianKernel(length, sigma_px, cv2.CV_32F).ravel())
+
+
+def write_box(g: GraphBuilder, x: str, width_px: int) -> str:
+    """cv2.blur of float pictures over an odd number of pixels."""
+    return _write_separable(g, x, np.full(width_px, 1 / width_px, np.float32))
+
+
+def _write_separable(g: GraphBuilder, x: str, kernel: np.ndarray) -> str:
+    """`x` through a kernel of odd length along columns, then rows, reflected at the border."""
+    length = len(kernel)
     x = _write_padded(g, x, length // 2, "reflect")
     for shape in ((length, 1), (1, length)):
         weights = g.constant(kernel.reshape(1, 1, *shape))

@@ -55,8 +55,11 @@ OPTIONS = {
         unet=replace(SMALL.unet, attention_heads=0),
         sampling=SamplingConfig(sampler="ddpm", steps=5, spacing="trailing"),
     ),
-    "a network that knows where it is, large planes": replace(
-        SMALL, unet=replace(SMALL.unet, position=True), depth=replace(SMALL.depth, surface="planes")
+    "a network that knows where it is, large planes, a box": replace(
+        SMALL,
+        graft=replace(SMALL.graft, window_px=5, window_shape="box"),
+        unet=replace(SMALL.unet, position=True),
+        depth=replace(SMALL.depth, surface="planes"),
     ),
     "distilled": replace(SMALL, sampling=SamplingConfig(sampler="progressive", steps=2)),
 }
@@ -173,6 +176,21 @@ def test_a_gaussian_that_reaches_across_the_map_is_refused(name, tmp_path):
     finished(made(wide), tmp_path)
     with pytest.raises(UserError, match=f"ddg.{name} is 7: .* 27 pixels: .* 6.5 or less"):
         exported.export_generator(tmp_path, tmp_path / "generator.onnx")
+
+
+def test_a_box_that_reaches_across_the_map_is_refused():
+    depth = replace(SMALL.depth, height_px=8)
+    held, wide = (GraftConfig(window_px=px, window_shape="box") for px in (15, 17))
+    prior_graph.check_prior(replace(SMALL, depth=depth, graft=held, prior=PriorConfig(blur_px=1.0)))
+    with pytest.raises(UserError, match="ddg.graft.window_px is 17: .* 8 pixels: .* less than 16"):
+        prior_graph.check_prior(replace(SMALL, depth=depth, graft=wide, prior=PriorConfig(blur_px=1.0)))
+
+
+@pytest.mark.parametrize("width_px", [3, 5, 15])
+def test_a_box_is_opencvs(width_px):
+    picture = np.random.default_rng(0).random((27, 48)).astype(np.float32)
+    averaged = filtered(lambda g, x: prior_graph.write_box(g, x, width_px), picture)
+    np.testing.assert_allclose(averaged, cv2.blur(picture, (width_px, width_px)), atol=1e-6)
 
 
 def test_the_widest_gaussian_that_is_held_is_opencvs():

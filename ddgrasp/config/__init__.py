@@ -8,6 +8,7 @@ from typing import Annotated
 
 from ddgrasp.config.checks import Range, Section, Seed, Text
 from ddgrasp.config.ddg import (
+    BOX,
     CROSS_ENTROPY,
     DDIM,
     DDPM,
@@ -151,6 +152,7 @@ __all__ = [
     "ROBOTS",
     "Robot",
     "BACKENDS",
+    "BOX",
     "RENDERERS",
     "Backend",
     "BY_COLOUR",

@@ -40,6 +40,9 @@ SPACINGS: tuple[Spacing, ...] = get_args(Spacing)
 HALVED_SPACINGS: tuple[Spacing, ...] = ("trailing", "quadratic")
 """Those whose every second step is one of half as many: what progressive distillation needs."""
 
+WindowShape = Literal["gaussian", "box"]
+GAUSSIAN, BOX = get_args(WindowShape)
+
 _Metres = Annotated[float, Range(0, 1000, above=True)]
 _Evaluations = Annotated[int, Range(1, 10_000)]
 _Snr = Annotated[float, Range(0, 1_000_000)]
@@ -83,8 +86,16 @@ class GraftConfig(Section, name="ddg.graft"):
     """Smallest deviation of inverse depth, 1/m, that is an artefact and grafted: 1/32 px of disparity, here a
     D455's; 0.0016 for a D435 at 640x480 (deviation only). 1 grafts holes alone."""
     window_px: Annotated[float, Range(0, 20)] = 0.0
-    """Standard deviation of the window over which the camera's matching mixes surfaces, pixels of simulated
-    depth, which is blurred by it before anything else (ddg_jax/window.py); 0 leaves its edges sharp."""
+    """Size of the window over which the camera's matching mixes surfaces, pixels of simulated depth, which is
+    blurred by it before anything else (ddg_jax/window.py): the standard deviation of a Gaussian, the width of
+    a box; 0 leaves edges sharp."""
+    window_shape: WindowShape = "gaussian"
+    """gaussian, or box, which is what a matcher that weighs all of its window alike does."""
+
+    def check(self) -> None:
+        """See `Section.check`."""
+        if self.window_shape == BOX and self.window_px and self.window_px % 2 != 1:
+            raise self.error("window_px", "an odd number of pixels for a box, or 0")
 
 
 @dataclass(frozen=True)
