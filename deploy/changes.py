@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rig.camera import RigCamera
     from rig.world import RigWorld
 
-WorldName = Literal["as it is", "meshes", "furniture", "dark table", "spring"]
+WorldName = Literal["as it is", "meshes", "furniture", "dark table", "other tables", "spring"]
 SightName = Literal[
     "stereo", "ideal", "full size",
     "holes", "small holes", "large holes", "values", "ripple", "mismatches",
@@ -28,8 +28,9 @@ class Change:
     """The development rig, but for this."""
 
     world: WorldName = "as it is"
-    """meshes (the test rig's objects), furniture (its table's end, wall and clutter), dark table, or spring
-    (the arm follows as the Franka driver's spring has it at full stiffness)."""
+    """meshes (the test rig's objects), furniture (its table's end, wall and clutter), dark table, other
+    tables (light and dark in other places in every trial), or spring (the arm follows as the Franka driver's
+    spring has it at full stiffness)."""
     sight: SightName = "stereo"
     """stereo (matched at the policy's size), ideal (no errors), full size (matched at 848x480), one kind of
     stereo's errors alone (rig/camera_errors.py), or a generator's errors instead of all of stereo's, or of
@@ -68,6 +69,10 @@ class Change:
         from rig.camera_errors import ERRORS, PartlyWrongCamera
 
         before, seen = (world.model, config.record.stereo, config.world.profile), self.sight
+        if self.world == "other tables":
+            from rig.other_worlds import OtherTablesCamera
+
+            return OtherTablesCamera(*before, seen == "ideal")
         if seen == "full size":
             from deploy.full_size import FullSizeCamera
 

@@ -93,6 +93,9 @@ ROWS: dict[str, Row] = {
     "off_10mm": Row("camera off by 10 mm and 1 degree", "calibration", Change(off=(0.010, 1.0))),
     "furniture": Row("end of the table, wall, clutter", "table and clutter", Change("furniture")),
     "dark_table": Row("dark table", "table and clutter", Change("dark table")),
+    "other_tables": Row(
+        "a table light and dark elsewhere in every trial", "table and clutter", Change("other tables"),
+    ),
     "spring": Row("arm follows as the Franka driver's spring", "dynamics", Change("spring")),
     "fr3": Row(
         "FR3 behind its protocol, on the same ground, primitives", "robot model",

@@ -39,7 +39,7 @@ def test_a_camera_is_off_by_as_much_as_is_said(off):
     assert Change().displaced(T_WORLD_CAM, 1) is T_WORLD_CAM
 
 
-@pytest.mark.parametrize("world", ["meshes", "furniture", "dark table", "spring"])
+@pytest.mark.parametrize("world", ["meshes", "furniture", "dark table", "other tables", "spring"])
 def test_arm_and_object_begin_where_they_do_in_the_development_rig(world):
     if world == "meshes":
         pytest.importorskip("manifold3d", reason="needs pip install -e '.[fr3]'")
@@ -80,6 +80,22 @@ def test_a_dark_table_returns_less_light():
     bright, dark = table_mm(Change()), table_mm(Change("dark table"))
     far = slice(0, 30)  # rows whose light has the longest way
     assert np.mean(dark[far] == 0) > np.mean(bright[far] == 0)
+
+
+def test_every_trial_has_a_table_of_its_own_and_few_a_hole_where_the_rigs_is_too_bright():
+    """Pixels 65 to 115 by 160 to 205 of the rig's own table: the infrared picture is clipped there."""
+    world = reset(Change(), name="cube", seed=1)
+    place = (slice(65, 115), slice(160, 205))
+
+    def lost(change):
+        camera = change.make_camera(CONFIG, world)
+        trials = [np.random.default_rng(seed) for seed in range(6)]
+        return [camera.depth_mm(world.data, T_WORLD_CAM, rng, "cube")[place] == 0 for rng in trials]
+
+    own, other = lost(Change()), lost(Change("other tables"))
+    assert min(hole.sum() for hole in own) >= 15 > np.median([hole.sum() for hole in other])
+    assert (other[0] != other[1]).any()
+    np.testing.assert_array_equal(other, lost(Change("other tables")))
 
 
 def test_a_camera_that_makes_some_of_its_errors_makes_no_others():

@@ -123,8 +123,8 @@ class StudyCauses:
     """ONNX file that `ddgrasp export` wrote."""
     rows: tuple[str, ...] = ("all",)
     """all, or of: ideal, holes, small_holes, large_holes, values, ripple, mismatches, generator,
-    generator_holes, generator_values, full_size, meshes, off_2mm, off_10mm, furniture, dark_table, spring,
-    fr3, test_rig. What they are compared with is tried too."""
+    generator_holes, generator_values, full_size, meshes, off_2mm, off_10mm, furniture, dark_table,
+    other_tables, spring, fr3, test_rig. What they are compared with is tried too."""
     objects: tuple[str, ...] = ("all",)
     """Names, or all."""
     trials: Count = 10

@@ -99,10 +99,14 @@ class ActiveStereo:
         self._vignetting = (1.0 + self._x**2 + self._y**2) ** np.float32(-VIGNETTING / 2)
         self._projector = _projector_profile(profile)
         self._pattern = _dot_pattern(config, profile, self._projector)
-        self._texture = albedo_texture(TEXTURE_PX, TEXTURE_PX, texture_seed)
+        self.paint(texture_seed)
         self._fb_px_m = p.fx_px * p.baseline_m
         self._disparities = 16 * math.ceil(self._fb_px_m / config.min_range_m / 16)
         self._matcher = matching.matcher(config, self._disparities)
+
+    def paint(self, texture_seed: int) -> None:
+        """Draws the albedo of what the camera looks at anew."""
+        self._texture = albedo_texture(TEXTURE_PX, TEXTURE_PX, texture_seed)
 
     def sense(
         self,
