@@ -47,6 +47,19 @@ def check(config: DDGConfig) -> None:
         _check_weights(source, manifest.metrics.get("prior_source"), weights_folder(config))
 
 
+def drawn_otherwise(config: DDGConfig) -> str:
+    """Which values of sampling and grafting are others than those that `config.init_from` was made with, for
+    people; "" if none is."""
+    there = artifacts.config_from_json(artifacts.read_manifest(folder(config)).config).ddg
+    other = [
+        f"ddg.{section}.{name} {getattr(getattr(config, section), name)!r} (there {value!r})"
+        for section in ("sampling", "graft")
+        for name, value in vars(getattr(there, section)).items()
+        if name != "batch_size" and value != getattr(getattr(config, section), name)
+    ]
+    return f"{config.init_from} was made to draw otherwise: {', '.join(other)}" if other else ""
+
+
 def _check_weights(source: Path, fitted_on: object, weights: Path) -> None:
     """UserError if the prior's `weights` are not of the file that the generator in `source` was fitted on."""
     here = store.read_manifest(weights).source_sha256

@@ -64,8 +64,8 @@ class UNet(nn.Module):
       factor: space-to-depth before and depth-to-space after the network.
       position: whether the network knows where in the picture it is, by a learnt embedding that is added to
         what it sees (Dosovitskiy et al. 2021, section 3.1). It then takes maps of the size that it was
-        initialised with. A camera's own defects stay at their pixels, wherever it looks: a gap in the
-        projector's pattern, dust, a corner that the lens leaves dark.
+        initialised with. A camera's own defects stay at their pixels, wherever it looks: dust, a corner
+        that the lens leaves dark, where its projector is too bright.
     """
 
     widths: Sequence[int]

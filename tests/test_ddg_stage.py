@@ -161,7 +161,7 @@ def test_the_camera_presets_generator_fits_and_samples_with_fresh_noise(recordin
     assert np.abs(predict(jax.random.key(0), calm, c) - made).max() > 1e-2
 
 
-def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
+def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path, capsys):
     config = dataclasses.replace(
         CONFIG,
         ddg=dataclasses.replace(
@@ -170,9 +170,10 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path):
             sampling=dataclasses.replace(CONFIG.ddg.sampling, steps=3),
         ),
     )
-    loaded = stage.run(
-        make_job("ddg", config, tmp_path / "ddg", Progress(tmp_path / "ddg", quiet=True), data=recordings)
-    )
+    loaded = stage.run(make_job("ddg", config, tmp_path / "ddg", Progress(tmp_path / "ddg"), data=recordings))
+    there = CONFIG.ddg.sampling.steps
+    said = f"{fitted.directory} was made to draw otherwise: ddg.sampling.steps 3 (there {there})"
+    assert said in capsys.readouterr().err
     assert loaded.manifest.origin == "loaded" and loaded.manifest.metrics["frames"]["training"] == 0
     before, after = (load_params(a.directory / "params.msgpack") for a in (fitted, loaded))
     jax.tree.map(np.testing.assert_array_equal, before, after)
