@@ -32,6 +32,7 @@ from rig import seeds
 from rig.film import Film, contact_sheet
 
 RigName = Literal["development", "fr3"]
+CameraName = Literal[Sight, "other_tables"]
 TRIALS_FILE, TABLE_FILE, EPISODES = "trials.jsonl", "table.json", "episodes"
 EVERYTHING, FIRST_TRY = "all", "first_try"
 _SAME = ("rig", "shapes", "split", "number", "seconds", "ends", "rules")
@@ -60,8 +61,9 @@ class Series:
     """Which seed of the split."""
     shapes: Shapes = "mesh"
     """On rig fr3: mesh objects, or the development rig's primitives."""
-    camera: Sight = "stereo"
-    """stereo (the rig's own), ideal (no errors), or coarse (rig fr3: matched at the policy's size)."""
+    camera: CameraName = "stereo"
+    """stereo (the rig's own), ideal (no errors), coarse (rig fr3: matched at the policy's size), or
+    other_tables (development rig: before a table that is light and dark elsewhere in every trial)."""
 
     seconds: float = contract.TRIAL_S
     """A trial ends with success, or after this."""
@@ -78,6 +80,10 @@ class Series:
         """The objects. UserError for none or an unknown one, or a choice that the rig does not have."""
         if self.rig == "development" and (self.camera == "coarse" or self.shapes != "mesh"):
             raise UserError("--camera coarse and --shapes are rig fr3's: drop them, or choose --rig fr3.")
+        if self.rig == "fr3" and self.camera == "other_tables":
+            raise UserError(
+                "--camera other_tables is rig development's: choose --rig development, or another."
+            )
         if self.rig == "development" and self.contact is not None:
             raise UserError("--contact is rig fr3's, whose arm stops itself: drop it, or choose --rig fr3.")
         if self.trials > (most := len(seeds.SEEDS[self.split])):
@@ -119,7 +125,10 @@ class Series:
         where a network's weights are missing."""
         treatment = treatment or make_treatment(self.depth, config)
         if self.rig == "fr3":
+            assert self.camera != "other_tables"  # `names`
             return Fr3Bench(self.shapes, self.camera, treatment)
+        if self.camera == "other_tables":
+            return partial(Rig, change=Change("other tables"), treatment=treatment)
         change = Change(sight="ideal" if self.camera == "ideal" else "stereo")
         return partial(Rig, change=change, treatment=treatment)
 

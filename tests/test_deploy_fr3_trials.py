@@ -115,6 +115,7 @@ def test_a_trial_is_the_same_whichever_others_are_asked_for():
         (Series(rig="development", objects=("mug",)), "Unknown object 'mug'"),
         (Series(objects=()), "--objects names none: give names, or all"),
         (Series(rig="development", camera="coarse"), "are rig fr3's"),
+        (Series(rig="fr3", camera="other_tables"), "other_tables is rig development's"),
     ],
 )
 def test_wrong_series_get_one_line(series, message):

@@ -98,6 +98,15 @@ def test_a_policy_is_shown_depth_as_recorded_or_inpainted(tmp_path, policy, seen
     np.testing.assert_array_equal(seen[0], inpainted(recorded[0]))
 
 
+def test_a_policy_is_shown_other_tables(tmp_path, policy, seen):
+    rig_trials.run(CONFIG, policy, replace(SERIES, camera="other_tables"), tmp_path / "other", 0, QUIET)
+    rig_trials.run(CONFIG, policy, SERIES, tmp_path / "own", 0, QUIET)
+    headers = [read_log(tmp_path / name / TRIALS)[0] for name in ("other", "own")]
+    assert [header["camera"] for header in headers] == ["other_tables", "stereo"]
+    other, own = np.stack(seen[:5]), np.stack(seen[5:])
+    assert other.shape == own.shape and np.mean(other != own) > 0.1
+
+
 def test_a_policy_is_shown_the_monocular_network_s_depth(tmp_path, policy, seen, small_network):
     rig_trials.run(small_network, policy, replace(SERIES, depth="monocular"), tmp_path / "out", 0, QUIET)
     assert len(seen) == 5 and holes(seen) == [0] * 5

@@ -38,7 +38,7 @@ def text() -> str:
         (("run", "--seed", "3", "--preset", "de"), ["debug", "demo"]),
         (("play", "--viewer", ""), ["auto", "film", "mujoco", "rerun", "web"]),
         (("deploy", "--camera", "rig"), ["rig", "rig-ideal"]),
-        (("deploy", "trials", "--camera", ""), ["stereo", "coarse", "ideal"]),
+        (("deploy", "trials", "--camera", ""), ["stereo", "coarse", "ideal", "other_tables"]),
         (("teacher", "compare", "x", "--backends", "c"), ["cpu"]),
         (("play", "--out", ""), []),
         (("run", "--config", ""), []),

@@ -29,8 +29,9 @@ class DeployTrials:
     """Which seed of the split."""
     shapes: Literal["mesh", "primitive"] = "mesh"
     """On rig fr3: mesh objects, or the development rig's primitives."""
-    camera: Literal["stereo", "coarse", "ideal"] = "stereo"
-    """stereo (the rig's own), ideal (without errors), coarse (on rig fr3: matched at the policy's size)."""
+    camera: Literal["stereo", "coarse", "ideal", "other_tables"] = "stereo"
+    """stereo (the rig's own), ideal (without errors), coarse (on rig fr3: matched at the policy's size), or
+    other_tables (on rig development: before a table that is light and dark elsewhere in every trial)."""
     seconds: Annotated[float, Range(0.5, 60)] = contract.TRIAL_S
     """A trial ends with success, or after this."""
     contact: Annotated[float, Range(1, 100)] | None = None
