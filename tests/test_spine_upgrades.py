@@ -195,7 +195,7 @@ BY_HAND: dict[int, tuple[str, tuple[tuple[str, object, str, object], ...]]] = {
         ),
     ),
     10: (
-        "ddg",
+        "table2/ddg",
         (
             ("deploy.retry", True, "deploy.retry", True),
             ("deploy.franka.approach_below_m", ABSENT, "deploy.franka.approach_below_m", 0.16),
@@ -216,6 +216,13 @@ BY_HAND: dict[int, tuple[str, tuple[tuple[str, object, str, object], ...]]] = {
             ("student.dextrah_scale", 2.0, "student.dextrah_scale", 2.0),
             ("student.depth_source", "dextrah", "student.depth_source", "dextrah"),
             ("student.picture.fill_holes", False, "student.picture.fill_holes", False),
+        ),
+    ),
+    15: (
+        "ddg",
+        (
+            ("ddg.graft.window_shape", "box", "ddg.graft.window_shape", "box"),
+            ("ddg.graft.window_px", 5.0, "ddg.graft.window_px", 5.0),
         ),
     ),
 }
