@@ -119,10 +119,10 @@ def test_every_column_is_resampled_alike():
 
 
 def test_samplers_have_the_generators_own_and_steps_that_do_not_spoil_them():
-    """Second order at linspace steps leaves specks, and the shipped generator has those for its DDIM."""
+    """Second order at a DDIM's steps leaves specks, and the shipped generator has trailing ones for its DDIM."""
     sampling = {name: made.config.sampling for name, made in samplers._generators(PRETRAINED / "ddg")}
     steps = {name: f"{s.sampler} {s.steps} {s.spacing}" for name, s in sampling.items()}
-    assert steps["ddim 6"] == "ddim 6 linspace" and steps["ddim 50"] == "ddim 50 linspace"
+    assert steps["ddim 8"] == "ddim 8 trailing" and steps["ddim 50"] == "ddim 50 trailing"
     assert steps["dpm_solver 4"] == "dpm_solver 4 quadratic"
     assert steps["dpm_solver 8"] == "dpm_solver 8 quadratic"
 
