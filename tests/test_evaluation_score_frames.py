@@ -119,7 +119,7 @@ def test_every_column_is_resampled_alike():
 
 
 def test_samplers_have_the_generators_own_and_steps_that_do_not_spoil_them():
-    """Second order at a DDIM's steps leaves specks, and the shipped generator has trailing ones for its DDIM."""
+    """Second order at a DDIM's steps leaves specks; the shipped generator has trailing ones."""
     sampling = {name: made.config.sampling for name, made in samplers._generators(PRETRAINED / "ddg")}
     steps = {name: f"{s.sampler} {s.steps} {s.spacing}" for name, s in sampling.items()}
     assert steps["ddim 8"] == "ddim 8 trailing" and steps["ddim 50"] == "ddim 50 trailing"
