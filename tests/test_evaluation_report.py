@@ -276,7 +276,7 @@ def test_every_number_of_a_whole_run_has_a_meaning_and_a_unit_where_it_needs_one
     report = json.loads((ROOT / "pretrained" / "report.json").read_text())
     assert unexplained(report) == []
     shown = dict(flatten(report["record"]) + flatten(report["deploy"]))
-    assert shown["invalid_fraction"] == "9.48 %" and shown["sense_ms.p50"] == "28 ms"
+    assert shown["invalid_fraction"] == "9.48 %" and shown["sense_ms.p50"] == "56.07 ms"
     assert explain("deploy.sense_ms.p50") == ("ms", "reading camera and joints: half take no longer")
     assert explain("loss/v_loss") == ("", "training loss: the value network's")
     assert explain("nonsense.of.ours") == ("", "")
