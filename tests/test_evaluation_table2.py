@@ -307,7 +307,8 @@ KEPT = PRETRAINED / "table2" / "trials"
     [
         ("development-test-10", {"sim_gt": (477, 6), "rand_noise": (50, 23), "inpaint": (125, 19),
                                  "ddg_no_graft": (25, 20), "upper_bound": (16, 22)}),
-        ("development-test-11-other-tables", {"sim_gt": (122, 18), "rand_noise": (19, 24)}),
+        ("development-test-11-other-tables", {"sim_gt": (122, 18), "rand_noise": (19, 24),
+                                              "inpaint": (90, 21)}),
         ("development-9", {"sim_gt": (499, 3), "rand_noise": (62, 37), "inpaint": (141, 28),
                            "ddg_no_graft": (26, 34), "upper_bound": (24, 42)}),
         ("fr3-test-10", {"inpaint": (8, 3)}),
