@@ -96,9 +96,9 @@ def fitted_generator(
     """
     if config.sampling.sampler == PROGRESSIVE:
         check_halving(config)
+    fitted = _loaded(config) if config.init_from else fit(config, frames, directory, seed, progress, curve)
     if config.init_from and (other := start.drawn_otherwise(config)):
         progress.note(other)
-    fitted = _loaded(config) if config.init_from else fit(config, frames, directory, seed, progress, curve)
     generator = Generator(config, fitted, prior)
     generator.save(directory)
     if config.sampling.sampler != PROGRESSIVE:

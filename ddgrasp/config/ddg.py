@@ -41,7 +41,7 @@ HALVED_SPACINGS: tuple[Spacing, ...] = ("trailing", "quadratic")
 """Those whose every second step is one of half as many: what progressive distillation needs."""
 
 WindowShape = Literal["gaussian", "box"]
-GAUSSIAN, BOX = get_args(WindowShape)
+_, BOX = get_args(WindowShape)
 
 _Metres = Annotated[float, Range(0, 1000, above=True)]
 _Evaluations = Annotated[int, Range(1, 10_000)]
