@@ -64,15 +64,16 @@ class Change:
 
     def make_camera(self, config: Config, world: "RigWorld") -> "RigCamera":
         """The camera before `world`."""
+        camera = self._camera(config, world)
+        camera.other_tables = config.record.other_tables or self.world == "other tables"
+        return camera
+
+    def _camera(self, config: Config, world: "RigWorld") -> "RigCamera":
         from deploy.generated_camera import GENERATED, SHIPPED, GeneratedCamera
-        from rig.camera import make_camera
+        from rig.camera import RigCamera
         from rig.camera_errors import ERRORS, PartlyWrongCamera
 
         before, seen = (world.model, config.record.stereo, config.world.profile), self.sight
-        if self.world == "other tables":
-            from rig.other_worlds import OtherTablesCamera
-
-            return OtherTablesCamera(*before, seen == "ideal")
         if seen == "full size":
             from deploy.full_size import FullSizeCamera
 
@@ -85,7 +86,7 @@ class Change:
             from rig.mesh_world import MeshCamera
 
             return MeshCamera(*before, seen == "ideal")
-        return make_camera(config, world, ideal=seen == "ideal")
+        return RigCamera(*before, seen == "ideal")
 
     def displaced(self, T_world_cam: Float[np.ndarray, "4 4"], seed: int) -> Float[np.ndarray, "4 4"]:
         """(4, 4) where the camera stands instead of `T_world_cam`; the direction follows from `seed`."""

@@ -25,11 +25,10 @@ class FullSizeCamera(RigCamera):
         self.stereo = of_scale(config, contract.D455_STREAM)
         self._driver = RealSenseCamera(SimClock(), profile, stream=contract.D455_STREAM)
 
-    def depth_mm(
-        self, data: mujoco.MjData, T_world_cam: Pose, rng: np.random.Generator, object_name: str = ""
+    def _sense(
+        self, data: mujoco.MjData, T_world_cam: Pose, rng: np.random.Generator, object_name: str
     ) -> UInt16[np.ndarray, "H W"]:
-        """See RigCamera."""
-        return self._driver.convert(super().depth_mm(data, T_world_cam, rng, object_name))
+        return self._driver.convert(super()._sense(data, T_world_cam, rng, object_name))
 
     def pinhole(self, T_world_cam: Pose) -> Camera:
         """See RigCamera: of the pictures that it hands out."""

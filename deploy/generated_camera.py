@@ -35,28 +35,27 @@ class GeneratedCamera(RigCamera):
         super().__init__(model, config, profile)
         self.generated: GeneratedName = generated
         self._generator = _opened(file, profile)
-        self._of: np.random.Generator | None = None
         self._noise: EpisodeNoise
 
-    def depth_mm(
+    def _begin(self, rng: np.random.Generator) -> None:
+        super()._begin(rng)
+        self._noise = self._generator.noise(1, seed=int(rng.spawn(1)[0].integers(2**31)))
+
+    def _sense(
         self,
         data: mujoco.MjData,
         T_world_cam: Float[np.ndarray, "4 4"],
         rng: np.random.Generator,
-        object_name: str = "",
+        object_name: str,
     ) -> UInt16[np.ndarray, "H W"]:
-        """(H, W) uint16 millimetres, 0 = invalid; the camera's share by the same draws of `rng` as the whole
-        camera's, the generator's by draws of its own that follow from it. Another `rng` is another episode.
-        """
-        if rng is not self._of:
-            self._of, seed = rng, rng.spawn(1)[0].integers(2**31)
-            self._noise = self._generator.noise(1, seed=int(seed))
+        """The camera's share by the same draws of `rng` as the whole camera's, the generator's by others that
+        follow from it."""
         clean_mm = self.clean_mm(data, T_world_cam)
         generated = self._generator(to_metres(clean_mm)[None], self._noise.next())[0]
         generated_mm = to_millimetres(generated)
         if self.generated == "generator":
             return generated_mm
-        sensed_mm = super().depth_mm(data, T_world_cam, rng, object_name)
+        sensed_mm = super()._sense(data, T_world_cam, rng, object_name)
         if self.generated == "generator's holes":
             return joined(generated_mm, sensed_mm, clean_mm)
         return joined(sensed_mm, generated_mm, clean_mm)

@@ -350,6 +350,8 @@ def made_with(config: Config, policy: Path, trained: Sequence[str]) -> dict[str,
 
 
 def _draws_hash(config: Config) -> str:
-    """Stands for what trials are drawn from: where camera, joints and object are, sizes, camera noise."""
-    drawn_from = to_json((config.world.random, config.record.stereo))
+    """Stands for what trials are drawn from: where camera, joints and object are, sizes, camera noise, and
+    the tables if they are not the rig's own (logs of before there were others say nothing of it)."""
+    tables = ("other tables",) if config.record.other_tables else ()
+    drawn_from = to_json((config.world.random, config.record.stereo, *tables))
     return hashlib.sha256(json.dumps(drawn_from, sort_keys=True).encode()).hexdigest()[:8]

@@ -36,6 +36,11 @@ class RigCamera:
         """`ideal` depth is as rendered."""
         self.model, self._ideal = model, ideal
         self.stereo = of_scale(config, profile)
+        self.other_tables = False
+        """Whether every scene is before a table whose light and dark places are others. The rig's own has one
+        that is so bright under the middle of the projector that the infrared picture is clipped there and
+        nothing is matched: a hole in the bare table at the same place in nearly all trials."""
+        self._scene: np.random.Generator | None = None
 
     def close(self) -> None:
         """Lets go of what it draws with."""
@@ -47,8 +52,28 @@ class RigCamera:
         rng: np.random.Generator,
         object_name: str = "",
     ) -> UInt16[np.ndarray, "H W"]:
-        """(H, W) uint16 millimetres as the camera reports them, 0 = invalid."""
+        """(H, W) uint16 millimetres as the camera reports them, 0 = invalid.
 
+        Another `rng` is another scene.
+        """
+        if rng is not self._scene:
+            self._scene = rng
+            self._begin(rng)
+        return self._sense(data, T_world_cam, rng, object_name)
+
+    def _begin(self, rng: np.random.Generator) -> None:
+        """Draws what a scene keeps, without a number of `rng`'s own."""
+        if self.other_tables:
+            self.stereo.paint(int(rng.spawn(1)[0].integers(2**31)))
+
+    def _sense(
+        self,
+        data: mujoco.MjData,
+        T_world_cam: Float[np.ndarray, "4 4"],
+        rng: np.random.Generator,
+        object_name: str,
+    ) -> UInt16[np.ndarray, "H W"]:
+        """See `depth_mm`."""
         if self._ideal:
             return self.clean_mm(data, T_world_cam)
         draw, draw_depth = partial(self._draw, data), partial(self._draw_depth, data)
@@ -78,7 +103,9 @@ class RigCamera:
 
 def make_camera(config: Config, world: RigWorld, ideal: bool = False) -> RigCamera:
     """The configured camera, before `world`; `ideal` makes no errors."""
-    return RigCamera(world.model, config.record.stereo, config.world.profile, ideal)
+    camera = RigCamera(world.model, config.record.stereo, config.world.profile, ideal)
+    camera.other_tables = config.record.other_tables
+    return camera
 
 
 def jittered_pose(config: RecordConfig, rng: np.random.Generator) -> Float64[np.ndarray, "4 4"]:

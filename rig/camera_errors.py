@@ -27,15 +27,15 @@ class PartlyWrongCamera(RigCamera):
         super().__init__(model, config, profile)
         self.errors: ErrorName = errors
 
-    def depth_mm(
+    def _sense(
         self,
         data: mujoco.MjData,
         T_world_cam: Float[np.ndarray, "4 4"],
         rng: np.random.Generator,
-        object_name: str = "",
+        object_name: str,
     ) -> UInt16[np.ndarray, "H W"]:
-        """(H, W) uint16 millimetres, 0 = invalid; the same draws of `rng` as the whole camera's."""
-        sensed_mm = super().depth_mm(data, T_world_cam, rng, object_name)
+        """By the same draws of `rng` as the whole camera's."""
+        sensed_mm = super()._sense(data, T_world_cam, rng, object_name)
         return only(self.errors, sensed_mm, self.clean_mm(data, T_world_cam), self.stereo.profile)
 
 

@@ -8,13 +8,12 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Float
 
 from ddgrasp import contract
 from ddgrasp.config import RandomConfig
 from ddgrasp.layout import CONTROLS, QPOS
 from mjx_envs import draws, scene
-from rig.camera import RigCamera
 from rig.fr3.scene import FLOOR_Z_M, TABLE_CENTER_M, TABLE_HALF_M, add_surroundings
 from rig.world import SIM_DT_S, RigWorld
 
@@ -44,30 +43,6 @@ class DarkTableWorld(RigWorld):
         """See RigWorld."""
         super().__init__(objects, random)
         self.model.geom("table").rgba[:] = [float(share) for share in DARK_RGBA.split()]
-
-
-class OtherTablesCamera(RigCamera):
-    """Before a table whose light and dark places are others in every trial.
-
-    The development rig's has one that is so bright under the middle of the projector that the infrared
-    picture is clipped there and nothing is matched: a hole in the bare table at the same place in nearly all
-    trials.
-    """
-
-    _of: np.random.Generator | None = None
-
-    def depth_mm(
-        self,
-        data: mujoco.MjData,
-        T_world_cam: Float[np.ndarray, "4 4"],
-        rng: np.random.Generator,
-        object_name: str = "",
-    ) -> UInt16[np.ndarray, "H W"]:
-        """See RigCamera, by the same draws of `rng`. Another `rng` is another trial."""
-        if rng is not self._of:
-            self._of = rng
-            self.stereo.paint(int(rng.spawn(1)[0].integers(2**31)))
-        return super().depth_mm(data, T_world_cam, rng, object_name)
 
 
 class SpringWorld(RigWorld):

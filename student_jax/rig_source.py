@@ -23,6 +23,8 @@ from rig.world import SIM_DT_S
 
 _STREAM = 0x626F756E
 """Keeps its random numbers apart from every other stage's ("boun")."""
+_TABLES = 0x7461626C
+"""The same for the tables of episodes ("tabl")."""
 
 
 class RigSource(FrameByFrame):
@@ -57,6 +59,8 @@ class RigSource(FrameByFrame):
         """(H, W) uint16 millimetres of one view."""
         stage, spec = self._stage(), self._table.variants[int(views.variant[i])]
         stage.set_up(spec, float(views.size[i]), views.qpos[i])
+        if self._config.record.other_tables:
+            stage.paint(int(np.random.default_rng([self._config.seed, _TABLES, episode]).integers(2**31)))
         rng = np.random.default_rng([self._config.seed, _STREAM, episode, frame])
         return stage.camera.depth_mm(stage.data, views.T_world_cam[i], rng, spec.name)
 
@@ -75,6 +79,13 @@ class _Stage:
         self._model = scene.build_model(SIM_DT_S, layout)
         self.data = mujoco.MjData(self._model)
         self.camera = RigCamera(self._model, config.record.stereo, config.world.profile, ideal)
+        self._table: int | None = None
+
+    def paint(self, table: int) -> None:
+        """Puts another table there if it is not there yet."""
+        if table != self._table:
+            self._table = table
+            self.camera.stereo.paint(table)
 
     def set_up(self, spec: ObjectSpec, size: float, qpos: np.ndarray) -> None:
         """Puts everything where it was."""

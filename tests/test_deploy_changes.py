@@ -96,6 +96,11 @@ def test_every_trial_has_a_table_of_its_own_and_few_a_hole_where_the_rigs_is_too
     assert min(hole.sum() for hole in own) >= 15 > np.median([hole.sum() for hole in other])
     assert (other[0] != other[1]).any()
     np.testing.assert_array_equal(other, lost(Change("other tables")))
+    of_config = replace(CONFIG, record=replace(CONFIG.record, other_tables=True))
+    camera = Change().make_camera(of_config, world)
+    mm = camera.depth_mm(world.data, T_WORLD_CAM, np.random.default_rng(0), "cube")
+    np.testing.assert_array_equal(mm[place] == 0, other[0])
+    np.testing.assert_array_equal(lost(Change("other tables", sight="holes")), other)
 
 
 def test_a_camera_that_makes_some_of_its_errors_makes_no_others():

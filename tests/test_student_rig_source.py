@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ddg_jax.generate import Clip
+from ddgrasp import machine
 from ddgrasp.config import (
     Config,
     PictureConfig,
@@ -25,6 +26,7 @@ from mjx_envs.randomize import ObjectTable
 from mjx_envs.views import Views, observed
 from rig.camera import camera_pose, make_camera
 from rig.world import make_world
+from sensors.models.active_stereo import ActiveStereo
 from student_jax import frames_io
 from student_jax.act import SourceCamera
 from student_jax.depth_source import VIEWED, check_demos, make_source
@@ -76,6 +78,21 @@ def test_a_frame_is_what_the_rigs_own_camera_takes_of_the_scene():
         np.testing.assert_array_equal(rendered, ideal.clean_mm(world.data, view.T_world_cam[0]))
         np.testing.assert_array_equal(seen, taken)
         assert 0.6 < np.mean(seen > 0) < 1.0 and np.any(seen != rendered)
+
+
+def test_an_episode_stays_before_its_own_table(monkeypatch):
+    config = replace(CONFIG, record=replace(CONFIG.record, other_tables=True))
+    world, painted = make_world(CONFIG.world), []
+    world.reset(0, "apple")
+    poses = np.repeat(camera_pose(CONFIG, np.random.default_rng(0))[None], 5, axis=0)
+    views = Views(np.repeat(world.data.qpos[None], 5, axis=0), np.zeros(5, int), np.ones(5), poses)
+    monkeypatch.setattr(machine, "cores", lambda: 1)
+    paint = ActiveStereo.paint
+    monkeypatch.setattr(ActiveStereo, "paint", lambda self, seed: painted.append(seed) or paint(self, seed))
+    episode, frame = np.array([3, 3, 4, 4, 3]), np.arange(5)
+    RigSource(config).frames(np.zeros((5, 1, 1), np.uint16), None, episode, frame, views)
+    three, four, again = painted[1:]  # after the one that a camera begins with
+    assert three == again != four
 
 
 def test_a_rollout_s_views_are_of_what_it_shows(roller):

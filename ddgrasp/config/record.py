@@ -21,5 +21,8 @@ class RecordConfig(Section, name="record"):
     """Half width of the uniform displacement of the point it looks at."""
     camera_roll_jitter_rad: Annotated[float, Range(0, 3.15)] = 0.05
     """Half width of its uniform roll."""
+    other_tables: bool = False
+    """Every recording, and every trial on the development rig, is before a table that is light and dark
+    elsewhere; off: all before the rig's one, whose brightest place is a hole that most frames share."""
     stereo: StereoConfig = field(default_factory=StereoConfig)
     """The camera itself."""
