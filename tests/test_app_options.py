@@ -159,6 +159,14 @@ def test_a_name_that_is_no_utf_8_is_refused_in_one_line(tmp_path):
             "deploy trials --policy x --rig fr3 --objects puck",
             "object 'puck' is a plain shape, which the dev",
         ),
+        (
+            "deploy trials --policy x --rig development --preset demo --config a.yaml",
+            "--config a.yaml and --preset demo both name a configuration: drop one.",
+        ),
+        (
+            "study causes --policy x --rows ideal --config a.yaml",
+            "--config a.yaml cannot be read (No such file",
+        ),
         ("play aple --objects aple", "'aple' stands without an option"),
         ("play apple", "'apple' stands without an option: objects are given by --objects apple."),
         ("play apple can --trials 2", "objects are given by --objects apple can."),

@@ -107,6 +107,18 @@ def test_a_policy_is_shown_other_tables(tmp_path, policy, seen):
     assert other.shape == own.shape and np.mean(other != own) > 0.1
 
 
+def test_other_tables_by_configuration_are_the_same_ones_and_other_trials(tmp_path, policy, seen):
+    config = replace(CONFIG, record=replace(CONFIG.record, other_tables=True))
+    rig_trials.run(CONFIG, policy, replace(SERIES, camera="other_tables"), tmp_path / "asked", 0, QUIET)
+    rig_trials.run(config, policy, SERIES, tmp_path / "configured", 0, QUIET)
+    np.testing.assert_array_equal(np.stack(seen[:5]), np.stack(seen[5:]))
+    rig_trials.run(CONFIG, policy, SERIES, tmp_path / "own", 0, QUIET)
+    configured, own = (read_log(tmp_path / name / TRIALS)[0] for name in ("configured", "own"))
+    assert configured["draws_hash"] != own["draws_hash"]
+    with pytest.raises(UserError, match="other trials|draws_hash|belong"):
+        rig_trials.check_place(CONFIG, policy, SERIES, tmp_path / "configured")
+
+
 def test_a_policy_is_shown_the_monocular_network_s_depth(tmp_path, policy, seen, small_network):
     rig_trials.run(small_network, policy, replace(SERIES, depth="monocular"), tmp_path / "out", 0, QUIET)
     assert len(seen) == 5 and holes(seen) == [0] * 5

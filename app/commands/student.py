@@ -10,7 +10,7 @@ import tyro
 
 from app.commands.base import DEFAULT_PRESET, OneStage, load_config, say
 from app.commands.checks import check_folder, check_objects, check_tried, tell_trials
-from ddgrasp import artifacts, contract
+from ddgrasp import artifacts, config_file, contract
 from ddgrasp.config import Camera, Config, Robot
 from ddgrasp.config.checks import Count, Range, Seed
 from ddgrasp.errors import UserError
@@ -177,8 +177,13 @@ def _check_policy(policy: Path) -> None:
         )
 
 
-def config_of(policy: Path, preset: str | None) -> Config:
-    """The named preset; else what made the artifact beside `policy`; else the default preset."""
+def config_of(policy: Path, preset: str | None, file: Path | None = None) -> Config:
+    """What the YAML `file` says; else the named preset; else what made the artifact beside `policy`; else the
+    default preset. UserError if both are given, or the file is none."""
+    if file is not None:
+        if preset is not None:
+            raise UserError(f"--config {file} and --preset {preset} both name a configuration: drop one.")
+        return config_file.read(file)
     if preset is None and artifacts.is_finished(policy.parent):
         return artifacts.config_from_json(artifacts.read_manifest(policy.parent).config)
     return get_preset(preset or DEFAULT_PRESET)

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import tyro
+
 from app.commands.base import FromPreset
 from app.commands.checks import (
     check_config_values,
@@ -135,6 +137,9 @@ class StudyCauses:
     """A trial ends with success, or after this."""
     preset: str | None = None
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    """YAML file to take instead of --preset, as for `ddgrasp run`: another camera (record.stereo), or before
+    many tables (record.other_tables)."""
     generator: Path = Path("pretrained/ddg/generator.onnx")
     """What `ddgrasp ddg export` wrote, for the rows with a generator's errors."""
     workers: Annotated[int, Range(1, 64)] = 2
@@ -156,7 +161,7 @@ class StudyCauses:
             check_tried(there := replace(series, rig="fr3"))
             there.names()
         check_folder("--out", self.out)
-        config = config_of(self.policy, self.preset)
+        config = config_of(self.policy, self.preset, self.config_file)
         made = causes.run(config, self.policy, rows, series, self.out, self.workers, self.generator)
         print(self.out / causes.JSON_FILE, self.out / causes.TABLE_FILE, sep="\n")
         print(causes.markdown(made["rows"]))

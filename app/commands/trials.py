@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import tyro
+
 from app.commands.checks import check_folder, check_tried
 from ddgrasp import contract
 from ddgrasp.config.checks import Count, Range
@@ -44,6 +46,9 @@ class DeployTrials:
     is off; --no-retry lets the policy alone act."""
     preset: str | None = None
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    """YAML file to take instead of --preset, as for `ddgrasp run`: another camera (record.stereo), or before
+    many tables (record.other_tables)."""
     workers: Annotated[int, Range(1, 64)] = 2
     """Rigs that run side by side."""
     record: bool = False
@@ -74,7 +79,7 @@ class DeployTrials:
         )
         check_tried(series)
         check_folder("--out", self.out)
-        config = config_of(self.policy, self.preset)
+        config = config_of(self.policy, self.preset, self.config_file)
         progress = Progress(name="deploy trials")
         table = rig_trials.run(
             config, self.policy, series, self.out, self.workers, progress, record=self.record
