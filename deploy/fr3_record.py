@@ -92,6 +92,7 @@ def describe(recordings: list[Recording], out: Path) -> str:
 def _begin(config: Config, takes: Takes, out: Path) -> None:
     """Writes down what is recorded, or compares it with what was. More trajectories may come."""
     camera = {**asdict(config.record), "trajectories": None}
+    del camera["other_tables"]  # the development rig's
     made = to_json({"takes": takes, "record": camera, "camera_scale": config.world.camera_scale})
     file = out / SETTINGS_FILE
     if file.exists() and read_json(file) != made:

@@ -28,7 +28,7 @@ from evaluation.rig_trials import Series
 
 JSON_FILE, TABLE_FILE, TIMES_FILE = "causes.json", "causes.md", "seconds.json"
 EVERYTHING = "all"
-REFERENCE, IDEAL = "development", "ideal"
+REFERENCE, IDEAL, OTHER_TABLES = "development", "ideal", "other_tables"
 _FILMED_FAILURES = 1
 
 
@@ -93,7 +93,7 @@ ROWS: dict[str, Row] = {
     "off_10mm": Row("camera off by 10 mm and 1 degree", "calibration", Change(off=(0.010, 1.0))),
     "furniture": Row("end of the table, wall, clutter", "table and clutter", Change("furniture")),
     "dark_table": Row("dark table", "table and clutter", Change("dark table")),
-    "other_tables": Row(
+    OTHER_TABLES: Row(
         "a table light and dark elsewhere in every trial", "table and clutter", Change("other tables"),
     ),
     "spring": Row("arm follows as the Franka driver's spring", "dynamics", Change("spring")),
@@ -135,6 +135,8 @@ def run(
 ) -> dict[str, Any]:
     """The table of the rows `names`; writes it after every row. Trials that `out` has are not run again.
 
+    Row `other_tables` is left out where the configuration has other tables in every row.
+
     Args:
       series: objects, trials, seed, seconds and retry, the same for every row; rig, camera and depth are a
         row's own and count for nothing. UserError for what rig fr3 alone has: contact, shapes, coarse camera.
@@ -144,12 +146,14 @@ def run(
     trained = policy_objects(policy, config)
     config = one_pose(series.configured(config, policy))
     trials = series.plan()
+    if config.record.other_tables:  # every row has them
+        names = tuple(name for name in names if name != OTHER_TABLES)
     belong_to = rig_trials.made_with(config, policy, trained) | {
         "number": series.number,
         "seconds": series.seconds,
     }
     headers = {name: belong_to | {"row": name} for name in names}
-    about = {"number": series.number, "policy": str(policy)}
+    about = {"number": series.number, "policy": str(policy), "other_tables": config.record.other_tables}
     if generated := [name for name in names if ROWS[name].generated]:
         drawn_by = {"generator_sha256": digest(generator, config.world.profile)}
         headers |= {name: headers[name] | drawn_by for name in generated}

@@ -107,6 +107,12 @@ class Series:
         """Trial i of the object of that name, one of `known`."""
         return Trial(self.known().index(name) * len(seeds.SEEDS[self.split]) + i, name)
 
+    def before(self, config: Config) -> "Series":
+        """With the tables that `config` has the development rig's own camera stand before."""
+        if self.rig == "development" and self.camera == "stereo" and config.record.other_tables:
+            return replace(self, camera="other_tables")
+        return self
+
     def configured(self, config: Config, policy: Path) -> Config:
         """`config` with the trials' length, seed, objects and the arm's limits. UserError if `policy` is no
         policy that can be run, or a limit not one that an arm has."""
@@ -162,6 +168,7 @@ def run(
     Leaves trials.jsonl, table.json and films in `out`: each object's first success, its first `failures`;
     with `record` a folder in `EPISODES` for every trial, as a deployment leaves it.
     """
+    series = series.before(config)
     header = _header(config, policy, series)
     config = series.configured(config, policy)
     make = series.make(config)
@@ -205,7 +212,7 @@ def run_missing(
 
 def check_place(config: Config, policy: Path, series: Series, out: Path) -> None:
     """UserError if `out` has trials of something else than `run` would add to them. Writes nothing."""
-    check_log(out, _header(config, policy, series))
+    check_log(out, _header(config, policy, series.before(config)))
 
 
 def check_log(out: Path, header: dict[str, Any]) -> None:
@@ -350,8 +357,7 @@ def made_with(config: Config, policy: Path, trained: Sequence[str]) -> dict[str,
 
 
 def _draws_hash(config: Config) -> str:
-    """Stands for what trials are drawn from: where camera, joints and object are, sizes, camera noise, and
-    the tables if they are not the rig's own (logs of before there were others say nothing of it)."""
-    tables = ("other tables",) if config.record.other_tables else ()
-    drawn_from = to_json((config.world.random, config.record.stereo, *tables))
+    """Stands for what trials are drawn from: where camera, joints and object are, sizes, camera noise; not
+    for the tables, which the camera's name tells."""
+    drawn_from = to_json((config.world.random, config.record.stereo))
     return hashlib.sha256(json.dumps(drawn_from, sort_keys=True).encode()).hexdigest()[:8]

@@ -39,6 +39,7 @@ def standing_scenes(
     """
     world = RigWorld(objects)
     camera = RigCamera(world.model, config.stereo, profile)
+    camera.other_tables = config.other_tables
     body = mujoco.mj_name2id(world.model, mujoco.mjtObj.mjOBJ_BODY, "object")
     for index in range(per_object * len(objects)):
         name = objects[index % len(objects)]

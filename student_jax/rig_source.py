@@ -59,7 +59,7 @@ class RigSource(FrameByFrame):
         """(H, W) uint16 millimetres of one view."""
         stage, spec = self._stage(), self._table.variants[int(views.variant[i])]
         stage.set_up(spec, float(views.size[i]), views.qpos[i])
-        if self._config.record.other_tables:
+        if self._config.record.other_tables and not self._ideal:
             stage.paint(int(np.random.default_rng([self._config.seed, _TABLES, episode]).integers(2**31)))
         rng = np.random.default_rng([self._config.seed, _STREAM, episode, frame])
         return stage.camera.depth_mm(stage.data, views.T_world_cam[i], rng, spec.name)
@@ -78,6 +78,7 @@ class _Stage:
         self._layout = layout
         self._model = scene.build_model(SIM_DT_S, layout)
         self.data = mujoco.MjData(self._model)
+        # Its own `other_tables` stays off: every frame has a generator of its own here, and would be a scene.
         self.camera = RigCamera(self._model, config.record.stereo, config.world.profile, ideal)
         self._table: int | None = None
 

@@ -9,6 +9,7 @@ import pytest
 from ddgrasp import contract, policy_metadata
 from ddgrasp.contract import HOME_RAD
 from ddgrasp.errors import UserError
+from ddgrasp.files import read_json
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from deploy import fr3_record, kinematics
@@ -116,6 +117,7 @@ def test_two_trajectories_of_the_rig_are_recordings_and_are_kept(tmp_path, open_
     out, takes = tmp_path / "fr3", Takes(0, ("cube", "can"))
     one = replace(CONFIG, record=replace(CONFIG.record, trajectories=1))
     (first,) = fr3_record.record(one, takes, out, Progress(quiet=True))
+    assert "other_tables" not in read_json(out / fr3_record.SETTINGS_FILE)["record"], "the other rig's"
     written = (first.path / "meta.json").stat().st_mtime_ns
     fr3_record.record(CONFIG, takes, out, Progress(quiet=True))
     recordings = find_recordings(out)

@@ -234,6 +234,14 @@ def test_a_trial_ends_with_success():
     assert height_m[-1] == pytest.approx(contract.LIFT_TARGET_M[2], abs=contract.LIFT_TOLERANCE_M)
 
 
+def test_a_file_says_before_which_camera_a_policy_is_tried(tmp_path):
+    student, file = PRETRAINED / "student" / "policy.onnx", tmp_path / "bright.yaml"
+    file.write_text("preset: demo\nrecord:\n  other_tables: true\n  stereo: {exposure_target: 0.7}\n")
+    config = config_of(student, None, file)
+    assert config.record.other_tables and config.record.stereo.exposure_target == 0.7
+    assert not config_of(student, None).record.other_tables
+
+
 def test_what_ends_a_trial_with_success_has_one_whatever_the_last_command_does(policy):
     config = dataclasses.replace(CONFIG, world=dataclasses.replace(CONFIG.world, episode_steps=20))
 

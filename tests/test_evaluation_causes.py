@@ -79,6 +79,13 @@ def test_the_table_is_kept_and_its_trials_are_not_run_again(tmp_path, policy):
         causes.run(CONFIG, policy, names, other, out, 0)
 
 
+def test_other_tables_are_no_row_where_every_row_has_them(tmp_path, policy):
+    config = replace(CONFIG, record=replace(CONFIG.record, other_tables=True))
+    names, series = causes.chosen(("other_tables",)), replace(SERIES, objects=("cube",))
+    made = causes.run(config, policy, names, series, tmp_path, 0)
+    assert [row["row"] for row in made["rows"]] == [causes.REFERENCE] and made["other_tables"] is True
+
+
 def test_a_plain_shape_is_added_to_trials_that_stay(tmp_path, policy):
     series, names = replace(SERIES, objects=("cube",)), causes.chosen(("off_10mm",))
     more = replace(series, objects=("cube", "stick"))

@@ -282,6 +282,14 @@ def test_rows_that_were_tried_otherwise_are_not_compared_which_is_said(tmp_path,
     assert of["apart"]["grafting"] == [] and of["trials"]["seconds"] == 6.0
 
 
+@pytest.mark.parametrize(("camera", "said"), [("stereo", False), ("other_tables", True)])
+def test_the_page_says_that_every_trial_has_a_table_of_its_own(tmp_path, camera, said):
+    write_row(tmp_path, Series("development"), "ddg", {"apple": [True]}, camera=camera)
+    about = {"preset": "laptop", "created": "now", "machine": {"processor": "x"}, "left_out": {}}
+    made = page.render({**about, **results.collect(tmp_path)}, b"")
+    assert ("seed 0, each before a table of its own</h2>" in made) == said
+
+
 def test_where_the_reference_was_not_tried_the_first_row_says_what_is_otherwise(tmp_path):
     series = Series("development")
     for row, rules in (("sim_gt", 1), ("rand_noise", 2), ("paper_ddg", 2), ("paper_ddg_no_graft", 2)):

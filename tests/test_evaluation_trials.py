@@ -114,8 +114,13 @@ def test_other_tables_by_configuration_are_the_same_ones_and_other_trials(tmp_pa
     np.testing.assert_array_equal(np.stack(seen[:5]), np.stack(seen[5:]))
     rig_trials.run(CONFIG, policy, SERIES, tmp_path / "own", 0, QUIET)
     configured, own = (read_log(tmp_path / name / TRIALS)[0] for name in ("configured", "own"))
-    assert configured["draws_hash"] != own["draws_hash"]
-    with pytest.raises(UserError, match="other trials|draws_hash|belong"):
+    asked = read_log(tmp_path / "asked" / TRIALS)[0]
+    assert rig_trials.differing(configured, asked, ("camera",)) == []
+    assert rig_trials.differing(configured, own, ("camera",)) == ["camera is other_tables, not stereo"]
+    assert (
+        json.loads((tmp_path / "configured" / "table.json").read_text())["series"]["camera"] == "other_tables"
+    )
+    with pytest.raises(UserError, match="begun otherwise"):
         rig_trials.check_place(CONFIG, policy, SERIES, tmp_path / "configured")
 
 

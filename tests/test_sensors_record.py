@@ -9,7 +9,7 @@ from ddgrasp import contract
 from ddgrasp.config import RandomConfig
 from ddgrasp.presets import get_preset
 from rig import world as rig
-from rig.camera import RigCamera
+from rig.camera import make_camera
 from rig.stage import act, record_trajectory
 from sensors.recordings.recording import Recording
 
@@ -22,7 +22,7 @@ def config():
 
 def _record(config, path, index=0) -> Recording:
     world = rig.make_world(config.world)
-    camera = RigCamera(world.model, config.record.stereo, config.world.profile)
+    camera = make_camera(config, world)
 
     def reach_down(observation: np.ndarray) -> np.ndarray:
         assert observation.shape == (contract.OBSERVATION_SIZE,)
@@ -52,6 +52,21 @@ def test_same_index_gives_the_same_recording_another_index_another_view(config, 
     other = _record(config, tmp_path / "c", index=1)
     np.testing.assert_array_equal(one.depth_mm(2), two.depth_mm(2))
     assert np.mean(one.depth_mm(2) != other.depth_mm(2)) > 0.5
+
+
+def test_with_other_tables_a_recording_has_its_own_whatever_was_recorded_before(config, tmp_path):
+    config = dataclasses.replace(config, record=dataclasses.replace(config.record, other_tables=True))
+    world = rig.make_world(config.world)
+    camera = make_camera(config, world)
+    for index in range(2):
+        record_trajectory(config, index, tmp_path / f"one{index}", world, camera, lambda _: np.zeros(8))
+    afresh = make_camera(config, world)
+    record_trajectory(config, 1, tmp_path / "again", world, afresh, lambda _: np.zeros(8))
+    ordinary = make_camera(get_preset("debug"), world)
+    record_trajectory(config, 1, tmp_path / "own", world, ordinary, lambda _: np.zeros(8))
+    one, again, own = (Recording.open(tmp_path / name).depth_mm(3) for name in ("one1", "again", "own"))
+    np.testing.assert_array_equal(one, again)
+    assert np.mean(one != own) > 0.1
 
 
 def test_action_is_scaled_and_clipped_to_the_joint_limits(config):

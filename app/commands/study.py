@@ -96,7 +96,7 @@ class StudyTable2(FromPreset):
                 f"--paper-generator is {self.paper_generator!r}, and no row asked for has the paper's own "
                 "generator: leave it out, or ask for --rows paper_ddg."
             )
-        series = Series(self.rig, self.objects, self.trials, self.split, self.number)
+        series = Series(self.rig, self.objects, self.trials, self.split, self.number).before(self.config)
         check_tried(series)
         series.names()
         if self.rig == "fr3":
@@ -138,8 +138,8 @@ class StudyCauses:
     preset: str | None = None
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
-    """YAML file to take instead of --preset, as for `ddgrasp run`: another camera (record.stereo), or before
-    many tables (record.other_tables)."""
+    """YAML file to take instead of --preset: a copy of a run's config.yaml, or a preset's name and what
+    differs from it. Another camera (record.stereo), many tables (record.other_tables)."""
     generator: Path = Path("pretrained/ddg/generator.onnx")
     """What `ddgrasp ddg export` wrote, for the rows with a generator's errors."""
     workers: Annotated[int, Range(1, 64)] = 2

@@ -91,7 +91,9 @@ def render(study: Mapping[str, Any], picture: bytes) -> str:
         ),
     ]
     for name in study["sets"]:
-        body.append(f"<h2>Trials: {escape(describe_set(name))}</h2>")
+        own = study["sets"][name]["trials"].get("camera") == "other_tables"
+        tables = ", each before a table of its own" if own else ""
+        body.append(f"<h2>Trials: {escape(describe_set(name))}{tables}</h2>")
         for key in _begun(study["sets"][name]["rows"]):
             of = TABLES[key]
             body.append(f"<h3>{of.title}, reference {ROWS[of.reference].title}</h3>")

@@ -12,6 +12,7 @@ beside it along +x with parallel axes. Depth is planar.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -320,15 +321,21 @@ def _dot_pattern(config: StereoConfig, profile: CameraProfile, projector: Camera
     return (np.minimum(texture, 2.0) * cosine**PROJECTOR_FALLOFF).astype(np.float32)
 
 
+@lru_cache(maxsize=128)
 def albedo_texture(
     height_px: int, width_px: int, seed: int = TEXTURE_SEED
 ) -> Float32[np.ndarray, "height width"]:
-    """(height, width) float32 noise of unit variance over several octaves, seamless; `seed` is the scene."""
+    """(height, width) float32 noise of unit variance over several octaves, seamless; `seed` is the scene.
+
+    Read-only, and kept: 15 ms and 1 MB for one of 512 x 512, and scenes may take turns.
+    """
     rng = np.random.default_rng(seed)
     frequency = np.hypot(np.fft.fftfreq(height_px)[:, None], np.fft.fftfreq(width_px)[None, :])
     frequency[0, 0] = np.inf
     noise = np.fft.ifft2(np.fft.fft2(rng.standard_normal((height_px, width_px))) / frequency).real
-    return (noise / noise.std()).astype(np.float32)
+    texture = (noise / noise.std()).astype(np.float32)
+    texture.flags.writeable = False
+    return texture
 
 
 def _unit(x, y, z) -> tuple[np.ndarray, np.ndarray]:
