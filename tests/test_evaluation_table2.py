@@ -318,7 +318,7 @@ KEPT = PRETRAINED / "table2" / "trials"
         ("development-test-11-other-tables", {"sim_gt": (122, 18), "rand_noise": (19, 24),
                                               "inpaint": (90, 21), "ddg_no_graft": (15, 22),
                                               "upper_bound": (14, 23)}),
-        ("development-test-12-overexposed", {"rand_noise": (188, 25)}),
+        ("development-test-12-overexposed", {"rand_noise": (188, 25), "inpaint": (283, 22)}),
         ("development-9", {"sim_gt": (499, 3), "rand_noise": (62, 37), "inpaint": (141, 28),
                            "ddg_no_graft": (26, 34), "upper_bound": (24, 42)}),
         ("fr3-test-10", {"inpaint": (8, 3)}),
