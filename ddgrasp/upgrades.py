@@ -16,8 +16,7 @@ edges. 6: demos are trained on from their beginning. 7: a student leaves holes a
 generator does not know where in the picture it is. 9: the policy alone acts in the loop. 10: a Franka's hand
 comes down at any speed; what was made then comes down slowly too, since no run has an arm. 11: a Franka
 gives way to nothing before it stops itself; the same. 12: formulas have one strength. 13: what comes behind
-a teacher's time limit counts. 14: a window is a Gaussian. 15: the rig has
-one table."""
+a teacher's time limit counts. 14: a window is a Gaussian. 15: the rig has one table."""
 
 VERSION_FIELD = "manifest_version"
 

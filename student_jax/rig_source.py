@@ -60,7 +60,8 @@ class RigSource(FrameByFrame):
         stage, spec = self._stage(), self._table.variants[int(views.variant[i])]
         stage.set_up(spec, float(views.size[i]), views.qpos[i])
         if self._config.record.other_tables and not self._ideal:
-            stage.paint(int(np.random.default_rng([self._config.seed, _TABLES, episode]).integers(2**31)))
+            table = np.random.default_rng([self._config.seed, _TABLES, episode]).integers(2**31)
+            stage.camera.stereo.paint(int(table))
         rng = np.random.default_rng([self._config.seed, _STREAM, episode, frame])
         return stage.camera.depth_mm(stage.data, views.T_world_cam[i], rng, spec.name)
 
@@ -80,13 +81,6 @@ class _Stage:
         self.data = mujoco.MjData(self._model)
         # Its own `other_tables` stays off: every frame has a generator of its own here, and would be a scene.
         self.camera = RigCamera(self._model, config.record.stereo, config.world.profile, ideal)
-        self._table: int | None = None
-
-    def paint(self, table: int) -> None:
-        """Puts another table there if it is not there yet."""
-        if table != self._table:
-            self._table = table
-            self.camera.stereo.paint(table)
 
     def set_up(self, spec: ObjectSpec, size: float, qpos: np.ndarray) -> None:
         """Puts everything where it was."""

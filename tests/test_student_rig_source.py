@@ -91,8 +91,8 @@ def test_an_episode_stays_before_its_own_table(monkeypatch):
     monkeypatch.setattr(ActiveStereo, "paint", lambda self, seed: painted.append(seed) or paint(self, seed))
     episode, frame = np.array([3, 3, 4, 4, 3]), np.arange(5)
     RigSource(config).frames(np.zeros((5, 1, 1), np.uint16), None, episode, frame, views)
-    three, four, again = painted[1:]  # after the one that a camera begins with
-    assert three == again != four
+    first, second, third, fourth, again = painted[1:]  # after the one that a camera begins with
+    assert first == second == again != third == fourth
 
 
 def test_a_rollout_s_views_are_of_what_it_shows(roller):

@@ -321,7 +321,7 @@ def _dot_pattern(config: StereoConfig, profile: CameraProfile, projector: Camera
     return (np.minimum(texture, 2.0) * cosine**PROJECTOR_FALLOFF).astype(np.float32)
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=64)
 def albedo_texture(
     height_px: int, width_px: int, seed: int = TEXTURE_SEED
 ) -> Float32[np.ndarray, "height width"]:
