@@ -92,7 +92,8 @@ def describe(recordings: list[Recording], out: Path) -> str:
 def _begin(config: Config, takes: Takes, out: Path) -> None:
     """Writes down what is recorded, or compares it with what was. More trajectories may come."""
     camera = {**asdict(config.record), "trajectories": None}
-    del camera["other_tables"]  # the development rig's
+    if not config.record.other_tables:
+        del camera["other_tables"]  # as in recordings that were begun before there was a choice
     made = to_json({"takes": takes, "record": camera, "camera_scale": config.world.camera_scale})
     file = out / SETTINGS_FILE
     if file.exists() and read_json(file) != made:
@@ -135,7 +136,8 @@ def _take(config: Config, takes: Takes, lab: Fr3Lab, index: int, path: Path) -> 
     info = policy_metadata.describe(config.student, config.export, profile)
     safety = safety_filter(settings, info, "franka")
     way = GuidedPath(plan(lab.thing(name), draw.place, safety.limits, draw.rng))
-    sense = fr3_camera.stereo(config.record.stereo, profile, clock, draw.rng)
+    about = config.record
+    sense = fr3_camera.stereo(about.stereo, profile, clock, draw.rng, other_tables=about.other_tables)
     camera = fr3_camera.Fr3Camera(rig.host, clock, sense, profile, draw.T_world_cam, in_colour=True)
     meta = describe_recording(profile, "FR3 rig, D455 at 848x480", name)
     with RecordingWriter(path, meta) as writer:

@@ -45,6 +45,8 @@ class Fr3Bench:
     """Without table, wall and clutter: on the ground, as the development rig."""
     paired: bool = False
     """Object and camera stand where the development rig's trial of the same number has them."""
+    other_tables: bool = False
+    """Every trial is before a table that is light and dark elsewhere, as with `record.other_tables` on."""
 
     def __call__(self, config: Config, policy_path: Path) -> "Fr3Runner":
         return Fr3Runner(config, policy_path, self)
@@ -124,7 +126,9 @@ class Fr3Runner:
         if self._bench.sight == "ideal":
             return fr3_camera.ideal(profile)
         stream = profile if self._bench.sight == "coarse" else contract.D455_STREAM
-        return fr3_camera.stereo(self._config.record.stereo, profile, clock, rng, stream)
+        record = self._config.record
+        other_tables = self._bench.other_tables or record.other_tables
+        return fr3_camera.stereo(record.stereo, profile, clock, rng, stream, other_tables)
 
 
 def _as_in_development(config: Config, trial: Trial) -> PlacedDraw:

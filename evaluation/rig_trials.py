@@ -63,8 +63,7 @@ class Series:
     """On rig fr3: mesh objects, or the development rig's primitives."""
     camera: CameraName = "stereo"
     """stereo (the rig's own), ideal (no errors), coarse (rig fr3: matched at the policy's size), or
-    other_tables (development rig: before a table that is light and dark elsewhere in every trial)."""
-
+    other_tables (stereo, before a table that is light and dark elsewhere in every trial)."""
     seconds: float = contract.TRIAL_S
     """A trial ends with success, or after this."""
     contact: float | None = None
@@ -80,10 +79,6 @@ class Series:
         """The objects. UserError for none or an unknown one, or a choice that the rig does not have."""
         if self.rig == "development" and (self.camera == "coarse" or self.shapes != "mesh"):
             raise UserError("--camera coarse and --shapes are rig fr3's: drop them, or choose --rig fr3.")
-        if self.rig == "fr3" and self.camera == "other_tables":
-            raise UserError(
-                "--camera other_tables is rig development's: choose --rig development, or another."
-            )
         if self.rig == "development" and self.contact is not None:
             raise UserError("--contact is rig fr3's, whose arm stops itself: drop it, or choose --rig fr3.")
         if self.trials > (most := len(seeds.SEEDS[self.split])):
@@ -108,8 +103,8 @@ class Series:
         return Trial(self.known().index(name) * len(seeds.SEEDS[self.split]) + i, name)
 
     def before(self, config: Config) -> "Series":
-        """With the tables that `config` has the development rig's own camera stand before."""
-        if self.rig == "development" and self.camera == "stereo" and config.record.other_tables:
+        """With the tables that `config` has the rig's own camera stand before."""
+        if self.camera == "stereo" and config.record.other_tables:
             return replace(self, camera="other_tables")
         return self
 
@@ -131,7 +126,8 @@ class Series:
         where a network's weights are missing."""
         treatment = treatment or make_treatment(self.depth, config)
         if self.rig == "fr3":
-            assert self.camera != "other_tables"  # `names`
+            if self.camera == "other_tables":
+                return Fr3Bench(self.shapes, treatment=treatment, other_tables=True)
             return Fr3Bench(self.shapes, self.camera, treatment)
         if self.camera == "other_tables":
             return partial(Rig, change=Change("other tables"), treatment=treatment)

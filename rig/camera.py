@@ -64,7 +64,7 @@ class RigCamera:
     def _begin(self, rng: np.random.Generator) -> None:
         """Draws what a scene keeps, without a number of `rng`'s own."""
         if self.other_tables:
-            self.stereo.paint(int(rng.spawn(1)[0].integers(2**31)))
+            self.stereo.paint_for(rng)
 
     def _sense(
         self,

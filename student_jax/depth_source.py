@@ -188,7 +188,7 @@ def make_source(config: Config, ddg: Path) -> DepthSource:
         return MonocularSource(MonocularDepth(config.ddg))
     if name == "rig":
         return RigSource(config)
-    formulas = DextrahConfig().scaled(config.student.dextrah_scale)
+    formulas = DextrahConfig(patches=config.student.dextrah_patches).scaled(config.student.dextrah_scale)
     sensor = SensorConfig(name=name, stereo=config.record.stereo, dextrah=formulas)
     return SenseSource(make_sensor(sensor, config.world.profile), key, name in BY_COLOUR)
 

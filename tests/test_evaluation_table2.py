@@ -103,6 +103,14 @@ def test_rows_differ_in_the_student_s_section_alone_so_that_they_share_what_come
     assert ROWS["inpaint"].student == ROWS["sim_gt"].student
 
 
+def test_formulas_have_patches_in_the_row_that_is_of_them_alone():
+    shared = rows.shared_config(LAPTOP)
+    patched = rows.row_config(shared, ROWS["rand_noise_patches"]).student
+    plain = rows.row_config(shared, ROWS["rand_noise"]).student
+    assert (plain.dextrah_patches, patched.dextrah_patches) == (0.0, rows.PATCHES)
+    assert replace(patched, dextrah_patches=0.0) == plain
+
+
 def test_ripple_and_the_paper_s_generator_are_one_difference_each():
     shared = rows.shared_config(LAPTOP)
     rippled = rows.row_config(shared, ROWS["ddg_ripple"])

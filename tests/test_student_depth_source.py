@@ -194,6 +194,18 @@ def test_a_student_s_formulas_take_its_scale(demos):
     assert deviation(twice) == pytest.approx(2 * deviation(once), rel=0.2)
 
 
+def test_a_student_s_formulas_take_its_patches(demos):
+    def holes(settings):
+        numbers = np.arange(28)
+        clean = demos.steps("depth_mm")
+        return np.mean(make_source(settings, Path()).frames(clean, None, numbers, numbers) == 0)
+
+    plain = with_source("dextrah")
+    patched = replace(plain, student=replace(plain.student, dextrah_patches=4.0))
+    # A patch has 347 pixels on average, some beyond the border or on another.
+    assert holes(plain) < 0.01 and holes(patched) == pytest.approx(4 * 347 / (90 * 160), rel=0.25)
+
+
 def test_the_clean_share_keeps_clean_depth_whatever_the_source(demos, tmp_path):
     settings = with_source("dextrah", clean_share=1.0)
     seen = training_depth(settings, make_source(settings, tmp_path), demos, tmp_path)

@@ -33,8 +33,8 @@ class DeployTrials:
     """On rig fr3: mesh objects, or the development rig's primitives."""
     camera: Literal["stereo", "coarse", "ideal", "other_tables"] = "stereo"
     """stereo (the rig's own), ideal (without errors), coarse (on rig fr3: matched at the policy's size), or
-    other_tables (on rig development: before a table that is light and dark elsewhere in every trial; what
-    stereo means where record.other_tables is on)."""
+    other_tables (stereo, before a table that is light and dark elsewhere in every trial; what stereo means
+    where record.other_tables is on)."""
     seconds: Annotated[float, Range(0.5, 60)] = contract.TRIAL_S
     """A trial ends with success, or after this."""
     contact: Annotated[float, Range(1, 100)] | None = None
@@ -49,7 +49,7 @@ class DeployTrials:
     """Configuration of camera and loop; without it that of the run that the policy lies in."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
     """YAML file to take instead of --preset: a copy of a run's config.yaml, or a preset's name and what
-    differs from it. Another camera (record.stereo), many tables (record.other_tables, on rig development)."""
+    differs from it. Another camera (record.stereo), many tables (record.other_tables)."""
     workers: Annotated[int, Range(1, 64)] = 2
     """Rigs that run side by side."""
     record: bool = False

@@ -22,8 +22,8 @@ class RecordConfig(Section, name="record"):
     camera_roll_jitter_rad: Annotated[float, Range(0, 3.15)] = 0.05
     """Half width of its uniform roll."""
     other_tables: bool = False
-    """Every recording, every trial on the development rig and every episode of training behind its own camera
-    (student.depth_source rig) is before a table that is light and dark elsewhere; off: all before the rig's
-    one, whose brightest place is a hole that most frames share."""
+    """Every recording, every trial on a rig and every episode of training behind the development rig's camera
+    (student.depth_source rig) is before a table that is light and dark elsewhere; off: all before one and the
+    same, whose brightest place is a hole that most of the development rig's frames share."""
     stereo: StereoConfig = field(default_factory=StereoConfig)
     """The camera itself."""

@@ -260,6 +260,8 @@ class StudentConfig(Section, name="student"):
     dextrah_scale: Annotated[float, Range(0.125, 8)] = 1.0
     """Size of the formulas' pixel in training, in pixels of the picture, where depth_source is dextrah: their
     numbers are of pictures 160 wide; 2 makes one of 320 as noisy as those, 1 half as noisy in depth."""
+    dextrah_patches: Annotated[float, Range(0, 100)] = 0.0
+    """Elliptic holes that the formulas are given besides, expected in a picture (`DextrahConfig.patches`)."""
 
     def check(self) -> None:
         """See `Section.check`."""

@@ -28,8 +28,10 @@ Sense = Callable[["ScenePicture", Pose, str], Depth]
 
 def make(setup: Setup, robot: Robot) -> "Fr3Camera":
     """A D455 before the rig that runs at the robot's host, at its nominal place within its error."""
-    profile, rng = setup.info.profile, np.random.default_rng(setup.config.seed)
-    return _at_place(setup, profile, stereo(setup.config.record.stereo, profile, setup.clock, rng))
+    profile, record = setup.info.profile, setup.config.record
+    rng = np.random.default_rng(setup.config.seed)
+    sense = stereo(record.stereo, profile, setup.clock, rng, other_tables=record.other_tables)
+    return _at_place(setup, profile, sense)
 
 
 def make_ideal(setup: Setup, robot: Robot) -> "Fr3Camera":
@@ -44,15 +46,24 @@ def stereo(
     clock: Clock,
     rng: np.random.Generator,
     stream: contract.CameraProfile = contract.D455_STREAM,
+    other_tables: bool = False,
 ) -> Sense:
     """Matching at the size of `stream`, then what the RealSense driver does to a frame.
 
-    `profile` is the policy's picture.
+    Args:
+      config: the camera.
+      profile: the policy's picture.
+      clock: the driver's.
+      rng: draws the noise.
+      stream: the picture in which it matches.
+      other_tables: whether light and dark places are `rng`'s own (`record.other_tables`), not the rig's.
     """
     from sensors.models.active_stereo import of_scale
     from sensors.models.materials import rig_materials
 
     camera, driver = of_scale(config, stream), RealSenseCamera(clock, profile, stream=stream)
+    if other_tables:
+        camera.paint_for(rng)
 
     def sense(picture: "ScenePicture", T_world_cam: Pose, name: str) -> Depth:
         materials = rig_materials(picture.model, name)

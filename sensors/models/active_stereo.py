@@ -109,6 +109,10 @@ class ActiveStereo:
         """Draws the albedo of what the camera looks at anew."""
         self._texture = albedo_texture(TEXTURE_PX, TEXTURE_PX, texture_seed)
 
+    def paint_for(self, rng: np.random.Generator) -> None:
+        """`paint` with a seed that belongs to `rng`, without a number of `rng`'s own."""
+        self.paint(int(rng.spawn(1)[0].integers(2**31)))
+
     def sense(
         self,
         render: Render,

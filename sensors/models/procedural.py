@@ -2,7 +2,7 @@
 
 `dextrah`: the model that DextrAH-G trains with (Lum et al. 2024, "DextrAH-G: Pixels-to-Action Dexterous
 Arm-Hand Grasping with Geometric Fabrics"; strengths from its published code): correlated noise in disparity,
-pixel dropout, random values, sticks.
+pixel dropout, random values, sticks; and, where asked for, patches without depth, which that model lacks.
 `kinect`: the model of Handa et al. 2014 ("A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM",
 after Barron and Malik 2013) with the axial noise that Khoshelham and Elberink 2012 measured.
 """
@@ -21,8 +21,10 @@ from sensors.models.sense import Key, Sense, batched
 
 NEAREST_M = 0.05
 """Noise never brings a surface nearer than this."""
-MOST_STICKS = 4.0
-"""Room for this many deviations more sticks than are expected in a picture."""
+MOST_SHAPES = 4.0
+"""Room for this many deviations more sticks or patches than are expected in a picture."""
+SMALLEST_PATCH = 1 / 8
+"""Shortest half axis of a patch, of the longest one."""
 
 
 def dextrah(config: DextrahConfig, profile: CameraProfile) -> Sense:
@@ -48,7 +50,8 @@ def _dextrah_frame(
     values = jax.random.uniform(value_key, shape, minval=near, maxval=far)
     noisy = jnp.where(jax.random.bernoulli(replace_key, float(config.random_value), shape), values, noisy)
     noisy = jnp.where(jax.random.bernoulli(drop_key, float(config.dropout), shape), 0.0, noisy)
-    return draw_sticks(stick_key, noisy, config)
+    noisy = draw_sticks(stick_key, noisy, config)
+    return cut_patches(jax.random.fold_in(key, 6), noisy, config)  # the keys above are 0 to 5
 
 
 def _kinect_frame(
@@ -116,9 +119,7 @@ def _interpolation(size: int, spacing_px: float) -> Array:
 def draw_sticks(key: Key, depth_m: Float[Array, "H W"], config: DextrahConfig) -> Float[Array, "H W"]:
     """Thin segments of one random depth each over (H, W): every pixel starts one with probability `stick`."""
     height, width = depth_m.shape
-    expected = config.stick * height * width
-    most = math.ceil(expected + MOST_STICKS * math.sqrt(expected))
-    share = expected / max(most, 1)
+    most, share = _room(config.stick * height * width)
     rows, columns = jnp.arange(height)[:, None] + 0.5, jnp.arange(width)[None, :] + 0.5
 
     def draw(i: Array, picture: Array) -> Array:
@@ -132,3 +133,29 @@ def draw_sticks(key: Key, depth_m: Float[Array, "H W"], config: DextrahConfig) -
         return jnp.where(on & (there < share), depth, picture)
 
     return jax.lax.fori_loop(0, most, draw, depth_m)
+
+
+def cut_patches(key: Key, depth_m: Float[Array, "H W"], config: DextrahConfig) -> Float[Array, "H W"]:
+    """Elliptic holes in (H, W): `patches` are expected, anywhere and turned anyhow, either half axis drawn
+    from a log-uniform distribution up to `patch_px`. Random erasing (Zhong et al. 2017) with ellipses."""
+    height, width = depth_m.shape
+    most, share = _room(config.patches)
+    rows, columns = jnp.arange(height)[:, None] + 0.5, jnp.arange(width)[None, :] + 0.5
+
+    def cut(i: Array, picture: Array) -> Array:
+        row, column, angle, long, short, there = jax.random.uniform(jax.random.fold_in(key, i), (6,))
+        v, u = rows - row * height, columns - column * width
+        sine, cosine = jnp.sin(jnp.pi * angle), jnp.cos(jnp.pi * angle)
+        along, across = u * cosine + v * sine, v * cosine - u * sine
+        half_axes = config.patch_px * SMALLEST_PATCH ** jnp.stack([long, short])
+        inside = (along / half_axes[0]) ** 2 + (across / half_axes[1]) ** 2 <= 1
+        return jnp.where(inside & (there < share), 0.0, picture)
+
+    return jax.lax.fori_loop(0, most, cut, depth_m)
+
+
+def _room(expected: float) -> tuple[int, float]:
+    """How many shapes to try to draw in a picture and with which probability each, so that on average
+    `expected` are."""
+    most = math.ceil(expected + MOST_SHAPES * math.sqrt(expected))
+    return most, expected / max(most, 1)
