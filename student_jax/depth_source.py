@@ -26,6 +26,7 @@ from ddgrasp.depth import to_metres, to_millimetres
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
 from mjx_envs.views import Views
+from sensors.models.procedural import patches
 from sensors.models.sense import Sense
 from student_jax.rig_source import RigSource
 from student_jax.source_check import LEARNED
@@ -176,11 +177,65 @@ class SenseSource(FrameByFrame):
         return to_millimetres(np.concatenate(parts))
 
 
+@dataclass(frozen=True)
+class PatchedSource:
+    """Another source's depth with holes cut into it by hand."""
+
+    source: DepthSource
+    cutter: SenseSource
+
+    @property
+    def needs_rgb(self) -> bool:
+        """See `DepthSource`."""
+        return self.source.needs_rgb
+
+    @property
+    def needs_views(self) -> bool:
+        """See `DepthSource`."""
+        return self.source.needs_views
+
+    def episodes(
+        self, lengths: Sequence[int], read: Callable[[int], Clip], first: int = 0
+    ) -> Iterator[UInt16[np.ndarray, "_ H W"]]:
+        """See `DepthSource`."""
+        numbers: dict[int, int] = {}
+
+        def noted(i: int) -> Clip:
+            clip = read(i)
+            numbers[i] = clip.number
+            return clip
+
+        for i, depth_mm in enumerate(self.source.episodes(lengths, noted, first), first):
+            steps = np.arange(len(depth_mm))
+            yield self.cutter.frames(depth_mm, None, np.full(len(steps), numbers.pop(i)), steps)
+
+    def frames(
+        self,
+        depth_mm: UInt16[np.ndarray, "B H W"],
+        rgb: UInt8[np.ndarray, "B H W 3"] | None,
+        episode: Int[np.ndarray, " B"],
+        frame: Int[np.ndarray, " B"],
+        views: Views | None = None,
+    ) -> UInt16[np.ndarray, "B H W"]:
+        """See `DepthSource`."""
+        seen_mm = self.source.frames(depth_mm, rgb, episode, frame, views)
+        return self.cutter.frames(seen_mm, None, episode, frame)
+
+
 def make_source(config: Config, ddg: Path) -> DepthSource:
-    """The source that `config.student.depth_source` names; `ddg` is the stage directory of the generator.
+    """The source that `config.student.depth_source` names, with the holes that `hole_patches` has cut into
+    it; `ddg` is the stage directory of the generator.
 
     Raises UserError for an unknown name, or where `learned` finds no generator or `monocular` no weights.
     """
+    source, student = _named_source(config, ddg), config.student
+    if not student.hole_patches:
+        return source
+    sense = patches(student.hole_patches, student.hole_patch_px)
+    return PatchedSource(source, SenseSource(sense, jax.random.key(config.seed)))
+
+
+def _named_source(config: Config, ddg: Path) -> DepthSource:
     name, key = config.student.depth_source, jax.random.key(config.seed)
     if name in LEARNED:
         return GeneratorSource(Generator.load(ddg), key, grafting=name == "learned")
@@ -188,7 +243,7 @@ def make_source(config: Config, ddg: Path) -> DepthSource:
         return MonocularSource(MonocularDepth(config.ddg))
     if name == "rig":
         return RigSource(config)
-    formulas = DextrahConfig(patches=config.student.dextrah_patches).scaled(config.student.dextrah_scale)
+    formulas = DextrahConfig().scaled(config.student.dextrah_scale)
     sensor = SensorConfig(name=name, stereo=config.record.stereo, dextrah=formulas)
     return SenseSource(make_sensor(sensor, config.world.profile), key, name in BY_COLOUR)
 

@@ -103,12 +103,12 @@ def test_rows_differ_in_the_student_s_section_alone_so_that_they_share_what_come
     assert ROWS["inpaint"].student == ROWS["sim_gt"].student
 
 
-def test_formulas_have_patches_in_the_row_that_is_of_them_alone():
+def test_rows_with_holes_cut_by_hand_differ_in_them_alone():
     shared = rows.shared_config(LAPTOP)
-    patched = rows.row_config(shared, ROWS["rand_noise_patches"]).student
-    plain = rows.row_config(shared, ROWS["rand_noise"]).student
-    assert (plain.dextrah_patches, patched.dextrah_patches) == (0.0, rows.PATCHES)
-    assert replace(patched, dextrah_patches=0.0) == plain
+    for name in ("sim_gt", "rand_noise", "ddg"):
+        plain, patched = (rows.row_config(shared, ROWS[row]).student for row in (name, f"{name}_patches"))
+        assert (plain.hole_patches, patched.hole_patches) == (0.0, rows.PATCHES)
+        assert replace(patched, hole_patches=0.0) == plain
 
 
 def test_ripple_and_the_paper_s_generator_are_one_difference_each():
@@ -139,8 +139,8 @@ def test_a_filled_row_differs_from_its_own_in_who_fills_the_holes():
 
 
 def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
-    def student(name: str, init_from: str = "", **training) -> str:
-        config = replace(LAPTOP.student, depth_source="ideal", init_from=init_from)
+    def student(name: str, init_from: str = "", hole_patches: float = 0.0, **training) -> str:
+        config = replace(LAPTOP.student, depth_source="ideal", init_from=init_from, hole_patches=hole_patches)
         config = replace(
             config, training=replace(config.training, **(dict.fromkeys(rows.HAND_MADE, 0.0) | training))
         )
@@ -162,6 +162,8 @@ def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
         shared(student("holes", unseen_share=0.25))
     with pytest.raises(UserError, match="trained with student.init_from 'pretrained/student'"):
         shared(student("later", init_from="pretrained/student"))
+    with pytest.raises(UserError, match=r"trained with student.hole_patches 4.0: a student that has"):
+        shared(student("cut", hole_patches=4.0))
 
 
 def test_pages_have_words_for_what_every_row_is_trained_on_and_sees():
@@ -179,7 +181,7 @@ def test_help_names_every_row_and_table(capsys):
 def test_rows_are_chosen_by_name_or_by_table():
     assert rows.chosen((), ("main",)) == TABLES["main"].rows
     assert rows.chosen(("ddg", "sim_gt", "ddg"), ("main",)) == ("ddg", "sim_gt")
-    assert set(rows.chosen((), ("main", "ripple", "filled", "formulas", "grafting"))) == set(ROWS)
+    assert set(rows.chosen((), tuple(TABLES))) == set(ROWS)
     with pytest.raises(UserError, match=r"--table names none, and --rows neither: give tables \(main"):
         command("--table").planned()
 

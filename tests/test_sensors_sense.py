@@ -1,7 +1,6 @@
 """Every camera model by the same rules: jit, vmap, keys, invalid pixels, metres."""
 
 import math
-from dataclasses import replace
 
 import cv2
 import jax
@@ -188,11 +187,9 @@ def test_sticks_have_the_expected_number_and_one_depth_each():
 
 
 def test_patches_are_holes_of_the_expected_number_and_size():
-    quiet = DextrahConfig(shift_px=0, disparity_px=0, dropout=0.0, random_value=0.0, stick=0.0)
-    config = replace(quiet, patches=0.5, patch_px=12.0)
     size = (100, 140)
-    cut = jax.jit(jax.vmap(lambda key: procedural.cut_patches(key, jnp.ones(size), config)))
-    pictures = np.asarray(cut(jax.random.split(jax.random.key(0), 400)))
+    cut = jax.jit(procedural.patches(0.5, 12.0))
+    pictures = np.asarray(cut(jax.random.key(0), jnp.ones((400, *size)), None))
     assert set(np.unique(pictures)) == {0.0, 1.0}
     counts, widest = [], 0.0
     for holes in (pictures == 0).astype(np.uint8):
@@ -204,17 +201,8 @@ def test_patches_are_holes_of_the_expected_number_and_size():
     mean_area_px = math.pi * (12 * (1 - 1 / 8) / math.log(8)) ** 2
     assert np.mean(pictures == 0) == pytest.approx(0.5 * mean_area_px / pictures[0].size, rel=0.25)
     assert 12 < widest < 2 * 12 * math.sqrt(2)
-    np.testing.assert_array_equal(procedural.cut_patches(jax.random.key(0), jnp.ones(size), quiet), 1.0)
-
-
-def test_patches_leave_the_other_noise_as_it_was():
-    depth, key = jnp.full((1, *SIZE), 0.8), jax.random.key(5)
-    plain = np.asarray(procedural.dextrah(DextrahConfig(), PROFILE)(key, depth, None))
-    patched = np.asarray(
-        procedural.dextrah(DextrahConfig(patches=3.0, patch_px=6.0), PROFILE)(key, depth, None)
-    )
-    changed = patched != plain
-    assert changed.any() and not patched[changed].any()
+    none = procedural.patches(0.0, 12.0)(jax.random.key(0), jnp.ones(size), None)
+    np.testing.assert_array_equal(none, 1.0)
 
 
 def test_without_noise_the_procedural_models_change_nothing():

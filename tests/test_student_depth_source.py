@@ -1,5 +1,6 @@
 """Depth sources of the student stage: by name, keyed by episode and frame, on demos and in closed loop."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from app.commands.checks import check_config_values
 from ddg_jax import generate, sample, train
+from ddg_jax.generate import Clip
 from ddg_jax.prior import make_prior
 from ddg_jax.sensor import SENSORS
 from ddgrasp import artifacts, config, contract, upgrades
@@ -194,16 +196,35 @@ def test_a_student_s_formulas_take_its_scale(demos):
     assert deviation(twice) == pytest.approx(2 * deviation(once), rel=0.2)
 
 
-def test_a_student_s_formulas_take_its_patches(demos):
-    def holes(settings):
-        numbers = np.arange(28)
-        clean = demos.steps("depth_mm")
-        return np.mean(make_source(settings, Path()).frames(clean, None, numbers, numbers) == 0)
+def with_patches(settings: Config, number: float = 4.0) -> Config:
+    return replace(settings, student=replace(settings.student, hole_patches=number, hole_patch_px=9.0))
 
-    plain = with_source("dextrah")
-    patched = replace(plain, student=replace(plain.student, dextrah_patches=4.0))
-    # A patch has 347 pixels on average, some beyond the border or on another.
-    assert holes(plain) < 0.01 and holes(patched) == pytest.approx(4 * 347 / (90 * 160), rel=0.25)
+
+@pytest.mark.parametrize("name", ["ideal", "dextrah"])
+def test_holes_are_cut_into_whatever_a_source_gives(demos, tmp_path, name):
+    plain, patched = with_source(name), with_patches(with_source(name))
+    own, cut = (make_source(settings, tmp_path) for settings in (plain, patched))
+    seen, holed = (
+        training_depth(settings, source, demos, tmp_path / source.__class__.__name__)
+        for settings, source in ((plain, own), (patched, cut))
+    )
+    changed = holed != seen
+    assert not holed[changed].any(), "nothing but holes"
+    # Half axes are 9 px x 8^-u: 3.8 px on average; some beyond the border or on another.
+    assert changed.mean() == pytest.approx(4 * math.pi * 3.79**2 / (90 * 160), rel=0.3)
+
+
+def test_holes_of_a_frame_hang_on_its_own_numbers_alone(demos, tmp_path):
+    settings = with_patches(with_source("dextrah"))
+    source = make_source(settings, tmp_path)
+    clean = demos.steps("depth_mm")
+    begins = np.concatenate([[0], demos.ends])
+    clips = [Clip(10 + i, clean[begins[i] : begins[i + 1]]) for i in range(len(LENGTHS))]
+    whole = list(source.episodes(LENGTHS, clips.__getitem__))
+    np.testing.assert_array_equal(whole[2], next(source.episodes(LENGTHS, clips.__getitem__, 2)))
+    alone = source.frames(clips[1].depth_mm[[7]], None, np.array([11]), np.array([7]))
+    np.testing.assert_array_equal(alone[0], whole[1][7])
+    assert (source.needs_rgb, source.needs_views) == (False, False)
 
 
 def test_the_clean_share_keeps_clean_depth_whatever_the_source(demos, tmp_path):

@@ -122,10 +122,6 @@ class DextrahConfig(Section, name="sensor.dextrah"):
     """Longest stick."""
     stick_width_px: Annotated[float, Range(1, 4096)] = 3.0
     """Widest stick."""
-    patches: Annotated[float, Range(0, 100)] = 0.0
-    """Elliptic holes expected in a picture, which DextrAH-G's noise has none of."""
-    patch_px: Annotated[float, Range(1, 4096)] = 25.0
-    """Longest half axis of such a hole."""
 
     def check(self) -> None:
         """See `Section.check`."""
@@ -134,12 +130,12 @@ class DextrahConfig(Section, name="sensor.dextrah"):
 
     def scaled(self, scale: float) -> "DextrahConfig":
         """The same noise for a picture `scale` times as wide of the same scene: lengths and disparities grow
-        with it, as many sticks and patches fall on a picture, of a pixel at least, and the same share of
-        single pixels is lost."""
+        with it, as many sticks fall on a picture, of a pixel at least, and the same share of single pixels is
+        lost."""
         lengths = ("shift_px", "disparity_px", "correlation_px")
         grown = {name: scale * getattr(self, name) for name in lengths}
-        shapes = ("stick_length_px", "stick_width_px", "patch_px")
-        grown |= {name: max(1.0, scale * getattr(self, name)) for name in shapes}
+        sticks = ("stick_length_px", "stick_width_px")
+        grown |= {name: max(1.0, scale * getattr(self, name)) for name in sticks}
         return replace(self, stick=self.stick / scale**2, **grown)
 
 

@@ -45,8 +45,8 @@ class Row:
     """Whether its student fills holes by itself (`student.picture.fill_holes`), in training as on the rig."""
     dextrah_scale: float = 1.0
     """Size of the formulas' pixel (`student.dextrah_scale`)."""
-    dextrah_patches: float = 0.0
-    """Holes added to the formulas by hand (`student.dextrah_patches`)."""
+    patches: bool = False
+    """Whether training depth has holes cut by hand (`student.hole_patches`, `PATCHES`)."""
 
     @property
     def student(self) -> str:
@@ -57,7 +57,7 @@ class Row:
             "ripple" * self.ripple,
             "filled" * self.filled,
             f"x{self.dextrah_scale:g}" * (self.dextrah_scale != 1),
-            "patches" * bool(self.dextrah_patches),
+            "patches" * self.patches,
         )
         return "_".join(part for part in parts if part)
 
@@ -87,7 +87,9 @@ ROWS: dict[str, Row] = {
     "rand_noise_filled": Row("Rand Noise, holes filled", "dextrah", filled=True),
     "ddg_filled": Row("DDG, holes filled", "learned", filled=True),
     "rand_noise_double": Row("Rand Noise, twice as strong", "dextrah", dextrah_scale=2.0),
-    "rand_noise_patches": Row("Rand Noise, holes added by hand", "dextrah", dextrah_patches=PATCHES),
+    "sim_gt_patches": Row("Sim GT, holes cut by hand", "ideal", patches=True),
+    "rand_noise_patches": Row("Rand Noise, holes cut by hand", "dextrah", patches=True),
+    "ddg_patches": Row("DDG, holes cut by hand", "learned", patches=True),
     "paper_ddg_no_graft": Row(
         "Paper's generator without grafting", "learned_ungrafted", paper_generator=True
     ),
@@ -110,9 +112,14 @@ TABLES: dict[str, Table] = {
         ("sim_gt", "sim_gt_filled", "rand_noise", "rand_noise_filled", "ddg", "ddg_filled"),
     ),
     "formulas": Table(
-        "Formulas as they are, twice as strong, with holes added by hand",
+        "Formulas in pixels of the picture, and of one half as wide",
         "ddg",
-        ("rand_noise", "rand_noise_double", "rand_noise_patches", "ddg"),
+        ("rand_noise", "rand_noise_double", "ddg"),
+    ),
+    "patches": Table(
+        "Holes cut by hand, off and on",
+        "ddg",
+        ("sim_gt", "sim_gt_patches", "rand_noise", "rand_noise_patches", "ddg", "ddg_patches"),
     ),
     "grafting": Table(
         "Grafting, with the paper's generator", "paper_ddg", ("paper_ddg_no_graft", "paper_ddg")
@@ -159,7 +166,8 @@ def _check_clean(start: str) -> None:
     folder = holding(start, artifacts.MANIFEST, "student") or shipped(start)
     student = artifacts.read_manifest(folder).config["student"]
     training = student["training"]
-    seen = {"student.depth_source": student["depth_source"], "student.init_from": student["init_from"]}
+    fields = ("depth_source", "init_from", "hole_patches")
+    seen = {f"student.{name}": student[name] for name in fields}
     seen |= {f"student.training.{name}": training[name] for name in HAND_MADE}
     if other := {name: value for name, value in seen.items() if value not in ("ideal", "", 0.0)}:
         how = ", ".join(f"{name} {value!r}" for name, value in other.items())
@@ -189,7 +197,7 @@ def row_config(shared: Config, row: Row, paper_from: str = "") -> Config:
         shared.student,
         depth_source=row.source,
         dextrah_scale=row.dextrah_scale,
-        dextrah_patches=row.dextrah_patches,
+        hole_patches=PATCHES if row.patches else 0.0,
         training=training,
         picture=picture,
     )

@@ -2,9 +2,10 @@
 
 `dextrah`: the model that DextrAH-G trains with (Lum et al. 2024, "DextrAH-G: Pixels-to-Action Dexterous
 Arm-Hand Grasping with Geometric Fabrics"; strengths from its published code): correlated noise in disparity,
-pixel dropout, random values, sticks; and, where asked for, patches without depth, which that model lacks.
+pixel dropout, random values, sticks.
 `kinect`: the model of Handa et al. 2014 ("A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM",
 after Barron and Malik 2013) with the axial noise that Khoshelham and Elberink 2012 measured.
+`patches`: elliptic holes anywhere, alone (random erasing, Zhong et al. 2017, by ellipses).
 """
 
 import math
@@ -25,6 +26,8 @@ MOST_SHAPES = 4.0
 """Room for this many deviations more sticks or patches than are expected in a picture."""
 SMALLEST_PATCH = 1 / 8
 """Shortest half axis of a patch, of the longest one."""
+_PATCHES = 6
+"""Keeps patches apart from other noise of the same key, which is split into fewer."""
 
 
 def dextrah(config: DextrahConfig, profile: CameraProfile) -> Sense:
@@ -36,6 +39,16 @@ def dextrah(config: DextrahConfig, profile: CameraProfile) -> Sense:
 def kinect(config: KinectConfig, profile: CameraProfile) -> Sense:
     """Kinect-style depth noise. `profile` gives focal length times baseline."""
     return batched(partial(_kinect_frame, config, profile.fx_px * profile.baseline_m))
+
+
+def patches(expected: float, longest_px: float) -> Sense:
+    """Holes alone, `expected` in a picture: ellipses anywhere, turned anyhow, either half axis drawn from a
+    log-uniform distribution between `SMALLEST_PATCH` of `longest_px` and all of it."""
+
+    def cut(key: Array, depth_m: Array, rgb: Array | None) -> Array:
+        return cut_patches(jax.random.fold_in(key, _PATCHES), depth_m, expected, longest_px)
+
+    return batched(cut)
 
 
 def _dextrah_frame(
@@ -50,8 +63,7 @@ def _dextrah_frame(
     values = jax.random.uniform(value_key, shape, minval=near, maxval=far)
     noisy = jnp.where(jax.random.bernoulli(replace_key, float(config.random_value), shape), values, noisy)
     noisy = jnp.where(jax.random.bernoulli(drop_key, float(config.dropout), shape), 0.0, noisy)
-    noisy = draw_sticks(stick_key, noisy, config)
-    return cut_patches(jax.random.fold_in(key, 6), noisy, config)  # the keys above are 0 to 5
+    return draw_sticks(stick_key, noisy, config)
 
 
 def _kinect_frame(
@@ -135,19 +147,20 @@ def draw_sticks(key: Key, depth_m: Float[Array, "H W"], config: DextrahConfig) -
     return jax.lax.fori_loop(0, most, draw, depth_m)
 
 
-def cut_patches(key: Key, depth_m: Float[Array, "H W"], config: DextrahConfig) -> Float[Array, "H W"]:
-    """Elliptic holes in (H, W): `patches` are expected, anywhere and turned anyhow, either half axis drawn
-    from a log-uniform distribution up to `patch_px`. Random erasing (Zhong et al. 2017) with ellipses."""
+def cut_patches(
+    key: Key, depth_m: Float[Array, "H W"], expected: float, longest_px: float
+) -> Float[Array, "H W"]:
+    """(H, W) with elliptic holes: see `patches`."""
     height, width = depth_m.shape
-    most, share = _room(config.patches)
+    most, share = _room(expected)
     rows, columns = jnp.arange(height)[:, None] + 0.5, jnp.arange(width)[None, :] + 0.5
 
     def cut(i: Array, picture: Array) -> Array:
-        row, column, angle, long, short, there = jax.random.uniform(jax.random.fold_in(key, i), (6,))
+        row, column, angle, one, other, there = jax.random.uniform(jax.random.fold_in(key, i), (6,))
         v, u = rows - row * height, columns - column * width
         sine, cosine = jnp.sin(jnp.pi * angle), jnp.cos(jnp.pi * angle)
         along, across = u * cosine + v * sine, v * cosine - u * sine
-        half_axes = config.patch_px * SMALLEST_PATCH ** jnp.stack([long, short])
+        half_axes = longest_px * SMALLEST_PATCH ** jnp.stack([one, other])
         inside = (along / half_axes[0]) ** 2 + (across / half_axes[1]) ** 2 <= 1
         return jnp.where(inside & (there < share), 0.0, picture)
 
