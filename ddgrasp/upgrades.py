@@ -17,7 +17,7 @@ generator does not know where in the picture it is. 9: the policy alone acts in 
 comes down at any speed; what was made then comes down slowly too, since no run has an arm. 11: a Franka
 gives way to nothing before it stops itself; the same. 12: formulas have one strength. 13: what comes behind
 a teacher's time limit counts. 14: a window is a Gaussian. 15: the rig has one table.
-16: no holes are cut into training depth."""
+16: no ellipses are dropped."""
 
 VERSION_FIELD = "manifest_version"
 
@@ -125,7 +125,7 @@ _ADDED_AFTER: dict[int, dict[str, Any]] = {
     13: {"teacher.bootstrap_time_limit": True},
     14: {"ddg.graft.window_shape": "gaussian"},
     15: {"record.other_tables": False},
-    16: {"student.hole_patches": 0.0, "student.hole_patch_px": 25.0},
+    16: {"student.ellipse_dropout": 0.0, "student.ellipse_half_axis_px": 25.0},
 }
 """Version -> the fields that it lacked and the next one has, with what it did (10, 11: what is done now)."""
 

@@ -136,8 +136,7 @@ def _take(config: Config, takes: Takes, lab: Fr3Lab, index: int, path: Path) -> 
     info = policy_metadata.describe(config.student, config.export, profile)
     safety = safety_filter(settings, info, "franka")
     way = GuidedPath(plan(lab.thing(name), draw.place, safety.limits, draw.rng))
-    about = config.record
-    sense = fr3_camera.stereo(about.stereo, profile, clock, draw.rng, other_tables=about.other_tables)
+    sense = fr3_camera.configured(config.record, profile, clock, draw.rng)
     camera = fr3_camera.Fr3Camera(rig.host, clock, sense, profile, draw.T_world_cam, in_colour=True)
     meta = describe_recording(profile, "FR3 rig, D455 at 848x480", name)
     with RecordingWriter(path, meta) as writer:

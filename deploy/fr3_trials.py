@@ -46,7 +46,8 @@ class Fr3Bench:
     paired: bool = False
     """Object and camera stand where the development rig's trial of the same number has them."""
     other_tables: bool = False
-    """Every trial is before a table that is light and dark elsewhere, as with `record.other_tables` on."""
+    """Every trial with sight stereo is before a table that is light and dark elsewhere, as with
+    `record.other_tables` on."""
 
     def __call__(self, config: Config, policy_path: Path) -> "Fr3Runner":
         return Fr3Runner(config, policy_path, self)
@@ -125,10 +126,12 @@ class Fr3Runner:
     def _sense(self, profile: contract.CameraProfile, clock: RobotClock, rng: np.random.Generator):
         if self._bench.sight == "ideal":
             return fr3_camera.ideal(profile)
-        stream = profile if self._bench.sight == "coarse" else contract.D455_STREAM
         record = self._config.record
-        other_tables = self._bench.other_tables or record.other_tables
-        return fr3_camera.stereo(record.stereo, profile, clock, rng, stream, other_tables)
+        if self._bench.sight == "coarse":
+            return fr3_camera.stereo(record.stereo, profile, clock, rng, stream=profile)
+        if self._bench.other_tables:
+            record = replace(record, other_tables=True)
+        return fr3_camera.configured(record, profile, clock, rng)
 
 
 def _as_in_development(config: Config, trial: Trial) -> PlacedDraw:

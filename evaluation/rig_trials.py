@@ -126,9 +126,9 @@ class Series:
         where a network's weights are missing."""
         treatment = treatment or make_treatment(self.depth, config)
         if self.rig == "fr3":
-            if self.camera == "other_tables":
-                return Fr3Bench(self.shapes, treatment=treatment, other_tables=True)
-            return Fr3Bench(self.shapes, self.camera, treatment)
+            tables = self.camera == "other_tables"
+            sight = "stereo" if self.camera == "other_tables" else self.camera
+            return Fr3Bench(self.shapes, sight, treatment, other_tables=tables)
         if self.camera == "other_tables":
             return partial(Rig, change=Change("other tables"), treatment=treatment)
         change = Change(sight="ideal" if self.camera == "ideal" else "stereo")

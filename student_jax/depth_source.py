@@ -3,6 +3,7 @@
 `student.depth_source` names one: `learned` is the run's fitted generator, `learned_ungrafted` its own map,
 `monocular` a network on colour (`ddg_jax/monocular.py`), `rig` the development rig's camera before the scene
 (`student_jax/rig_source.py`), the others are the camera models of `ddg_jax/sensor.py`.
+`student.ellipse_dropout` cuts holes into what any of them gives.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +27,7 @@ from ddgrasp.depth import to_metres, to_millimetres
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
 from mjx_envs.views import Views
-from sensors.models.procedural import patches
+from sensors.models.procedural import ellipse_dropout
 from sensors.models.sense import Sense
 from student_jax.rig_source import RigSource
 from student_jax.source_check import LEARNED
@@ -178,11 +179,11 @@ class SenseSource(FrameByFrame):
 
 
 @dataclass(frozen=True)
-class PatchedSource:
-    """Another source's depth with holes cut into it by hand."""
+class EllipseDropoutSource:
+    """Another source's depth with elliptic holes (`student.ellipse_dropout`)."""
 
     source: DepthSource
-    cutter: SenseSource
+    dropout: SenseSource
 
     @property
     def needs_rgb(self) -> bool:
@@ -207,7 +208,7 @@ class PatchedSource:
 
         for i, depth_mm in enumerate(self.source.episodes(lengths, noted, first), first):
             steps = np.arange(len(depth_mm))
-            yield self.cutter.frames(depth_mm, None, np.full(len(steps), numbers.pop(i)), steps)
+            yield self.dropout.frames(depth_mm, None, np.full(len(steps), numbers.pop(i)), steps)
 
     def frames(
         self,
@@ -219,20 +220,20 @@ class PatchedSource:
     ) -> UInt16[np.ndarray, "B H W"]:
         """See `DepthSource`."""
         seen_mm = self.source.frames(depth_mm, rgb, episode, frame, views)
-        return self.cutter.frames(seen_mm, None, episode, frame)
+        return self.dropout.frames(seen_mm, None, episode, frame)
 
 
 def make_source(config: Config, ddg: Path) -> DepthSource:
-    """The source that `config.student.depth_source` names, with the holes that `hole_patches` has cut into
-    it; `ddg` is the stage directory of the generator.
+    """The source that `config.student.depth_source` names, with the holes that `ellipse_dropout` adds; `ddg`
+    is the stage directory of the generator.
 
     Raises UserError for an unknown name, or where `learned` finds no generator or `monocular` no weights.
     """
     source, student = _named_source(config, ddg), config.student
-    if not student.hole_patches:
+    if not student.ellipse_dropout:
         return source
-    sense = patches(student.hole_patches, student.hole_patch_px)
-    return PatchedSource(source, SenseSource(sense, jax.random.key(config.seed)))
+    sense = ellipse_dropout(student.ellipse_dropout, student.ellipse_half_axis_px)
+    return EllipseDropoutSource(source, SenseSource(sense, jax.random.key(config.seed)))
 
 
 def _named_source(config: Config, ddg: Path) -> DepthSource:

@@ -111,13 +111,27 @@ def test_unknown_objects_are_named_before_anything_runs(tmp_path, takes, message
     assert not (tmp_path / "out").exists()
 
 
+def test_recordings_before_one_table_and_before_many_do_not_mix(tmp_path):
+    takes = Takes(0, ("cube",))
+    many = replace(CONFIG, record=replace(CONFIG.record, other_tables=True))
+    for first, then in ((CONFIG, many), (many, CONFIG)):
+        out = tmp_path / str(first.record.other_tables)
+        fr3_record._begin(first, takes, out)
+        fr3_record._begin(first, takes, out)
+        assert read_json(out / fr3_record.SETTINGS_FILE)["record"].get("other_tables", False) is (
+            first is many
+        )
+        with pytest.raises(UserError, match="were made otherwise"):
+            fr3_record._begin(then, takes, out)
+
+
 def test_two_trajectories_of_the_rig_are_recordings_and_are_kept(tmp_path, open_gl):
     pytest.importorskip("franky_sim", reason="needs pip install -e '.[fr3]'")
     pytest.importorskip("franky", reason="needs pip install -e '.[fr3]'")
     out, takes = tmp_path / "fr3", Takes(0, ("cube", "can"))
     one = replace(CONFIG, record=replace(CONFIG.record, trajectories=1))
     (first,) = fr3_record.record(one, takes, out, Progress(quiet=True))
-    assert "other_tables" not in read_json(out / fr3_record.SETTINGS_FILE)["record"], "the other rig's"
+    assert "other_tables" not in read_json(out / fr3_record.SETTINGS_FILE)["record"], "as before"
     written = (first.path / "meta.json").stat().st_mtime_ns
     fr3_record.record(CONFIG, takes, out, Progress(quiet=True))
     recordings = find_recordings(out)

@@ -15,11 +15,12 @@ import franky
 from franky_sim.mujoco_simulator import MujocoSimulator
 
 from ddgrasp import contract
+from ddgrasp.config import Config, RecordConfig
 from ddgrasp.contract import HOME_RAD
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
-from deploy.clock import SimClock
+from deploy.clock import RobotClock, SimClock
 from deploy.devices import fr3_camera
 from deploy.devices.franka_faults import no_connection
 from deploy.devices.franka_robot import LOST
@@ -94,28 +95,48 @@ def test_the_d455_sees_the_table_to_a_millimetre_and_loses_black_rubber(picture)
     assert lost[0] > 2 * lost[1] and lost[1] < 0.15
 
 
-def test_another_table_is_the_generator_s_own_and_takes_none_of_its_numbers(picture):
-    def depth(other_tables: bool) -> tuple[np.ndarray, float]:
+MANY = replace(get_preset("demo").record, other_tables=True)
+
+
+def test_another_table_follows_from_the_trial_s_random_numbers_and_takes_none_of_them(picture):
+    def depth(record: RecordConfig) -> tuple[np.ndarray, float]:
         rng = np.random.default_rng(0)
-        sense = fr3_camera.stereo(STEREO, PROFILE, SimClock(), rng, other_tables=other_tables)
+        sense = fr3_camera.configured(record, PROFILE, SimClock(), rng)
         return sense(picture, T_WORLD_CAM, "wheel"), rng.random()
 
-    (own, after_own), (other, after_other) = depth(False), depth(True)
+    (own, after_own), (other, after_other) = depth(replace(MANY, other_tables=False)), depth(MANY)
     assert after_own == after_other, "the same noise"
-    np.testing.assert_array_equal(other, depth(True)[0])
+    np.testing.assert_array_equal(other, depth(MANY)[0])
     geoms = picture.buffers(Camera.of(PROFILE, T_WORLD_CAM)).segmentation
     table = geoms == picture.model.geom(scene.TABLE).id
     assert np.mean((own != other)[table]) > 0.1
 
 
-def test_the_test_rig_stands_before_the_configured_tables():
-    config = get_preset("demo")
-    many = replace(config, record=replace(config.record, other_tables=True))
+def test_the_test_rig_stands_before_the_configured_tables(tmp_path, picture):
+    config = replace(get_preset("demo"), seed=4)
+    many = replace(config, record=MANY)
     assert Series().before(config).camera == "stereo"
     assert Series(camera="ideal").before(many).camera == "ideal"
     series = Series().before(many)
     assert series.camera == "other_tables"
     assert series.make(config) == Fr3Bench(other_tables=True) != Series().make(config)
+    policy = write_policy(tmp_path / "policy.onnx", describe())
+
+    def seen(config: Config, bench: Fr3Bench) -> np.ndarray:
+        runner = Fr3Runner(config, policy, bench)
+        sense = runner._sense(PROFILE, RobotClock(), np.random.default_rng(0))
+        return sense(picture, T_WORLD_CAM, "wheel")
+
+    def expected(record: RecordConfig) -> np.ndarray:
+        sense = fr3_camera.configured(record, PROFILE, SimClock(), np.random.default_rng(0))
+        return sense(picture, T_WORLD_CAM, "wheel")
+
+    other = expected(MANY)
+    np.testing.assert_array_equal(seen(config, Fr3Bench()), expected(config.record))
+    np.testing.assert_array_equal(seen(config, Fr3Bench(other_tables=True)), other)
+    np.testing.assert_array_equal(seen(many, Fr3Bench(paired=True)), other)
+    coarse = Fr3Bench(sight="coarse")
+    np.testing.assert_array_equal(seen(many, coarse), seen(config, coarse))
 
 
 def test_seeds_of_development_and_test_are_disjoint():

@@ -118,6 +118,19 @@ def test_depth_that_is_not_the_generator_s_is_not_called_so(tmp_path):
     assert not any("generated" in text for text in said)
 
 
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("ideal", "depth of its training (ideal, 4 elliptic holes a picture): success 60.0 %"),
+        ("learned", "generated depth (4 elliptic holes a picture): success 60.0 %"),
+    ],
+)
+def test_holes_cut_into_training_depth_are_told(tmp_path, source, expected):
+    config = replace(CONFIG, student=StudentConfig(depth_source=source, ellipse_dropout=4.0))
+    artifacts.finish(tmp_path / "student", "student", config, seconds=1, metrics=METRICS["student"])
+    assert any(row[-1].startswith(expected) for row in summary_rows(build_report(tmp_path)))
+
+
 def test_a_picture_cut_short_is_named(run_dir):
     pictures = run_dir / "ddg" / PICTURES
     pictures.mkdir(exist_ok=True)

@@ -106,9 +106,9 @@ def test_rows_differ_in_the_student_s_section_alone_so_that_they_share_what_come
 def test_rows_with_holes_cut_by_hand_differ_in_them_alone():
     shared = rows.shared_config(LAPTOP)
     for name in ("sim_gt", "rand_noise", "ddg"):
-        plain, patched = (rows.row_config(shared, ROWS[row]).student for row in (name, f"{name}_patches"))
-        assert (plain.hole_patches, patched.hole_patches) == (0.0, rows.PATCHES)
-        assert replace(patched, hole_patches=0.0) == plain
+        plain, holed = (rows.row_config(shared, ROWS[row]).student for row in (name, f"{name}_ellipses"))
+        assert (plain.ellipse_dropout, holed.ellipse_dropout) == (0.0, rows.ELLIPSES)
+        assert replace(holed, ellipse_dropout=0.0) == plain
 
 
 def test_ripple_and_the_paper_s_generator_are_one_difference_each():
@@ -139,8 +139,10 @@ def test_a_filled_row_differs_from_its_own_in_who_fills_the_holes():
 
 
 def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
-    def student(name: str, init_from: str = "", hole_patches: float = 0.0, **training) -> str:
-        config = replace(LAPTOP.student, depth_source="ideal", init_from=init_from, hole_patches=hole_patches)
+    def student(name: str, init_from: str = "", ellipse_dropout: float = 0.0, **training) -> str:
+        config = replace(
+            LAPTOP.student, depth_source="ideal", init_from=init_from, ellipse_dropout=ellipse_dropout
+        )
         config = replace(
             config, training=replace(config.training, **(dict.fromkeys(rows.HAND_MADE, 0.0) | training))
         )
@@ -162,8 +164,8 @@ def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
         shared(student("holes", unseen_share=0.25))
     with pytest.raises(UserError, match="trained with student.init_from 'pretrained/student'"):
         shared(student("later", init_from="pretrained/student"))
-    with pytest.raises(UserError, match=r"trained with student.hole_patches 4.0: a student that has"):
-        shared(student("cut", hole_patches=4.0))
+    with pytest.raises(UserError, match=r"trained with student.ellipse_dropout 4.0: a student that has"):
+        shared(student("cut", ellipse_dropout=4.0))
 
 
 def test_pages_have_words_for_what_every_row_is_trained_on_and_sees():
@@ -230,6 +232,14 @@ def test_rows_are_tested_on_the_trials_that_both_had(study):
     assert (by_row["rand_noise"]["n"], by_row["rand_noise"]["p"]) == (4, 1.0)
     assert of["tables"]["grafting"] == []
     assert of["rows"]["ddg"]["seen"]["n"] == 10 and of["rows"]["ddg"]["unseen"]["successes"] == 9
+
+
+def test_the_page_says_how_many_holes_were_cut():
+    made = {"generator_from": "runs/a", "ellipses": 4.0}
+    study = {"rows": {"ddg_ellipses": made}, "sets": {"set": {"rows": {}, "tables": {"ellipses": []}}}}
+    cells = {line[0]: line[1] for line in page.table_rows(study, "set", "ellipses")}
+    assert cells["DDG, holes cut by hand"] == "generator, grafted (runs/a), 4 elliptic holes a picture"
+    assert cells["DDG"] == "generator, grafted"
 
 
 def test_the_page_has_every_row_tried_or_not(study, tmp_path):

@@ -186,23 +186,43 @@ def test_sticks_have_the_expected_number_and_one_depth_each():
     )
 
 
-def test_patches_are_holes_of_the_expected_number_and_size():
+def test_ellipses_are_holes_of_the_expected_number_size_and_slant():
     size = (100, 140)
-    cut = jax.jit(procedural.patches(0.5, 12.0))
-    pictures = np.asarray(cut(jax.random.key(0), jnp.ones((400, *size)), None))
+    drop = jax.jit(procedural.ellipse_dropout(0.5, 12.0))
+    pictures = np.asarray(drop(jax.random.key(0), jnp.ones((400, *size)), None))
     assert set(np.unique(pictures)) == {0.0, 1.0}
-    counts, widest = [], 0.0
+    counts, longest, slant = [], 0.0, 0.0
     for holes in (pictures == 0).astype(np.uint8):
-        labels, _, found, _ = cv2.connectedComponentsWithStats(holes, connectivity=8)
+        labels, numbers, _, _ = cv2.connectedComponentsWithStats(holes, connectivity=8)
         counts.append(labels - 1)
-        widest = max(widest, float(np.hypot(*found[1:, 2:4].max(axis=0, initial=0))))
+        for label in range(1, labels):
+            place = np.argwhere(numbers == label)
+            spread = 4 * np.atleast_2d(np.cov(place.T, bias=True))  # of an ellipse: its half axes squared
+            longest = max(longest, float(np.sqrt(np.linalg.eigvalsh(spread)[-1])))
+            slant = max(slant, float(abs(spread[0, 1]) / spread.trace()))
     assert np.mean(counts) == pytest.approx(0.5, rel=0.2)  # fewer where one lies on another
     # A half axis is 12 px x 8^-u on average 12 (1 - 1/8) / ln 8; the borders cut off some.
     mean_area_px = math.pi * (12 * (1 - 1 / 8) / math.log(8)) ** 2
     assert np.mean(pictures == 0) == pytest.approx(0.5 * mean_area_px / pictures[0].size, rel=0.25)
-    assert 12 < widest < 2 * 12 * math.sqrt(2)
-    none = procedural.patches(0.0, 12.0)(jax.random.key(0), jnp.ones(size), None)
+    assert 10.5 < longest < 24  # two that touch count as one
+    assert slant > 0.25, "turned"
+    none = procedural.ellipse_dropout(0.0, 12.0)(jax.random.key(0), jnp.ones(size), None)
     np.testing.assert_array_equal(none, 1.0)
+
+
+def test_ellipses_lie_elsewhere_with_another_key_and_leave_holes_holes():
+    depth, _ = scene()
+    drop = procedural.ellipse_dropout(4.0, 12.0)
+    keys = jax.random.split(jax.random.key(3), len(depth))
+    batch = np.asarray(drop(jax.random.key(3), depth, None))
+    single = np.stack(
+        [np.asarray(drop(key, picture, None)) for key, picture in zip(keys, depth, strict=True)]
+    )
+    np.testing.assert_array_equal(batch, single)
+    assert (
+        not batch[depth == 0].any()
+        and np.mean(batch != np.asarray(drop(jax.random.key(4), depth, None))) > 0.01
+    )
 
 
 def test_without_noise_the_procedural_models_change_nothing():

@@ -35,9 +35,16 @@ from ddgrasp.progress import Progress
 from demos.rollout import Scene
 from demos.store import EpisodeStore
 from learning.params import save_params
+from sensors.models.procedural import ellipse_dropout
 from student_jax import frames_io
 from student_jax.act import SourceCamera
-from student_jax.depth_source import GeneratorSource, SenseSource, check_demos, make_source
+from student_jax.depth_source import (
+    EllipseDropoutSource,
+    GeneratorSource,
+    SenseSource,
+    check_demos,
+    make_source,
+)
 from upgrades_support import downgraded
 
 CONFIG = Config(
@@ -196,17 +203,18 @@ def test_a_student_s_formulas_take_its_scale(demos):
     assert deviation(twice) == pytest.approx(2 * deviation(once), rel=0.2)
 
 
-def with_patches(settings: Config, number: float = 4.0) -> Config:
-    return replace(settings, student=replace(settings.student, hole_patches=number, hole_patch_px=9.0))
+def with_ellipses(settings: Config, number: float = 4.0) -> Config:
+    student = replace(settings.student, ellipse_dropout=number, ellipse_half_axis_px=9.0)
+    return replace(settings, student=student)
 
 
 @pytest.mark.parametrize("name", ["ideal", "dextrah"])
-def test_holes_are_cut_into_whatever_a_source_gives(demos, tmp_path, name):
-    plain, patched = with_source(name), with_patches(with_source(name))
-    own, cut = (make_source(settings, tmp_path) for settings in (plain, patched))
+def test_ellipses_are_dropped_from_whatever_a_source_gives(demos, tmp_path, name):
+    plain, dropping = with_source(name), with_ellipses(with_source(name))
+    own, wrapped = (make_source(settings, tmp_path) for settings in (plain, dropping))
     seen, holed = (
         training_depth(settings, source, demos, tmp_path / source.__class__.__name__)
-        for settings, source in ((plain, own), (patched, cut))
+        for settings, source in ((plain, own), (dropping, wrapped))
     )
     changed = holed != seen
     assert not holed[changed].any(), "nothing but holes"
@@ -214,17 +222,37 @@ def test_holes_are_cut_into_whatever_a_source_gives(demos, tmp_path, name):
     assert changed.mean() == pytest.approx(4 * math.pi * 3.79**2 / (90 * 160), rel=0.3)
 
 
-def test_holes_of_a_frame_hang_on_its_own_numbers_alone(demos, tmp_path):
-    settings = with_patches(with_source("dextrah"))
-    source = make_source(settings, tmp_path)
-    clean = demos.steps("depth_mm")
-    begins = np.concatenate([[0], demos.ends])
-    clips = [Clip(10 + i, clean[begins[i] : begins[i + 1]]) for i in range(len(LENGTHS))]
+def clips_of(demos: EpisodeStore) -> list[Clip]:
+    """The demos' frames as episodes 10, 11, ..."""
+    parts = np.split(demos.steps("depth_mm"), demos.ends[:-1])
+    return [Clip(10 + i, part) for i, part in enumerate(parts)]
+
+
+def test_ellipses_of_a_frame_hang_on_its_own_numbers_alone(demos, tmp_path):
+    source, clips = make_source(with_ellipses(with_source("dextrah")), tmp_path), clips_of(demos)
     whole = list(source.episodes(LENGTHS, clips.__getitem__))
     np.testing.assert_array_equal(whole[2], next(source.episodes(LENGTHS, clips.__getitem__, 2)))
     alone = source.frames(clips[1].depth_mm[[7]], None, np.array([11]), np.array([7]))
     np.testing.assert_array_equal(alone[0], whole[1][7])
-    assert (source.needs_rgb, source.needs_views) == (False, False)
+
+
+def test_ellipses_find_their_episode_where_a_generator_reads_ahead(demos, generator):
+    own, clips = GeneratorSource(generator, jax.random.key(3)), clips_of(demos)
+    dropout = SenseSource(ellipse_dropout(4.0, 9.0), jax.random.key(3))
+    source = EllipseDropoutSource(own, dropout)
+    seen = own.episodes(LENGTHS, clips.__getitem__)
+    whole = list(source.episodes(LENGTHS, clips.__getitem__))
+    for clip, plain, holed in zip(clips, seen, whole, strict=True):
+        number = np.full(len(plain), clip.number)
+        np.testing.assert_array_equal(holed, dropout.frames(plain, None, number, np.arange(len(plain))))
+        assert np.mean(holed != plain) > 0.001
+    np.testing.assert_array_equal(whole[2], next(source.episodes(LENGTHS, clips.__getitem__, 2)))
+
+
+@pytest.mark.parametrize(("name", "needs"), [("stereo", (True, False)), ("rig", (False, True))])
+def test_with_ellipses_a_source_needs_what_it_needs(tmp_path, name, needs):
+    source = make_source(with_ellipses(with_source(name)), tmp_path)
+    assert (source.needs_rgb, source.needs_views) == needs
 
 
 def test_the_clean_share_keeps_clean_depth_whatever_the_source(demos, tmp_path):

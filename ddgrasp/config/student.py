@@ -260,11 +260,11 @@ class StudentConfig(Section, name="student"):
     dextrah_scale: Annotated[float, Range(0.125, 8)] = 1.0
     """Size of the formulas' pixel in training, in pixels of the picture, where depth_source is dextrah: their
     numbers are of pictures 160 wide; 2 makes one of 320 as noisy as those, 1 half as noisy in depth."""
-    hole_patches: Annotated[float, Range(0, 100)] = 0.0
-    """Elliptic holes cut into training depth besides what depth_source gives it, how many are expected in a
-    picture; their half axes are an eighth of hole_patch_px to all of it. Demos of training.clean_share have
-    none."""
-    hole_patch_px: Annotated[float, Range(1, 4096)] = 25.0
+    ellipse_dropout: Annotated[float, Range(0, 100)] = 0.0
+    """Elliptic holes in training depth besides what depth_source gives it: how many are expected in a
+    picture, drawn anew in every frame; their half axes are an eighth of ellipse_half_axis_px to all of it.
+    What training.clean_share leaves clean has none."""
+    ellipse_half_axis_px: Annotated[float, Range(1, 4096)] = 25.0
     """Longest half axis of such a hole, in pixels of the camera's picture."""
 
     def check(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from ddgrasp import contract
-from ddgrasp.config import StereoConfig
+from ddgrasp.config import RecordConfig, StereoConfig
 from ddgrasp.depth import to_millimetres
 from deploy.devices.options import Setup
 from deploy.devices.realsense_camera import RealSenseCamera
@@ -28,16 +28,21 @@ Sense = Callable[["ScenePicture", Pose, str], Depth]
 
 def make(setup: Setup, robot: Robot) -> "Fr3Camera":
     """A D455 before the rig that runs at the robot's host, at its nominal place within its error."""
-    profile, record = setup.info.profile, setup.config.record
-    rng = np.random.default_rng(setup.config.seed)
-    sense = stereo(record.stereo, profile, setup.clock, rng, other_tables=record.other_tables)
-    return _at_place(setup, profile, sense)
+    profile, rng = setup.info.profile, np.random.default_rng(setup.config.seed)
+    return _at_place(setup, profile, configured(setup.config.record, profile, setup.clock, rng))
 
 
 def make_ideal(setup: Setup, robot: Robot) -> "Fr3Camera":
     """A camera without errors at the same place."""
     profile = setup.info.profile
     return _at_place(setup, profile, ideal(profile))
+
+
+def configured(
+    record: RecordConfig, profile: contract.CameraProfile, clock: Clock, rng: np.random.Generator
+) -> Sense:
+    """The configured D455 as it is run, before the rig's own table or one that follows from `rng`."""
+    return stereo(record.stereo, profile, clock, rng, other_tables=record.other_tables)
 
 
 def stereo(
@@ -56,7 +61,7 @@ def stereo(
       clock: the driver's.
       rng: draws the noise.
       stream: the picture in which it matches.
-      other_tables: whether light and dark places are `rng`'s own (`record.other_tables`), not the rig's.
+      other_tables: whether the table's light and dark places follow from `rng` (`record.other_tables`).
     """
     from sensors.models.active_stereo import of_scale
     from sensors.models.materials import rig_materials

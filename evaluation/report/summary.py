@@ -252,8 +252,12 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
 
 def _own_depth(report: Mapping[str, Any]) -> str:
     """What the student was trained on, which is not always the generator's."""
-    source = report["config"].get("student", {}).get("depth_source", "learned")
-    return "generated depth" if source == "learned" else f"depth of its training ({source})"
+    student = report["config"].get("student", {})
+    source, ellipses = student.get("depth_source", "learned"), student.get("ellipse_dropout")
+    holes = f", {ellipses:g} elliptic holes a picture" if ellipses else ""
+    if source == "learned":
+        return "generated depth" + (f" ({holes[2:]})" if holes else "")
+    return f"depth of its training ({source}{holes})"
 
 
 def perceived(student: Mapping[str, Any]) -> str:

@@ -33,6 +33,7 @@ def _line(
     made = study["rows"].get(name, {})
     simulated = made.get("student", {}).get("simulation", {}).get("own", {})
     source = f" ({made['generator_from']})" if made.get("generator_from") else ""
+    source += f", {made['ellipses']:g} elliptic holes a picture" if made.get("ellipses") else ""
     rig = ("not tried", "", "") if tried is None else tuple(_rate(tried.get(group)) for group in _GROUPS)
     pairs = f"{test['only_reference']} / {test['only_row']} of {test['n']}" if test else ""
     p_values = (describe_p(test["p"]), describe_p(test["p_holm"])) if test else ("", "")

@@ -65,10 +65,11 @@ def collect(out: Path) -> dict[str, Any]:
     """What study.json holds of rows and trials.
 
     Keys: `rows.<row>` = {title, training, deployment, generator_from (empty if it was fitted in the study),
-    ripple_px, student: {name, seconds, simulation}}, of rows whose student is finished; `sets.<set>` =
-    {trials: how the main table's reference was tried, or the first row that was, rows: each as
-    `evaluation.rig_trials.tabulate` gives it, tables: see `compare`, apart: rows that are left out of their
-    table's comparisons, see `tried_otherwise`}. A success rate is {rate, n, successes, low, high}.
+    ripple_px, ellipses (expected in a picture), student: {name, seconds, simulation}}, of rows whose student
+    is finished; `sets.<set>` = {trials: how the main table's reference was tried, or the first row that was,
+    rows: each as `evaluation.rig_trials.tabulate` gives it, tables: see `compare`, apart: rows that are left
+    out of their table's comparisons, see `tried_otherwise`}. A success rate is {rate, n, successes, low,
+    high}.
     """
     rows = {
         name: _describe(row, artifacts.read_artifact(out / STUDENTS / row.student / "student"))
@@ -91,6 +92,7 @@ def _describe(row: Row, student: Artifact) -> dict[str, Any]:
         "deployment": DEPLOYED[row.depth],
         "generator_from": student.manifest.config["ddg"]["init_from"] if "learned" in row.source else "",
         "ripple_px": student.manifest.config["student"]["training"]["disparity_noise_px"],
+        "ellipses": student.manifest.config["student"]["ellipse_dropout"],
         "student": {
             "name": row.student,
             "seconds": student.manifest.seconds,

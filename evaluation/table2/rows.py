@@ -1,7 +1,7 @@
 """What Table II compares: its rows as differences of one configuration, and which rows make a table.
 
-A row is a training depth, with or without hand-made ripple, and what is done to recorded depth before its
-policy sees it. Rows that train alike share a student.
+A row is a training depth, with or without what is done to it by hand, and what is done to recorded depth
+before its policy sees it. Rows that train alike share a student.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,10 @@ PAPER_THRESHOLD = -0.2
 """Below it a pixel of a generated depth map is a hole: surfaces are 0 to 1 there, holes -1."""
 PAPER_SAMPLING: dict[str, Any] = {"sampler": DDIM, "spacing": "linspace", "steps": 10, "eta": 0.0}
 """The paper names DDPM and DDIM; docs/table2.md has what others of as many evaluations are off by."""
-PATCHES = 4.0
-"""Holes of 30 pixels and more that the rig's camera, overexposed, has in a picture beside those at its left
-edge, where a stereo camera has none to match (80 pictures)."""
+ELLIPSES = 4.0
+"""Holes of 30 pixels and more that the rig's camera, overexposed (`record.stereo.exposure_target` 0.7), has
+in a picture of 320x180 before other tables, without those at its left edge, which the right imager does not
+see (mean of 80 recordings' first pictures, 2026-11-29; their areas go from 30 to 1,300 pixels)."""
 HAND_MADE = ("disparity_noise_px", "edge_noise_px", "unseen_share")
 """Fields of `student.training` that add noise made by hand; 0 turns each off."""
 
@@ -45,8 +46,9 @@ class Row:
     """Whether its student fills holes by itself (`student.picture.fill_holes`), in training as on the rig."""
     dextrah_scale: float = 1.0
     """Size of the formulas' pixel (`student.dextrah_scale`)."""
-    patches: bool = False
-    """Whether training depth has holes cut by hand (`student.hole_patches`, `PATCHES`)."""
+    ellipses: bool = False
+    """Whether training depth has holes cut by hand (`student.ellipse_dropout`): `ELLIPSES` in a picture,
+    whatever number the configuration has, of its sizes; other rows have none."""
 
     @property
     def student(self) -> str:
@@ -57,7 +59,7 @@ class Row:
             "ripple" * self.ripple,
             "filled" * self.filled,
             f"x{self.dextrah_scale:g}" * (self.dextrah_scale != 1),
-            "patches" * self.patches,
+            "ellipses" * self.ellipses,
         )
         return "_".join(part for part in parts if part)
 
@@ -87,9 +89,9 @@ ROWS: dict[str, Row] = {
     "rand_noise_filled": Row("Rand Noise, holes filled", "dextrah", filled=True),
     "ddg_filled": Row("DDG, holes filled", "learned", filled=True),
     "rand_noise_double": Row("Rand Noise, twice as strong", "dextrah", dextrah_scale=2.0),
-    "sim_gt_patches": Row("Sim GT, holes cut by hand", "ideal", patches=True),
-    "rand_noise_patches": Row("Rand Noise, holes cut by hand", "dextrah", patches=True),
-    "ddg_patches": Row("DDG, holes cut by hand", "learned", patches=True),
+    "sim_gt_ellipses": Row("Sim GT, holes cut by hand", "ideal", ellipses=True),
+    "rand_noise_ellipses": Row("Rand Noise, holes cut by hand", "dextrah", ellipses=True),
+    "ddg_ellipses": Row("DDG, holes cut by hand", "learned", ellipses=True),
     "paper_ddg_no_graft": Row(
         "Paper's generator without grafting", "learned_ungrafted", paper_generator=True
     ),
@@ -116,10 +118,10 @@ TABLES: dict[str, Table] = {
         "ddg",
         ("rand_noise", "rand_noise_double", "ddg"),
     ),
-    "patches": Table(
+    "ellipses": Table(
         "Holes cut by hand, off and on",
         "ddg",
-        ("sim_gt", "sim_gt_patches", "rand_noise", "rand_noise_patches", "ddg", "ddg_patches"),
+        ("sim_gt", "sim_gt_ellipses", "rand_noise", "rand_noise_ellipses", "ddg", "ddg_ellipses"),
     ),
     "grafting": Table(
         "Grafting, with the paper's generator", "paper_ddg", ("paper_ddg_no_graft", "paper_ddg")
@@ -166,7 +168,7 @@ def _check_clean(start: str) -> None:
     folder = holding(start, artifacts.MANIFEST, "student") or shipped(start)
     student = artifacts.read_manifest(folder).config["student"]
     training = student["training"]
-    fields = ("depth_source", "init_from", "hole_patches")
+    fields = ("depth_source", "init_from", "ellipse_dropout")
     seen = {f"student.{name}": student[name] for name in fields}
     seen |= {f"student.training.{name}": training[name] for name in HAND_MADE}
     if other := {name: value for name, value in seen.items() if value not in ("ideal", "", 0.0)}:
@@ -197,7 +199,7 @@ def row_config(shared: Config, row: Row, paper_from: str = "") -> Config:
         shared.student,
         depth_source=row.source,
         dextrah_scale=row.dextrah_scale,
-        hole_patches=PATCHES if row.patches else 0.0,
+        ellipse_dropout=ELLIPSES if row.ellipses else 0.0,
         training=training,
         picture=picture,
     )

@@ -5,7 +5,7 @@ Arm-Hand Grasping with Geometric Fabrics"; strengths from its published code): c
 pixel dropout, random values, sticks.
 `kinect`: the model of Handa et al. 2014 ("A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM",
 after Barron and Malik 2013) with the axial noise that Khoshelham and Elberink 2012 measured.
-`patches`: elliptic holes anywhere, alone (random erasing, Zhong et al. 2017, by ellipses).
+`ellipse_dropout`: elliptic holes anywhere, alone (random erasing, Zhong et al. 2020, by ellipses).
 """
 
 import math
@@ -23,11 +23,11 @@ from sensors.models.sense import Key, Sense, batched
 NEAREST_M = 0.05
 """Noise never brings a surface nearer than this."""
 MOST_SHAPES = 4.0
-"""Room for this many deviations more sticks or patches than are expected in a picture."""
-SMALLEST_PATCH = 1 / 8
-"""Shortest half axis of a patch, of the longest one."""
-_PATCHES = 6
-"""Keeps patches apart from other noise of the same key, which is split into fewer."""
+"""Room for this many deviations more sticks or ellipses than are expected in a picture."""
+SHORTEST_HALF_AXIS = 1 / 8
+"""An ellipse's shortest possible half axis, in parts of the longest."""
+_DROPOUT_STREAM = 6
+"""Keeps ellipses apart from DextrAH-G's noise of the same key, which is split into 0 to 5."""
 
 
 def dextrah(config: DextrahConfig, profile: CameraProfile) -> Sense:
@@ -41,14 +41,14 @@ def kinect(config: KinectConfig, profile: CameraProfile) -> Sense:
     return batched(partial(_kinect_frame, config, profile.fx_px * profile.baseline_m))
 
 
-def patches(expected: float, longest_px: float) -> Sense:
+def ellipse_dropout(expected: float, half_axis_px: float) -> Sense:
     """Holes alone, `expected` in a picture: ellipses anywhere, turned anyhow, either half axis drawn from a
-    log-uniform distribution between `SMALLEST_PATCH` of `longest_px` and all of it."""
+    log-uniform distribution between `SHORTEST_HALF_AXIS` of `half_axis_px` and all of it."""
 
-    def cut(key: Array, depth_m: Array, rgb: Array | None) -> Array:
-        return cut_patches(jax.random.fold_in(key, _PATCHES), depth_m, expected, longest_px)
+    def drop(key: Array, depth_m: Array, rgb: Array | None) -> Array:
+        return drop_ellipses(jax.random.fold_in(key, _DROPOUT_STREAM), depth_m, expected, half_axis_px)
 
-    return batched(cut)
+    return batched(drop)
 
 
 def _dextrah_frame(
@@ -147,10 +147,10 @@ def draw_sticks(key: Key, depth_m: Float[Array, "H W"], config: DextrahConfig) -
     return jax.lax.fori_loop(0, most, draw, depth_m)
 
 
-def cut_patches(
-    key: Key, depth_m: Float[Array, "H W"], expected: float, longest_px: float
+def drop_ellipses(
+    key: Key, depth_m: Float[Array, "H W"], expected: float, half_axis_px: float
 ) -> Float[Array, "H W"]:
-    """(H, W) with elliptic holes: see `patches`."""
+    """(H, W) with elliptic holes: see `ellipse_dropout`."""
     height, width = depth_m.shape
     most, share = _room(expected)
     rows, columns = jnp.arange(height)[:, None] + 0.5, jnp.arange(width)[None, :] + 0.5
@@ -160,7 +160,7 @@ def cut_patches(
         v, u = rows - row * height, columns - column * width
         sine, cosine = jnp.sin(jnp.pi * angle), jnp.cos(jnp.pi * angle)
         along, across = u * cosine + v * sine, v * cosine - u * sine
-        half_axes = longest_px * SMALLEST_PATCH ** jnp.stack([one, other])
+        half_axes = half_axis_px * SHORTEST_HALF_AXIS ** jnp.stack([one, other])
         inside = (along / half_axes[0]) ** 2 + (across / half_axes[1]) ** 2 <= 1
         return jnp.where(inside & (there < share), 0.0, picture)
 
