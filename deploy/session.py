@@ -84,9 +84,9 @@ def _run(
     loop = ControlLoop(camera, driven, policy, safety, clock, settings, say)
     steps = round(options.seconds * policy.info.control_hz) if math.isfinite(options.seconds) else None
     folder = _new_folder(options.out)
-    sensor = f"{options.camera}, D455 profile"
-    kept = DeploymentRecord(camera, policy.info.profile, sensor, config.deploy.film_every)
-    about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": options.camera}
+    seen_by = _camera_name(config, options)
+    kept = DeploymentRecord(camera, policy.info.profile, f"{seen_by}, D455 profile", config.deploy.film_every)
+    about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": seen_by}
     about["policy_sha256"] = hashlib.sha256(policy_path.read_bytes()).hexdigest()
     name = options.object_name or (config.world.objects[0] if options.camera == "stereo" else "")
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
@@ -124,6 +124,13 @@ def _run(
         atomic_write_bytes(path, dry_run.draw(driven.sent, safety.limits, 1.0 / policy.info.control_hz))
         say(f"drawn: {path}")
     return report
+
+
+def _camera_name(config: Config, options: SessionOptions) -> str:
+    """What report and recording call the camera: a simulated one before other tables sees other depth."""
+    if config.record.other_tables and options.camera in ("stereo", "rig"):
+        return f"{options.camera}, other tables"
+    return options.camera
 
 
 def _object(camera: Camera, named: str) -> dict[str, str]:

@@ -49,6 +49,9 @@ class ColourCamera:
         pass
 
 
+CONFIG = get_preset("debug")
+
+
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """Deploys a policy that bends joint 1, before a camera; (report, the folder it left, None if none)."""
@@ -56,13 +59,20 @@ def run(tmp_path, monkeypatch):
         tmp_path / "p.onnx", describe(profile=contract.D455.scaled(0.25)), bias=constant_bias(0.2)
     )
 
-    def deployed(camera=ColourCamera, say=lambda text: None, **changes):
+    def deployed(
+        camera=ColourCamera,
+        say=lambda text: None,
+        config=CONFIG,
+        camera_name="stereo",
+        **changes,
+    ):
         monkeypatch.setattr(
             session, "make_devices", lambda setup: (KinematicRobot(setup.clock), camera(setup.clock))
         )
-        options = replace(SessionOptions(seconds=0.5, out=tmp_path / "kept"), **changes)
+        options = SessionOptions(camera=camera_name, seconds=0.5, out=tmp_path / "kept")
+        options = replace(options, **changes)
         before = set(options.out.glob("*"))
-        report = session.deploy(get_preset("debug"), policy, options, say)
+        report = session.deploy(config, policy, options, say)
         (folder,) = set(options.out.glob("*")) - before or {None}
         return report, folder
 
@@ -403,6 +413,17 @@ def test_nor_is_the_report_cut_short_while_frames_go_to_the_disk(run, monkeypatc
     kept = json.loads((folder / "report.json").read_text())
     assert report.steps == len(Recording.open(folder)) == 5
     assert kept["success"] is True and not kept["fault"] and kept["frames"] == 5
+
+
+@pytest.mark.parametrize(
+    ("camera", "expected"), [("stereo", "stereo, other tables"), ("realsense", "realsense")]
+)
+def test_a_simulated_camera_before_other_tables_is_called_another(run, camera, expected):
+    config = get_preset("debug")
+    many = replace(config, record=replace(config.record, other_tables=True))
+    _, folder = run(config=many, camera_name=camera)
+    assert json.loads((folder / "report.json").read_text())["camera"] == expected
+    assert Recording.open(folder).meta["sensor"] == f"{expected}, D455 profile"
 
 
 def test_a_rig_knows_what_lies_there(run):
