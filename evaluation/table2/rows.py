@@ -21,8 +21,8 @@ PAPER_SAMPLING: dict[str, Any] = {"sampler": DDIM, "spacing": "linspace", "steps
 """The paper names DDPM and DDIM; docs/table2.md has what others of as many evaluations are off by."""
 ELLIPSES = 4.0
 """Holes of 30 pixels and more that the rig's camera, overexposed (`record.stereo.exposure_target` 0.7), has
-in a picture of 320x180 before other tables, without those at its left edge, which the right imager does not
-see (mean of 80 recordings' first pictures, 2026-11-29; their areas go from 30 to 1,300 pixels)."""
+in a picture of 320x180 before other tables, away from its left and upper edges (mean of 80 recordings' first
+pictures, opened by 5x5, 2026-11-29; their areas go from 30 to 1,300 pixels)."""
 HAND_MADE = ("disparity_noise_px", "edge_noise_px", "unseen_share")
 """Fields of `student.training` that add noise made by hand; 0 turns each off."""
 
