@@ -342,7 +342,7 @@ KEPT = PRETRAINED / "table2" / "trials"
                                              "sim_gt": (469, 8)}),
         ("development-9", {"sim_gt": (499, 3), "rand_noise": (62, 37), "inpaint": (141, 28),
                            "ddg_no_graft": (26, 34), "upper_bound": (24, 42)}),
-        ("fr3-test-10", {"inpaint": (8, 3)}),
+        ("fr3-test-10", {"rand_noise": (5, 3), "inpaint": (8, 3)}),
         ("fr3-test-3", {"sim_gt": (51, 3), "rand_noise": (4, 3), "inpaint": (10, 5),
                         "ddg_no_graft": (9, 3), "upper_bound": (7, 3)}),
     ],
@@ -358,6 +358,11 @@ def test_the_kept_logs_give_the_pairs_of_the_page(tmp_path, kept, rows_and_p):
     if kept == "development-test-10":
         ripple = _pairs(of["tables"]["ripple"])
         assert (ripple["ddg_ripple"], ripple["rand_noise_ripple"]) == ((19, 23), (46, 21))
+    if kept == "development-test-12-overexposed":
+        holes = _pairs(of["tables"]["ellipses"])
+        assert [holes[f"{row}_ellipses"] for row in ("sim_gt", "rand_noise", "ddg")] == [
+            (62, 37), (42, 42), (30, 43),
+        ]  # fmt: skip
 
 
 def _pairs(tests: Sequence[dict]) -> dict[str, tuple[int, int]]:
