@@ -254,10 +254,10 @@ def _own_depth(report: Mapping[str, Any]) -> str:
     """What the student was trained on, which is not always the generator's."""
     student = report["config"].get("student", {})
     source, ellipses = student.get("depth_source", "learned"), student.get("ellipse_dropout")
-    holes = f", {ellipses:g} elliptic holes a picture" if ellipses else ""
-    if source == "learned":
-        return "generated depth" + (f" ({holes[2:]})" if holes else "")
-    return f"depth of its training ({source}{holes})"
+    name = "generated depth" if source == "learned" else "depth of its training"
+    details = [source] if source != "learned" else []
+    details += [f"{ellipses:g} elliptic holes a picture"] if ellipses else []
+    return f"{name} ({', '.join(details)})" if details else name
 
 
 def perceived(student: Mapping[str, Any]) -> str:
