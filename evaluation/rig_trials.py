@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from ddgrasp import contract
 from ddgrasp.alone import alone_in
-from ddgrasp.config import Config
+from ddgrasp.config import Config, StereoConfig
 from ddgrasp.config_hash import config_hash
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
@@ -39,6 +39,8 @@ _SAME = ("rig", "shapes", "split", "number", "seconds", "ends", "rules")
 """What the headers of two logs agree on where trial i of an object is the same trial, besides `_DRAWS`."""
 _DRAWS = "draws_hash"
 _TRAINED = "trained"
+_STEREO = "stereo"
+"""What the rig's own camera is set to otherwise than a configuration that says nothing of it."""
 _ADDED = ("seconds", _DRAWS, _TRAINED)
 """What older headers do not name, those of `study causes` the seconds, and what `config_hash` covers or tells
 of the policy: a log goes on without."""
@@ -167,6 +169,8 @@ def run(
     series = series.before(config)
     header = _header(config, policy, series)
     config = series.configured(config, policy)
+    if set_to := _set_to(config):
+        progress.note(f"camera {series.camera}, its record.stereo set to {', '.join(set_to)}")
     make = series.make(config)
     if record:
         _check_recorded(out)
@@ -312,10 +316,17 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     trained, config = policy_objects(policy, config), series.configured(config, policy)
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
+    bench |= {_STEREO: set_to} if (set_to := _set_to(config)) else {}
     deploy = config.deploy
     return made_with(config, policy, trained) | bench | {
         "contact": deploy.franka.contact_force_n, "retry": deploy.retry,
     }  # fmt: skip
+
+
+def _set_to(config: Config) -> list[str]:
+    """ "exposure_target 0.7" for what `record.stereo` has otherwise than its defaults."""
+    given, usual = config.record.stereo, StereoConfig()
+    return [f"{k} {v}" for k, v in asdict(given).items() if v != getattr(usual, k)]
 
 
 def shown(header: Mapping[str, Any]) -> dict[str, Any]:
@@ -334,6 +345,8 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any], alike: Sequence[
     """
     one, other = shown(one), shown(other)
     known = (_DRAWS,) if _DRAWS in one and _DRAWS in other else ()
+    if known and one[_DRAWS] != other[_DRAWS]:  # says it in words, where a header does
+        known = (*known, _STEREO)
     covered = ("seconds",) if "config_hash" in alike else ()
     keys = [key for key in (*_SAME, *known, *alike) if key not in covered]
     pairs = {key: (one.get(key), other.get(key)) for key in keys}

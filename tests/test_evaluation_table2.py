@@ -310,6 +310,14 @@ def test_the_page_says_that_every_trial_has_a_table_of_its_own(tmp_path, camera,
     assert ("seed 0, each before a table of its own</h2>" in made) == said
 
 
+def test_the_page_says_that_the_camera_was_set_otherwise(tmp_path):
+    series = Series("development")
+    write_row(tmp_path, series, "ddg", {"apple": [True]}, stereo=["exposure_target 0.7", "read_noise 0.0"])
+    about = {"preset": "laptop", "created": "now", "machine": {"processor": "x"}, "left_out": {}}
+    made = page.render({**about, **results.collect(tmp_path)}, b"")
+    assert "seed 0, record.stereo set to exposure_target 0.7, read_noise 0.0</h2>" in made
+
+
 def test_where_the_reference_was_not_tried_the_first_row_says_what_is_otherwise(tmp_path):
     series = Series("development")
     for row, rules in (("sim_gt", 1), ("rand_noise", 2), ("paper_ddg", 2), ("paper_ddg_no_graft", 2)):

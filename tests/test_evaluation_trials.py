@@ -232,15 +232,26 @@ def test_a_header_says_what_the_policy_sees_and_what_its_trials_are_drawn_from(p
 
     assert header(depth="inpaint")["depth"] == "inpaint" and "depth" not in header()
     assert differing(header(depth="inpaint"), header()) == []
-    for section, changed in (
-        ("world", replace(CONFIG.world, random=replace(CONFIG.world.random, camera_position_m=0.03))),
-        ("world", replace(CONFIG.world, random=replace(CONFIG.world.random, joint_rad=0.0))),
-        ("record", replace(CONFIG.record, stereo=replace(CONFIG.record.stereo, lens_blur_px=1.0))),
-    ):
-        (found,) = differing(header(replace(CONFIG, **{section: changed})), header())
+    for changed in (dict(camera_position_m=0.03), dict(joint_rad=0.0)):
+        world = replace(CONFIG.world, random=replace(CONFIG.world.random, **changed))
+        (found,) = differing(header(replace(CONFIG, world=world)), header())
         assert found.startswith("draws_hash is ")
+    blurred = replace(CONFIG.record, stereo=replace(CONFIG.record.stereo, lens_blur_px=1.0))
+    found = differing(header(replace(CONFIG, record=blurred)), header())
+    assert found[0].startswith("draws_hash is ") and found[1:] == ["stereo is ['lens_blur_px 1.0'], not None"]
     trained_otherwise = replace(CONFIG, student=replace(CONFIG.student, depth_source="ideal"))
     assert differing(header(trained_otherwise), header()) == []
+
+
+def test_trials_before_a_camera_set_otherwise_say_so(tmp_path, policy, capsys):
+    stereo = replace(CONFIG.record.stereo, exposure_target=0.7)
+    config = replace(CONFIG, record=replace(CONFIG.record, stereo=stereo))
+    rig_trials.run(config, policy, SERIES, tmp_path / "set", 0, Progress())
+    assert "camera stereo, its record.stereo set to exposure_target 0.7" in capsys.readouterr().err
+    assert read_log(tmp_path / "set" / rig_trials.TRIALS_FILE)[0]["stereo"] == ["exposure_target 0.7"]
+    rig_trials.run(CONFIG, policy, SERIES, tmp_path / "own", 0, Progress())
+    assert "record.stereo" not in capsys.readouterr().err
+    assert "stereo" not in read_log(tmp_path / "own" / rig_trials.TRIALS_FILE)[0]
 
 
 def test_a_log_of_before_goes_on_and_keeps_its_header(tmp_path, policy):

@@ -92,9 +92,10 @@ def render(study: Mapping[str, Any], picture: bytes) -> str:
         ),
     ]
     for name in study["sets"]:
-        own = study["sets"][name]["trials"].get("camera") == "other_tables"
-        tables = ", each before a table of its own" if own else ""
-        body.append(f"<h2>Trials: {escape(describe_set(name))}{tables}</h2>")
+        trials = study["sets"][name]["trials"]
+        tables = ", each before a table of its own" if trials.get("camera") == "other_tables" else ""
+        set_to = f", record.stereo set to {', '.join(trials['stereo'])}" if "stereo" in trials else ""
+        body.append(f"<h2>Trials: {escape(describe_set(name) + tables + set_to)}</h2>")
         for key in _begun(study["sets"][name]["rows"]):
             of = TABLES[key]
             body.append(f"<h3>{of.title}, reference {ROWS[of.reference].title}</h3>")

@@ -111,7 +111,7 @@ def _set(folder: Path) -> dict[str, Any]:
     headers = {name: belong_to for name, (belong_to, _) in logs.items()}
     tried = {name: results for name, (_, results) in logs.items()}
     apart = {name: tried_otherwise(table, headers) for name, table in TABLES.items()}
-    same = ("rig", "split", "number", "shapes", "camera", "seconds", "contact")
+    same = ("rig", "split", "number", "shapes", "camera", "stereo", "seconds", "contact")
     belong_to = headers.get(TABLES["main"].reference) or next(iter(headers.values()), {})
     return {
         "trials": {key: value for key, value in rig_trials.shown(belong_to).items() if key in same},
