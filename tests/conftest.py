@@ -8,13 +8,14 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from jaxtyping import install_import_hook
+
+from typecheck_support import install as install_type_checks
 
 TYPED = (
     "mjx_envs", "learning", "ppo", "demos", "sensors", "rig", "foundation", "ddg_jax", "export", "deploy",
 )  # fmt: skip
 """Packages whose annotations, shapes among them, are checked in every call that a test makes."""
-install_import_hook(TYPED, "typecheck_support.checked")
+install_type_checks(TYPED)
 
 _CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 

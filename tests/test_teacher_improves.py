@@ -23,8 +23,9 @@ WORLD = WorldConfig(
 )  # fmt: skip
 """Episodes start with the apple in the open hand, anywhere up to the lift target: close, lift, hold."""
 TRIALS = 64
-SEED = 2
-"""Learns by iteration 30 or 40 of 60, whatever order XLA adds in; seed 1 never does in 60."""
+SEED = 3
+"""Learns by iteration 30 of 60, seed 4 by 35, seed 2 by 40, whatever order XLA adds in; seed 1 never does in
+60."""
 
 
 def test_ppo_from_nothing_learns_to_lift_and_hold():
@@ -39,7 +40,7 @@ def test_ppo_from_nothing_learns_to_lift_and_hold():
     after, metrics = 0, {}
     for iteration in range(1, TEACHER.iterations + 1):
         state, metrics, _ = iterate(state)
-        if iteration % 10 == 0 and (after := successes()) > 0.95 * TRIALS:
+        if iteration % 5 == 0 and (after := successes()) > 0.95 * TRIALS:
             break  # the bound is of its steps; most of the test's time is physics
     assert before < 0.2 * TRIALS
     assert after > 0.6 * TRIALS
