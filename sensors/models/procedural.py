@@ -130,15 +130,11 @@ def _interpolation(size: int, spacing_px: float) -> Array:
 
 def draw_sticks(key: Key, depth_m: Float[Array, "H W"], config: DextrahConfig) -> Float[Array, "H W"]:
     """Thin segments of one random depth each over (H, W): every pixel starts one with probability `stick`."""
-    height, width = depth_m.shape
-    most, share = _room(config.stick * height * width)
-    rows, columns = jnp.arange(height)[:, None] + 0.5, jnp.arange(width)[None, :] + 0.5
+    most, share = _room(config.stick * depth_m.size)
 
     def draw(i: Array, picture: Array) -> Array:
         row, column, angle, length, thick, value, there = jax.random.uniform(jax.random.fold_in(key, i), (7,))
-        v, u = rows - row * height, columns - column * width
-        sine, cosine = jnp.sin(2 * jnp.pi * angle), jnp.cos(2 * jnp.pi * angle)
-        along, across = u * cosine + v * sine, v * cosine - u * sine
+        along, across = _from(row, column, 2 * jnp.pi * angle, depth_m.shape)
         half_width = (1.0 + thick * (config.stick_width_px - 1.0)) / 2
         on = (along >= 0) & (along <= length * config.stick_length_px) & (jnp.abs(across) <= half_width)
         depth = config.random_near_m + value * (config.random_far_m - config.random_near_m)
@@ -151,20 +147,26 @@ def drop_ellipses(
     key: Key, depth_m: Float[Array, "H W"], expected: float, half_axis_px: float
 ) -> Float[Array, "H W"]:
     """(H, W) with elliptic holes: see `ellipse_dropout`."""
-    height, width = depth_m.shape
     most, share = _room(expected)
-    rows, columns = jnp.arange(height)[:, None] + 0.5, jnp.arange(width)[None, :] + 0.5
 
     def cut(i: Array, picture: Array) -> Array:
         row, column, angle, one, other, there = jax.random.uniform(jax.random.fold_in(key, i), (6,))
-        v, u = rows - row * height, columns - column * width
-        sine, cosine = jnp.sin(jnp.pi * angle), jnp.cos(jnp.pi * angle)
-        along, across = u * cosine + v * sine, v * cosine - u * sine
+        along, across = _from(row, column, jnp.pi * angle, depth_m.shape)
         half_axes = half_axis_px * SHORTEST_HALF_AXIS ** jnp.stack([one, other])
         inside = (along / half_axes[0]) ** 2 + (across / half_axes[1]) ** 2 <= 1
         return jnp.where(inside & (there < share), 0.0, picture)
 
     return jax.lax.fori_loop(0, most, cut, depth_m)
+
+
+def _from(row: Array, column: Array, angle_rad: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """(along, across), each (H, W) in pixels: where every pixel of a picture of that shape lies from the
+    place at the shares `row` of its height and `column` of its width, along a direction and across it."""
+    height, width = shape
+    v = jnp.arange(height)[:, None] + 0.5 - row * height
+    u = jnp.arange(width)[None, :] + 0.5 - column * width
+    sine, cosine = jnp.sin(angle_rad), jnp.cos(angle_rad)
+    return u * cosine + v * sine, v * cosine - u * sine
 
 
 def _room(expected: float) -> tuple[int, float]:
