@@ -11,6 +11,10 @@ import pytest
 
 from typecheck_support import install as install_type_checks
 
+# Python's own cache, whatever the shell says: without it every process that a test starts compiles anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 TYPED = (
     "mjx_envs", "learning", "ppo", "demos", "sensors", "rig", "foundation", "ddg_jax", "export", "deploy",
 )  # fmt: skip

@@ -114,7 +114,9 @@ def test_the_policy_sees_the_noise_that_is_chosen_now(tmp_path):
 
 def test_a_camera_that_knows_no_clean_depth_is_refused(tmp_path):
     class Real:
+        def start(self) -> None: ...
         def read(self) -> Frame: ...
+        def stop(self) -> None: ...
 
     with pytest.raises(UserError, match="needs a simulation"):
         TreatedCamera(Real(), _ChosenNoise(Controls(OBJECTS, "development"), tmp_path))

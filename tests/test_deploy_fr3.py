@@ -374,7 +374,7 @@ def test_limits_are_the_fr3_s_and_the_filter_keeps_them_before_the_arm_would(tmp
     """From so far away that joint 4 comes at full speed: it has to brake in time, too."""
     near = HOME_RAD.copy()
     near[3] = contract.FR3.joint_lower_rad[3] + 0.35
-    with Fr3Rig("127.0.0.14", primitive("cube"), q_rad=near) as rig:
+    with Fr3Rig("127.0.0.14", primitive("cube"), q_rad=near.tolist()) as rig:
         config = at_full_speed(config_for(rig.host))
         report = run_trial(tmp_path, config, joint_bias(j4=-1.0), steps=15)
         assert report.fault == "" and report.safety.by_cause["joint_position"] >= 10
@@ -415,7 +415,7 @@ def test_an_arm_that_gets_no_further_command_brakes_by_itself(rig):
 
 def test_start_asks_first_then_homes_and_moves_slowly_to_the_start_pose():
     away = HOME_RAD + np.array([0.03, 0, 0, 0, 0, 0, 0])
-    with Fr3Rig("127.0.0.15", primitive("cube"), q_rad=away) as rig:
+    with Fr3Rig("127.0.0.15", primitive("cube"), q_rad=away.tolist()) as rig:
         config = config_for(rig.host)
         asked = []
 
@@ -447,7 +447,7 @@ def test_start_asks_first_then_homes_and_moves_slowly_to_the_start_pose():
 
 def test_ctrl_c_on_the_way_to_the_start_pose_stops_the_arm(monkeypatch):
     away = HOME_RAD + np.array([0.5, 0, 0, 0, 0, 0, 0])
-    with Fr3Rig("127.0.0.16", primitive("cube"), q_rad=away) as rig:
+    with Fr3Rig("127.0.0.16", primitive("cube"), q_rad=away.tolist()) as rig:
         robot, _ = connect(config_for(rig.host), lambda question: None)
 
         def on_the_way(arm):
