@@ -109,6 +109,11 @@ def test_rows_with_holes_cut_by_hand_differ_in_them_alone():
         plain, holed = (rows.row_config(shared, ROWS[row]).student for row in (name, f"{name}_ellipses"))
         assert (plain.ellipse_dropout, holed.ellipse_dropout) == (0.0, rows.ELLIPSES)
         assert replace(holed, ellipse_dropout=0.0) == plain
+    for name in ("sim_gt", "rand_noise"):
+        filled, holed = (
+            rows.row_config(shared, ROWS[f"{name}{kind}_filled"]).student for kind in ("", "_ellipses")
+        )
+        assert filled.picture.fill_holes and replace(holed, ellipse_dropout=0.0) == filled
 
 
 def test_ripple_and_the_paper_s_generator_are_one_difference_each():

@@ -92,6 +92,12 @@ ROWS: dict[str, Row] = {
     "sim_gt_ellipses": Row("Sim GT, holes cut by hand", "ideal", ellipses=True),
     "rand_noise_ellipses": Row("Rand Noise, holes cut by hand", "dextrah", ellipses=True),
     "ddg_ellipses": Row("DDG, holes cut by hand", "learned", ellipses=True),
+    "sim_gt_ellipses_filled": Row(
+        "Sim GT, holes cut by hand and filled", "ideal", filled=True, ellipses=True
+    ),
+    "rand_noise_ellipses_filled": Row(
+        "Rand Noise, holes cut by hand and filled", "dextrah", filled=True, ellipses=True
+    ),
     "paper_ddg_no_graft": Row(
         "Paper's generator without grafting", "learned_ungrafted", paper_generator=True
     ),
@@ -111,7 +117,16 @@ TABLES: dict[str, Table] = {
     "filled": Table(
         "Holes as recorded, and filled by the student",
         "ddg_filled",
-        ("sim_gt", "sim_gt_filled", "rand_noise", "rand_noise_filled", "ddg", "ddg_filled"),
+        (
+            "sim_gt",
+            "sim_gt_filled",
+            "sim_gt_ellipses_filled",
+            "rand_noise",
+            "rand_noise_filled",
+            "rand_noise_ellipses_filled",
+            "ddg",
+            "ddg_filled",
+        ),
     ),
     "formulas": Table(
         "Formulas in pixels of the picture, and of one half as wide",
