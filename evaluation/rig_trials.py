@@ -41,9 +41,9 @@ _DRAWS = "draws_hash"
 _TRAINED = "trained"
 _STEREO = "stereo"
 """What the rig's own camera is set to otherwise than a configuration that says nothing of it."""
-_ADDED = ("seconds", _DRAWS, _TRAINED)
-"""What older headers do not name, those of `study causes` the seconds, and what `config_hash` covers or tells
-of the policy: a log goes on without."""
+_ADDED = ("seconds", _DRAWS, _TRAINED, _STEREO)
+"""What older headers do not name, those of `study causes` the seconds, and what `config_hash` covers, tells of
+the policy or `_DRAWS` stands for: a log goes on without."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def run(
     series = series.before(config)
     header = _header(config, policy, series)
     config = series.configured(config, policy)
-    if set_to := _set_to(config):
+    if series.camera != "ideal" and (set_to := _stereo_set_to(config)):
         progress.note(f"camera {series.camera}, its record.stereo set to {', '.join(set_to)}")
     make = series.make(config)
     if record:
@@ -316,15 +316,15 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     trained, config = policy_objects(policy, config), series.configured(config, policy)
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
-    bench |= {_STEREO: set_to} if (set_to := _set_to(config)) else {}
+    bench |= {_STEREO: set_to} if (set_to := _stereo_set_to(config)) else {}
     deploy = config.deploy
     return made_with(config, policy, trained) | bench | {
         "contact": deploy.franka.contact_force_n, "retry": deploy.retry,
     }  # fmt: skip
 
 
-def _set_to(config: Config) -> list[str]:
-    """ "exposure_target 0.7" for what `record.stereo` has otherwise than its defaults."""
+def _stereo_set_to(config: Config) -> list[str]:
+    """Settings of `record.stereo` that are not its defaults, each as "exposure_target 0.7"."""
     given, usual = config.record.stereo, StereoConfig()
     return [f"{k} {v}" for k, v in asdict(given).items() if v != getattr(usual, k)]
 

@@ -249,6 +249,12 @@ def test_trials_before_a_camera_set_otherwise_say_so(tmp_path, policy, capsys):
     rig_trials.run(config, policy, SERIES, tmp_path / "set", 0, Progress())
     assert "camera stereo, its record.stereo set to exposure_target 0.7" in capsys.readouterr().err
     assert read_log(tmp_path / "set" / rig_trials.TRIALS_FILE)[0]["stereo"] == ["exposure_target 0.7"]
+    log = tmp_path / "set" / rig_trials.TRIALS_FILE
+    header, *trials = log.read_text().splitlines(keepends=True)
+    before = {key: value for key, value in json.loads(header).items() if key != "stereo"}
+    log.write_text("".join([json.dumps(before) + "\n", *trials]))  # as begun before it was named
+    rig_trials.run(config, policy, replace(SERIES, trials=2), tmp_path / "set", 0, QUIET)
+    assert read_log(log)[0] == before and len(read_log(log)[1]) == 2
     rig_trials.run(CONFIG, policy, SERIES, tmp_path / "own", 0, Progress())
     assert "record.stereo" not in capsys.readouterr().err
     assert "stereo" not in read_log(tmp_path / "own" / rig_trials.TRIALS_FILE)[0]

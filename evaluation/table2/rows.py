@@ -115,7 +115,7 @@ TABLES: dict[str, Table] = {
         ("sim_gt", "sim_gt_ripple", "rand_noise", "rand_noise_ripple", "ddg", "ddg_ripple"),
     ),
     "filled": Table(
-        "Holes as recorded, and filled by the student",
+        "Holes as recorded, filled by the student, and cut by hand and filled",
         "ddg_filled",
         (
             "sim_gt",
