@@ -42,8 +42,8 @@ _TRAINED = "trained"
 _STEREO = "stereo"
 """What the rig's own camera is set to otherwise than a configuration that says nothing of it."""
 _ADDED = ("seconds", _DRAWS, _TRAINED, _STEREO)
-"""What older headers do not name, those of `study causes` the seconds, and what `config_hash` covers, tells of
-the policy or `_DRAWS` stands for: a log goes on without."""
+"""What older headers do not name, those of `study causes` the seconds, and what `config_hash` covers, tells
+of the policy or `_DRAWS` stands for: a log goes on without."""
 
 
 @dataclass(frozen=True)
