@@ -169,8 +169,8 @@ def run(
     series = series.before(config)
     header = _header(config, policy, series)
     config = series.configured(config, policy)
-    if series.camera != "ideal" and (set_to := _stereo_set_to(config)):
-        progress.note(f"camera {series.camera}, its record.stereo set to {', '.join(set_to)}")
+    if _STEREO in header:
+        progress.note(f"camera {series.camera}, its record.stereo set to {', '.join(header[_STEREO])}")
     make = series.make(config)
     if record:
         _check_recorded(out)
@@ -316,7 +316,8 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     trained, config = policy_objects(policy, config), series.configured(config, policy)
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
-    bench |= {_STEREO: set_to} if (set_to := _stereo_set_to(config)) else {}
+    if series.camera != "ideal" and (set_to := _stereo_set_to(config)):
+        bench[_STEREO] = set_to
     deploy = config.deploy
     return made_with(config, policy, trained) | bench | {
         "contact": deploy.franka.contact_force_n, "retry": deploy.retry,

@@ -255,6 +255,8 @@ def test_trials_before_a_camera_set_otherwise_say_so(tmp_path, policy, capsys):
     log.write_text("".join([json.dumps(before) + "\n", *trials]))  # as begun before it was named
     rig_trials.run(config, policy, replace(SERIES, trials=2), tmp_path / "set", 0, QUIET)
     assert read_log(log)[0] == before and len(read_log(log)[1]) == 2
+    without_errors = replace(SERIES, camera="ideal")
+    assert "stereo" not in rig_trials._header(config, policy, without_errors)  # has no such camera
     rig_trials.run(CONFIG, policy, SERIES, tmp_path / "own", 0, Progress())
     assert "record.stereo" not in capsys.readouterr().err
     assert "stereo" not in read_log(tmp_path / "own" / rig_trials.TRIALS_FILE)[0]

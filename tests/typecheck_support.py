@@ -2,7 +2,7 @@
 function of some packages by jaxtyping's import hook (conftest.py).
 
 The hook's own decorator checks arguments twice and binds them by `inspect` in every call, whatever they are:
-a fifth of the suite's CPU time.
+17 of 66 s of CPU time in five files with 209 tests (two AMD EPYC cores, 2026-11-29).
 """
 
 import functools
@@ -45,8 +45,6 @@ def _decorated(of: Any = None, *, typechecker: Any) -> Any:
     """In the place of `jaxtyping.jaxtyped`: what it is put onto, checked alike."""
     if of is None:
         return functools.partial(_decorated, typechecker=typechecker)
-    if isinstance(of, classmethod | staticmethod):
-        return type(of)(_decorated(of.__func__, typechecker=typechecker))
     if not inspect.isfunction(of):
         return _jaxtyped(of, typechecker=typechecker)
     if not of.__annotations__:
