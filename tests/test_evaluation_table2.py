@@ -116,6 +116,14 @@ def test_rows_with_holes_cut_by_hand_differ_in_them_alone():
         assert filled.picture.fill_holes and replace(holed, ellipse_dropout=0.0) == filled
 
 
+def test_ripple_filled_differs_from_ripple_in_who_fills_the_holes():
+    shared = rows.shared_config(LAPTOP)
+    plain, filled = (rows.row_config(shared, ROWS[row]) for row in ("sim_gt_ripple", "sim_gt_ripple_filled"))
+    assert plain.student.training == filled.student.training == LAPTOP.student.training
+    picture = replace(plain.student.picture, fill_holes=True)
+    assert filled == replace(plain, student=replace(plain.student, picture=picture))
+
+
 def test_ripple_and_the_paper_s_generator_are_one_difference_each():
     shared = rows.shared_config(LAPTOP)
     rippled = rows.row_config(shared, ROWS["ddg_ripple"])

@@ -92,6 +92,7 @@ ROWS: dict[str, Row] = {
     "sim_gt_ellipses": Row("Sim GT, holes cut by hand", "ideal", ellipses=True),
     "rand_noise_ellipses": Row("Rand Noise, holes cut by hand", "dextrah", ellipses=True),
     "ddg_ellipses": Row("DDG, holes cut by hand", "learned", ellipses=True),
+    "sim_gt_ripple_filled": Row("Sim GT, ripple, holes filled", "ideal", ripple=True, filled=True),
     "sim_gt_ellipses_filled": Row(
         "Sim GT, holes cut by hand and filled", "ideal", filled=True, ellipses=True
     ),
@@ -115,11 +116,12 @@ TABLES: dict[str, Table] = {
         ("sim_gt", "sim_gt_ripple", "rand_noise", "rand_noise_ripple", "ddg", "ddg_ripple"),
     ),
     "filled": Table(
-        "Holes as recorded, filled by the student, and cut by hand and filled",
+        "Holes as recorded and filled by the student; filled, with ripple or holes made by hand",
         "ddg_filled",
         (
             "sim_gt",
             "sim_gt_filled",
+            "sim_gt_ripple_filled",
             "sim_gt_ellipses_filled",
             "rand_noise",
             "rand_noise_filled",
