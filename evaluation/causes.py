@@ -152,8 +152,10 @@ def run(
         "number": series.number,
         "seconds": series.seconds,
     }
-    headers = {name: belong_to | {"row": name} for name in names}
     about = {"number": series.number, "policy": str(policy), "other_tables": config.record.other_tables}
+    if set_to := rig_trials.stereo_set_to(config):
+        belong_to[rig_trials.STEREO] = about[rig_trials.STEREO] = set_to
+    headers = {name: belong_to | {"row": name} for name in names}
     if generated := [name for name in names if ROWS[name].generated]:
         drawn_by = {"generator_sha256": digest(generator, config.world.profile)}
         headers |= {name: headers[name] | drawn_by for name in generated}
@@ -163,7 +165,8 @@ def run(
     made: dict[str, Any] = {}
     for place, name in enumerate(names, 1):
         folder, progress = out / name, Progress(name=name)
-        progress.note(f"row {place} of {len(names)}: {ROWS[name].title}")
+        camera = f" ({rig_trials.describe_stereo(set_to)})" if set_to else ""
+        progress.note(f"row {place} of {len(names)}: {ROWS[name].title}{camera}")
         known = len(_known(folder))
         begun = time.monotonic()
         rig_trials.run_missing(
@@ -192,7 +195,9 @@ def write(out: Path, about: Mapping[str, Any]) -> dict[str, Any]:
         "rows": table(out),
     }
     atomic_write_json(out / JSON_FILE, made)
-    atomic_write_text(out / TABLE_FILE, markdown(made["rows"]))
+    camera = about.get(rig_trials.STEREO)
+    head = f"The rig's camera has {rig_trials.describe_stereo(camera)}:\n\n" if camera else ""
+    atomic_write_text(out / TABLE_FILE, head + markdown(made["rows"]))
     return made
 
 

@@ -39,9 +39,9 @@ _SAME = ("rig", "shapes", "split", "number", "seconds", "ends", "rules")
 """What the headers of two logs agree on where trial i of an object is the same trial, besides `_DRAWS`."""
 _DRAWS = "draws_hash"
 _TRAINED = "trained"
-_STEREO = "stereo"
+STEREO = "stereo"
 """What the rig's own camera is set to otherwise than a configuration that says nothing of it."""
-_ADDED = ("seconds", _DRAWS, _TRAINED, _STEREO)
+_ADDED = ("seconds", _DRAWS, _TRAINED, STEREO)
 """What older headers do not name, those of `study causes` the seconds, and what `config_hash` covers, tells
 of the policy or `_DRAWS` stands for: a log goes on without."""
 
@@ -169,8 +169,8 @@ def run(
     series = series.before(config)
     header = _header(config, policy, series)
     config = series.configured(config, policy)
-    if _STEREO in header:
-        progress.note(f"camera {series.camera}, its record.stereo set to {', '.join(header[_STEREO])}")
+    if STEREO in header:
+        progress.note(f"camera {series.camera}, its {describe_stereo(header[STEREO])}")
     make = series.make(config)
     if record:
         _check_recorded(out)
@@ -316,18 +316,23 @@ def _header(config: Config, policy: Path, series: Series) -> dict[str, Any]:
     trained, config = policy_objects(policy, config), series.configured(config, policy)
     left_out = {"objects", "trials"} | ({"depth"} if series.depth == RECORDED else set())
     bench = {key: value for key, value in asdict(series).items() if key not in left_out}
-    if series.camera != "ideal" and (set_to := _stereo_set_to(config)):
-        bench[_STEREO] = set_to
+    if series.camera != "ideal" and (set_to := stereo_set_to(config)):
+        bench[STEREO] = set_to
     deploy = config.deploy
     return made_with(config, policy, trained) | bench | {
         "contact": deploy.franka.contact_force_n, "retry": deploy.retry,
     }  # fmt: skip
 
 
-def _stereo_set_to(config: Config) -> list[str]:
+def stereo_set_to(config: Config) -> list[str]:
     """Settings of `record.stereo` that are not its defaults, each as "exposure_target 0.7"."""
     given, usual = config.record.stereo, StereoConfig()
     return [f"{k} {v}" for k, v in asdict(given).items() if v != getattr(usual, k)]
+
+
+def describe_stereo(set_to: Sequence[str]) -> str:
+    """`stereo_set_to` as people read it."""
+    return f"record.stereo set to {', '.join(set_to)}"
 
 
 def shown(header: Mapping[str, Any]) -> dict[str, Any]:
@@ -347,7 +352,7 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any], alike: Sequence[
     one, other = shown(one), shown(other)
     known = (_DRAWS,) if _DRAWS in one and _DRAWS in other else ()
     if known and one[_DRAWS] != other[_DRAWS]:  # says it in words, where a header does
-        known = (*known, _STEREO)
+        known = (*known, STEREO)
     covered = ("seconds",) if "config_hash" in alike else ()
     keys = [key for key in (*_SAME, *known, *alike) if key not in covered]
     pairs = {key: (one.get(key), other.get(key)) for key in keys}

@@ -9,6 +9,7 @@ from evaluation.failure_modes import MODES, NOTE
 from evaluation.paired import describe_p
 from evaluation.report import success_chart
 from evaluation.report.html import image, page, table
+from evaluation.rig_trials import STEREO, describe_stereo
 from evaluation.table2.results import describe_set
 from evaluation.table2.rows import DEPLOYED, ROWS, TABLES, TRAINING
 
@@ -94,7 +95,7 @@ def render(study: Mapping[str, Any], picture: bytes) -> str:
     for name in study["sets"]:
         trials = study["sets"][name]["trials"]
         tables = ", each before a table of its own" if trials.get("camera") == "other_tables" else ""
-        set_to = f", record.stereo set to {', '.join(trials['stereo'])}" if "stereo" in trials else ""
+        set_to = f", {describe_stereo(trials[STEREO])}" if STEREO in trials else ""
         body.append(f"<h2>Trials: {escape(describe_set(name) + tables + set_to)}</h2>")
         for key in _begun(study["sets"][name]["rows"]):
             of = TABLES[key]
