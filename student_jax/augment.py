@@ -7,12 +7,13 @@ of what it had lifted, and on ideal depth never. So training ripples them.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Key
+from jaxtyping import Bool, Float, Int, Key
 
+from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
 from ddgrasp.contract import CameraProfile
 from mjx_envs.camera import nominal_camera
-from student_jax.preprocess import table_depth
+from student_jax.preprocess import cut, table_depth
 
 CORRELATION_PX = 2
 """Neighbouring pixels share their matching window; the rig's residuals correlate by 0.65 at one pixel."""
@@ -40,10 +41,11 @@ LYING_M = 0.08
 
 def disparity_noise(
     key: Key[jax.Array, ""],
-    depth_m: Float[jax.Array, "B F H W"],
+    depth_m: Float[jax.Array, "B F h w"],
+    first_px: Int[AnyArray, "#B 2"],
     profile: CameraProfile,
     config: StudentConfig,
-) -> Float[jax.Array, "B F H W"]:
+) -> Float[jax.Array, "B F h w"]:
     """Depth with correlated disparity noise, with it a few wrong matches, and more of it at edges.
 
     disparity = f b / depth, so that depth errors grow with the square of depth (Nguyen et al. 2012). Each
@@ -51,41 +53,45 @@ def disparity_noise(
     variance stays the same in all frames of a stack, as a camera's does.
 
     Args:
-        depth_m: (B, F, H, W) planar metres, 0 = invalid.
+        depth_m: (B, F, h, w) planar metres, 0 = invalid; a part of the frames, or all.
+        first_px: (B, 2) where it begins in the full frame, row and column.
 
     Returns:
         The same shape; invalid pixels stay so.
     """
     batch, frames, height, width = depth_m.shape
-    k_strength, k_shared, k_own, k_where, k_wrong, k_edges = jax.random.split(key, 6)
+    k_strength, k_shared, k_own, k_wrong, k_edges = jax.random.split(key, 5)
     coarse = (batch, frames, -(-height // CORRELATION_PX), -(-width // CORRELATION_PX))
     field = _half_shared(k_shared, k_own, coarse)
     strength = config.training.disparity_noise_px * jax.random.uniform(k_strength, (batch, 1, 1, 1))
-    share = SPURIOUS_SHARE if config.training.disparity_noise_px else 0.0
-    wrong = jax.random.bernoulli(k_where, share, coarse)
-    field = strength * field + wrong * jax.random.uniform(k_wrong, coarse, minval=-1.0) * SPURIOUS_PX
+    field = strength * field
+    if config.training.disparity_noise_px:
+        chance = jax.random.uniform(k_wrong, coarse)  # says which cells, and among those uniformly how much
+        wrong_px = SPURIOUS_PX * (2.0 * chance / SPURIOUS_SHARE - 1.0)
+        field += jnp.where(chance < SPURIOUS_SHARE, wrong_px, 0.0)
     field = _enlarged(field, CORRELATION_PX, height, width)
     fb = profile.fx_px * profile.baseline_m
-    disparity = fb / jnp.maximum(depth_m, 1e-3)
     if config.training.edge_noise_px:
-        field += _edge_noise(k_edges, disparity, depth_m > 0, profile, config)
-    disparity += field
-    return jnp.where(depth_m > 0, fb / jnp.maximum(disparity, _MIN_DISPARITY_PX), 0.0)
+        table_m = cut(table_depth(profile, config.picture.max_depth_m)[None, None], first_px, (height, width))
+        above_px = fb / jnp.maximum(depth_m, 1e-3) - fb / table_m
+        field += _edge_noise(k_edges, above_px, depth_m > 0, config)
+    # fb / (fb / depth + field), with one division and 0 where depth is 0.
+    return depth_m * fb / jnp.maximum(fb + depth_m * field, depth_m * _MIN_DISPARITY_PX)
 
 
 def _edge_noise(
     key: Key[jax.Array, ""],
-    disparity_px: Float[jax.Array, "B F H W"],
+    above_px: Float[jax.Array, "B F H W"],
     valid: Bool[jax.Array, "B F H W"],
-    profile: CameraProfile,
     config: StudentConfig,
 ) -> Float[jax.Array, "B F H W"]:
-    """Disparity errors at edges, one a cell of EDGE_CELL_PX, half of it the same in all frames."""
-    _, _, height, width = disparity_px.shape
-    table = profile.fx_px * profile.baseline_m / table_depth(profile, config.picture.max_depth_m)
-    highest, lowest = (
-        _around(_cells(jnp.where(valid, sign * (disparity_px - table), -jnp.inf))) for sign in (1.0, -1.0)
-    )
+    """Disparity errors at edges, one a cell of EDGE_CELL_PX, half of it the same in all frames.
+
+    Args:
+        above_px: disparity, less the empty table's.
+    """
+    _, _, height, width = above_px.shape
+    highest, lowest = (_around(_cells(jnp.where(valid, sign * above_px, -jnp.inf))) for sign in (1.0, -1.0))
     edge = jnp.clip((highest + lowest) / EDGE_RELIEF_PX, 0.0, 1.0)  # a sum: each is of its own sign
     k_strength, k_shared, k_own = jax.random.split(key, 3)
     noise = _half_shared(k_shared, k_own, edge.shape)
@@ -120,38 +126,44 @@ def _enlarged(cells: Float[jax.Array, "B F h w"], cell_px: int, height: int, wid
 
 def unseen_objects(
     key: Key[jax.Array, ""],
-    depth_m: Float[jax.Array, "B F H W"],
+    depth_m: Float[jax.Array, "B F h w"],
+    first_px: Int[AnyArray, "#B 2"],
     grasp_m: Float[jax.Array, "B 3"],
     profile: CameraProfile,
     config: StudentConfig,
-) -> Float[jax.Array, "B F H W"]:
+) -> Float[jax.Array, "B F h w"]:
     """Depth in which a share of the objects that lie on the table is a hole in every frame.
 
     A stereo camera finds nothing on what is dark or thin (the rig's tyre, a starfruit): the hole is all there
     is to see of it. Parts of a hand that is about to grasp go too.
 
     Args:
-        depth_m: (B, F, H, W) planar metres, 0 = invalid.
+        depth_m: (B, F, h, w) planar metres, 0 = invalid; a part of the frames, or all.
+        first_px: (B, 2) where it begins in the full frame, row and column.
         grasp_m: (B, 3) where to grasp, world frame.
     """
     chosen = jax.random.bernoulli(key, config.training.unseen_share, depth_m.shape[:1])
     chosen &= grasp_m[:, 2] < LYING_M
-    hole = _grown(_of_object(depth_m, grasp_m, profile)) & chosen[:, None, None, None]
+    hole = _grown(_of_object(depth_m, first_px, grasp_m, profile)) & chosen[:, None, None, None]
     return jnp.where(hole, 0.0, depth_m)
 
 
 def _of_object(
-    depth_m: Float[jax.Array, "B F H W"], grasp_m: Float[jax.Array, "B 3"], profile: CameraProfile
-) -> Bool[jax.Array, "B F H W"]:
+    depth_m: Float[jax.Array, "B F h w"],
+    first_px: Int[AnyArray, "#B 2"],
+    grasp_m: Float[jax.Array, "B 3"],
+    profile: CameraProfile,
+) -> Bool[jax.Array, "B F h w"]:
     camera = nominal_camera(profile)
     x = (np.arange(profile.width_px) + 0.5 - profile.cx_px) / profile.fx_px
     y = (np.arange(profile.height_px) + 0.5 - profile.cy_px) / profile.fy_px
-    ray = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(y), len(x)))], axis=-1)
-    ray = np.asarray(ray @ camera.T_world_cam[:3, :3].T, np.float32)
+    ray = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(y), len(x)))])
+    ray = np.tensordot(camera.T_world_cam[:3, :3], ray, 1).astype(np.float32)[None]
+    ray = cut(ray, first_px, (depth_m.shape[2], depth_m.shape[3]))[:, :, None]
     start = np.asarray(camera.T_world_cam[:3, 3], np.float32)
     grasp = grasp_m[:, None, None, None, :]
-    away = [start[i] + depth_m * ray[..., i] - grasp[..., i] for i in range(2)]
-    height = start[2] + depth_m * ray[..., 2]
+    away = [start[i] + depth_m * ray[:, i] - grasp[..., i] for i in range(2)]
+    height = start[2] + depth_m * ray[:, 2]
     low, above = UNSEEN_ABOVE_M
     square = away[0] ** 2 + away[1] ** 2
     around = (square > UNSEEN_RADIUS_M**2) & (square < (2 * UNSEEN_RADIUS_M) ** 2)

@@ -128,7 +128,8 @@ def cut(
     count, pitch = config.hand_view.size_px, config.hand_view.pitch_m
     rows = sampling_matrix(centre[:, 0], pitch * per_metre[:, 0], count, config.picture.height_px)
     columns = sampling_matrix(centre[:, 1], pitch * per_metre[:, 1], count, config.picture.width_px)
-    seen = jnp.einsum("bij,bjkc,blk->bilc", rows, picture, columns)
+    # Rows first: they are next to each other in memory, and fewer are left for the columns.
+    seen = jnp.einsum("bikc,blk->bilc", jnp.einsum("bij,bjkc->bikc", rows, picture), columns)
     frames = seen.reshape(*seen.shape[:3], -1, len(config.picture.channels))
     valid = config.picture.channels.index("valid")
     coverage = frames[..., valid : valid + 1]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int32
+from jaxtyping import Float, Float32, Int, Int32, Shaped
 
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
@@ -124,6 +124,34 @@ def pixel_coordinates(
     return centres(window.rows), centres(window.columns)
 
 
+def first_pixel(
+    crop_rc: Int[AnyArray, "B 2"] | None, profile: CameraProfile, config: StudentConfig
+) -> Int[AnyArray, "#B 2"]:
+    """(B, 2), or a NumPy constant (1, 2) for the centred window: (row, column) in the full frame of the first
+    pixel that the encoder sees."""
+    window = plan_window(profile, config)
+    starts = np.array([window.rows.start, window.columns.start])
+    if crop_rc is None:
+        return (profile.crop_origin_px + starts)[None]
+    return clip_crop(crop_rc, profile) + starts
+
+
+def cut(
+    frames: Shaped[AnyArray, "#B F H W"], first_px: Int[AnyArray, "#B 2"], size: tuple[int, int]
+) -> Shaped[jax.Array, "#B F h w"]:
+    """(B, F, *size) of the frames (B or 1, F, H, W), of any type, from the pixel `first_px` on."""
+    if isinstance(first_px, np.ndarray) and len(first_px) == 1:  # a slice that is known beforehand
+        row, column = first_px[0]
+        return jnp.asarray(frames)[..., row : row + size[0], column : column + size[1]]
+
+    def one(stack: AnyArray, first: AnyArray) -> jax.Array:
+        return jax.lax.dynamic_slice(stack, (0, first[0], first[1]), (len(stack), *size))
+
+    if len(frames) == 1:
+        return jax.vmap(one, (None, 0))(frames[0], first_px)
+    return jax.vmap(one)(frames, first_px)
+
+
 @exact
 def prepare_depth(
     depth_m: AnyArray, crop_rc: Int[AnyArray, "B 2"] | None, profile: CameraProfile, config: StudentConfig
@@ -131,7 +159,8 @@ def prepare_depth(
     """Depth frames as the encoder's picture.
 
     Args:
-        depth_m: (B, 3, H, W) planar metres, 0 or non-finite where invalid, oldest frame first.
+        depth_m: (B, 3, H, W) planar metres, 0 or non-finite where invalid, oldest frame first; or of that the
+            part that the encoder sees, from `cut`.
         crop_rc: (B, 2) integer (row, column) of each sample's crop window, clipped into the frame;
             None takes the centred window (what the exported policy does).
         profile: the camera that took the frames; H and W must be its own.
@@ -142,15 +171,17 @@ def prepare_depth(
         [RELIEF_MIN, RELIEF_MAX] and 0 where invalid; valid is 0 or 1; depth is in metres, 0 where invalid.
         With `fill_holes` all of a frame is valid, unless none of it is.
     """
+    window = plan_window(profile, config)
     expected = (contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
-    if depth_m.shape[1:] != expected:
+    seen = (contract.DEPTH_FRAMES, window.rows.length, window.columns.length)
+    if depth_m.shape[1:] not in (expected, seen):
         wanted = ", ".join(map(str, expected))
         raise UserError(f"Depth has shape {tuple(depth_m.shape)}; expected (B, {wanted}).")
-    window = plan_window(profile, config)
-    table = jnp.asarray(table_depth(profile, config.picture.max_depth_m))
-    depth, table = _cut(clean_depth(depth_m, config), table, crop_rc, profile, window)
+    table = jnp.asarray(table_depth(profile, config.picture.max_depth_m))[None, None]
+    first_px = first_pixel(crop_rc, profile, config)
+    depth = clean_depth(depth_m if depth_m.shape[1:] == seen else cut(depth_m, first_px, seen[1:]), config)
     valid = (depth > 0).astype(jnp.float32)
-    relief = (table[:, None] - depth) / RELIEF_SCALE_M
+    relief = (cut(table, first_px, seen[1:]) - depth) / RELIEF_SCALE_M
     relief, depth, valid = _resize_masked(relief, depth, valid, window, "depth" in config.picture.channels)
     if config.picture.fill_holes:
         relief = filled(relief, valid)
@@ -159,7 +190,8 @@ def prepare_depth(
     planes = {"relief": jnp.clip(relief, RELIEF_MIN, RELIEF_MAX) * valid, "valid": valid, "depth": depth}
     stacked = jnp.stack([planes[name] for name in config.picture.channels], axis=-1)  # (B, 3, h, w, C)
     picture = jnp.moveaxis(stacked, 1, 3)
-    return picture.reshape(*picture.shape[:3], -1)
+    # Behind a barrier: else a CPU turns the picture around once for each of those that read it.
+    return jax.lax.optimization_barrier(picture.reshape(*picture.shape[:3], -1))
 
 
 def filled(
@@ -189,25 +221,6 @@ def _sum_3x3(x: AnyArray) -> jax.Array:
     x = jnp.pad(x, ((0, 0), (0, 0), (1, 1), (1, 1)))
     x = x[:, :, :-2] + x[:, :, 1:-1] + x[:, :, 2:]
     return x[..., :-2] + x[..., 1:-1] + x[..., 2:]
-
-
-def _cut(
-    depth: AnyArray, table: AnyArray, crop_rc: AnyArray | None, profile: CameraProfile, window: Window
-) -> tuple[jax.Array, jax.Array]:
-    """Window of the frames (B, 3, r, c) and the same window of the table's depth (B or 1, r, c)."""
-    rows, columns = window
-    if crop_rc is None:
-        row, column = profile.crop_origin_px[0] + rows.start, profile.crop_origin_px[1] + columns.start
-        part = np.s_[..., row : row + rows.length, column : column + columns.length]
-        return depth[part], table[part][None]
-    first = clip_crop(crop_rc, profile) + jnp.array([rows.start, columns.start])
-
-    def cut_one(frames: AnyArray, start: AnyArray) -> jax.Array:
-        size = (frames.shape[0], rows.length, columns.length)
-        return jax.lax.dynamic_slice(frames, (0, start[0], start[1]), size)
-
-    frames = jax.vmap(cut_one)(depth, first)
-    return frames, jax.vmap(lambda start: cut_one(table[None], start)[0])(first)
 
 
 def _resize_masked(

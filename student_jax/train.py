@@ -32,6 +32,7 @@ from student_jax.policy import (
     position_to_world,
     sample_from_seen,
 )
+from student_jax.preprocess import cut, first_pixel, plan_window
 
 WARMUP_STEPS = 100
 FINAL_LEARNING_RATE = 0.02
@@ -134,6 +135,18 @@ def _ripples(config: StudentConfig) -> bool:
     return bool(config.training.disparity_noise_px or config.training.edge_noise_px)
 
 
+def _seen_part(
+    config: StudentConfig,
+    profile: CameraProfile,
+    depth_mm: UInt16[AnyArray, "B 3 H W"],
+    crop_rc: Int[AnyArray, "B 2"],
+) -> tuple[Float[Array, "B 3 h w"], Int[AnyArray, "B 2"]]:
+    """Metres in the part of the frames that the encoder sees, and its first pixel: noise for the other
+    three quarters would be drawn in vain."""
+    window, first_px = plan_window(profile, config), first_pixel(crop_rc, profile, config)
+    return to_metres(cut(depth_mm, first_px, (window.rows.length, window.columns.length))), first_px
+
+
 def aux_losses(seen: Aux, target: Aux) -> dict[str, Float[Array, ""]]:
     """Position (Huber, network units), yaw (squared), held (cross-entropy)."""
     return {
@@ -151,12 +164,12 @@ def train_step(
     """One optimiser step on pictures. Pure: noise comes from `step_key`."""
     policy = StudentPolicy(config, profile)
     key, k_noise, k_unseen = jax.random.split(step_key(state), 3)
-    depth_m = to_metres(batch.depth_mm)
+    depth_m, first_px = _seen_part(config, profile, batch.depth_mm, batch.crop_rc)
     if _ripples(config):
-        depth_m = disparity_noise(k_noise, depth_m, profile, config)
+        depth_m = disparity_noise(k_noise, depth_m, first_px, profile, config)
     if config.training.unseen_share:
         grasp_m = position_to_world(batch.aux.position)
-        depth_m = unseen_objects(k_unseen, depth_m, grasp_m, profile, config)
+        depth_m = unseen_objects(k_unseen, depth_m, first_px, grasp_m, profile, config)
 
     def loss_fn(params):
         params = params | frozen
@@ -189,9 +202,9 @@ def encode(
     key: Key[Array, ""] | None = None,
 ) -> Any:
     """`policy.Seen` of a batch; with `key`, under the disparity noise of training, if it has any."""
-    depth_m = to_metres(depth_mm)
+    depth_m, first_px = _seen_part(config, profile, depth_mm, crop_rc)
     if key is not None and _ripples(config):
-        depth_m = disparity_noise(key, depth_m, profile, config)
+        depth_m = disparity_noise(key, depth_m, first_px, profile, config)
     return StudentPolicy(config, profile).apply({"params": params}, depth_m, state, crop_rc, method="encode")
 
 

@@ -38,7 +38,7 @@ from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gri
 from student_jax.depth_source import make_source
 from student_jax.frames_io import useful_steps
 from student_jax.policy import PARAMS_FILE, Aux, Seen, init_params, position_to_world
-from student_jax.preprocess import table_depth
+from student_jax.preprocess import cut, first_pixel, table_depth
 from student_jax.privileged import PoseActor, noisy_seen
 
 PROFILE = contract.D455.scaled(0.25)
@@ -216,14 +216,20 @@ def test_a_step_shows_the_network_depth_with_noise_and_without_unseen_objects(
     """Both (tests of their own are below) as marks that can be told apart."""
     grasps = []
 
-    def unseen(key, depth_m, grasp_m, profile, config):
+    def unseen(key, depth_m, first_px, grasp_m, profile, config):
         grasps.append(grasp_m)
         return 2.0 * depth_m
 
-    monkeypatch.setattr(train, "disparity_noise", lambda key, depth_m, profile, config: depth_m + 1.0)
+    monkeypatch.setattr(train, "disparity_noise", lambda key, depth_m, *given: depth_m + 1.0)
     monkeypatch.setattr(train, "unseen_objects", unseen)
     batch, shown, _ = _blind_step(monkeypatch, **PLAIN | settings)
-    np.testing.assert_array_equal(shown, expected(to_metres(batch.depth_mm)))
+    parts = [
+        depth[:, row : row + shown.shape[2], column : column + shown.shape[3]]
+        for depth, (row, column) in zip(
+            np.asarray(batch.depth_mm), first_pixel(batch.crop_rc, PROFILE, CONFIG), strict=True
+        )
+    ]
+    np.testing.assert_array_equal(shown, expected(to_metres(np.stack(parts))))
     for grasp_m in grasps:
         np.testing.assert_allclose(grasp_m[:, 0], 0.4 + np.arange(4) / 50, atol=1e-5)
 
@@ -469,13 +475,55 @@ def test_executing_more_than_a_chunk_is_refused():
         dataclasses.replace(CONFIG.head, execute_steps=3)
 
 
+WHOLE = np.zeros((1, 2), np.int32)
+"""First pixel of frames that are no part of any."""
+
+
+def _parts_of_a_block() -> tuple[np.ndarray, jax.Array, np.ndarray, tuple[int, int], tuple[int, int]]:
+    """A block on the empty table: the frame, the whole stacks, first pixels and size of a part of each, and
+    the block's first pixel."""
+    depth = np.array(table_depth(PROFILE, 2.5), np.float32)
+    row, column = PROFILE.height_px // 2, PROFILE.width_px // 2
+    depth[row : row + 4, column : column + 4] -= 0.05
+    stack = jnp.asarray(depth)[None, None].repeat(2, 0).repeat(3, 1)
+    first_px = np.array([[row - 32, column - 40], [row - 20, column - 28]])
+    return depth, stack, first_px, (64, 80), (row, column)
+
+
+def test_edges_of_a_part_of_the_frames_are_told_by_the_table_that_lies_there():
+    noise = dataclasses.replace(CONFIG.training, disparity_noise_px=0.0, edge_noise_px=1.0)
+    config = dataclasses.replace(CONFIG, training=noise)
+    _, stack, first_px, size, block = _parts_of_a_block()
+    part = cut(stack, first_px, size)
+    made = disparity_noise(jax.random.key(0), part, first_px, PROFILE, config)
+    changed = np.abs(np.asarray(made - part)) > 1e-4
+    near = np.zeros(changed.shape, bool)
+    for i, (row, column) in enumerate(block - first_px):
+        near[i, :, row - 8 : row + 12, column - 8 : column + 12] = True
+    assert changed[near].any() and not changed[~near].any()
+
+
+def test_an_unseen_object_in_a_part_of_the_frames_is_found_where_it_lies():
+    config = dataclasses.replace(CONFIG, training=dataclasses.replace(CONFIG.training, unseen_share=1.0))
+    depth, stack, first_px, size, (row, column) = _parts_of_a_block()
+    x, y = (column + 2 - PROFILE.cx_px) / PROFILE.fx_px, (row + 2 - PROFILE.cy_px) / PROFILE.fy_px
+    camera = nominal_camera(PROFILE).T_world_cam
+    place = camera[:3, 3] + camera[:3, :3] @ [x, y, 1.0] * depth[row + 2, column + 2]
+    grasp = jnp.asarray(place, jnp.float32)[None].repeat(2, 0)
+    part = cut(stack, first_px, size)
+    whole = unseen_objects(jax.random.key(0), stack, WHOLE, grasp, PROFILE, config)
+    made = unseen_objects(jax.random.key(0), part, first_px, grasp, PROFILE, config)
+    assert ((np.asarray(made) == 0).sum((1, 2, 3)) >= 3 * 16).all()
+    np.testing.assert_allclose(made, cut(whole, first_px, size), rtol=1e-6)
+
+
 def test_disparity_noise_grows_with_the_square_of_depth_and_keeps_holes():
     config = dataclasses.replace(
         CONFIG, training=dataclasses.replace(CONFIG.training, disparity_noise_px=0.2)
     )
     depth = np.zeros((40, 3, 40, 60), np.float32)
     depth[:, :, :20, :30], depth[:, :, 20:, :30] = 0.5, 1.0  # the right half is invalid
-    noisy = np.asarray(disparity_noise(jax.random.key(0), jnp.asarray(depth), PROFILE, config))
+    noisy = np.asarray(disparity_noise(jax.random.key(0), jnp.asarray(depth), WHOLE, PROFILE, config))
     assert np.all(noisy[..., 30:] == 0) and np.all(noisy[..., :30] > 0)
     error = np.abs(noisy - depth)
     near, far = (np.median(error[:, :, rows, :30]) for rows in (slice(20), slice(20, 40)))
@@ -507,7 +555,7 @@ def test_noise_at_edges_is_where_things_stand_out_of_the_table_and_nowhere_else(
     depth[row : row + 4, column : column + 4] -= 0.05
     depth[:8, :8] = 0.0
     stack = jnp.asarray(depth)[None, None].repeat(64, 0).repeat(3, 1)
-    made = np.asarray(disparity_noise(jax.random.key(0), stack, PROFILE, config))
+    made = np.asarray(disparity_noise(jax.random.key(0), stack, WHOLE, PROFILE, config))
     np.testing.assert_array_equal(made[:, :, :8, :8], 0.0)
     changed = np.mean(np.abs(made - depth) > 1e-4, axis=(0, 1))
     beside = np.zeros(depth.shape, bool)
@@ -516,7 +564,7 @@ def test_noise_at_edges_is_where_things_stand_out_of_the_table_and_nowhere_else(
     error = made[:, :, row, column] - depth[row, column]
     assert 0.3 < np.corrcoef(error[:, 0], error[:, 2])[0, 1] < 0.9
     without = dataclasses.replace(config, training=dataclasses.replace(noise, edge_noise_px=0.0))
-    plain = np.asarray(disparity_noise(jax.random.key(0), stack, PROFILE, without))
+    plain = np.asarray(disparity_noise(jax.random.key(0), stack, WHOLE, PROFILE, without))
     assert np.mean(np.abs(plain - depth)[:, :, beside] > 1e-4) < 0.02
 
 
@@ -528,7 +576,9 @@ def test_a_hole_in_a_surface_is_no_edge():
     depth[row - 14 : row + 14, column - 14 : column + 14] -= 0.05
     stack = jnp.asarray(depth)[None, None].repeat(4, 0).repeat(3, 1)
     holed = stack.at[..., row - 1 : row + 1, column - 1 : column + 1].set(0.0)
-    whole, made = (np.asarray(disparity_noise(jax.random.key(0), x, PROFILE, config)) for x in (stack, holed))
+    whole, made = (
+        np.asarray(disparity_noise(jax.random.key(0), x, WHOLE, PROFILE, config)) for x in (stack, holed)
+    )
     np.testing.assert_array_equal(made[holed > 0], whole[holed > 0])
 
 
@@ -569,7 +619,7 @@ def test_an_object_that_is_not_seen_is_a_hole_as_large_as_it_is():
     depth[block] = z - 0.03
     stack = jnp.asarray(np.stack([depth, depth, depth])[None].repeat(2, 0), jnp.float32)
     grasp = jnp.asarray(np.stack([at, [0.5, 0.0, 0.3]]), jnp.float32)  # the other one is carried
-    made = np.asarray(unseen_objects(jax.random.key(0), stack, grasp, PROFILE, config))
+    made = np.asarray(unseen_objects(jax.random.key(0), stack, WHOLE, grasp, PROFILE, config))
     hole = made[0, 0] == 0
     grown = np.zeros_like(block)
     grown[row - 4 : row + 5, column - 4 : column + 5] = True  # a pixel of its edge each way
@@ -577,4 +627,6 @@ def test_an_object_that_is_not_seen_is_a_hole_as_large_as_it_is():
     np.testing.assert_allclose(made[0, 2][~hole], empty[~hole], rtol=1e-6)
     np.testing.assert_array_equal(made[1], stack[1])
     none = dataclasses.replace(config, training=dataclasses.replace(training, unseen_share=0.0))
-    np.testing.assert_array_equal(unseen_objects(jax.random.key(0), stack, grasp, PROFILE, none), stack)
+    np.testing.assert_array_equal(
+        unseen_objects(jax.random.key(0), stack, WHOLE, grasp, PROFILE, none), stack
+    )
