@@ -162,11 +162,12 @@ def run(
         about |= {"generator": str(generator)} | drawn_by
     for name, header in headers.items():
         rig_trials.check_log(out / name, header)
+    if set_to:
+        Progress(name="causes").note(f"the rig's camera has {rig_trials.describe_stereo(set_to)}")
     made: dict[str, Any] = {}
     for place, name in enumerate(names, 1):
         folder, progress = out / name, Progress(name=name)
-        camera = f" ({rig_trials.describe_stereo(set_to)})" if set_to else ""
-        progress.note(f"row {place} of {len(names)}: {ROWS[name].title}{camera}")
+        progress.note(f"row {place} of {len(names)}: {ROWS[name].title}")
         known = len(_known(folder))
         begun = time.monotonic()
         rig_trials.run_missing(

@@ -7,7 +7,6 @@ what depends on the observation alone is computed once.
 
 from collections.abc import Mapping
 
-import numpy as np
 import onnx
 from onnx import TensorProto
 
@@ -101,7 +100,7 @@ def write_picture(
 ) -> tuple[str, tuple[str, str]]:
     """Raw depth (B, 3, H, W) to the picture (B, 3C, h, w) and its (relief, valid), each (B, 3, h, w)."""
     window = preprocess.plan_window(profile, student)
-    first = np.array(profile.crop_origin_px) + [window.rows.start, window.columns.start]
+    first = preprocess.first_pixel(None, profile, student)[0]
     last = first + [window.rows.length, window.columns.length]
     depth = g.slice(raw, first.tolist(), last.tolist(), [2, 3])
     if export.depth_dtype == "uint16_mm":  # as `ddgrasp.depth.to_metres`

@@ -53,7 +53,8 @@ def disparity_noise(
     variance stays the same in all frames of a stack, as a camera's does.
 
     Args:
-        depth_m: (B, F, h, w) planar metres, 0 = invalid; a part of the frames, or all.
+        depth_m: (B, F, h, w) planar metres, 0 = invalid; a part of the frames, or all; what
+            lies outside it counts for nothing.
         first_px: (B, 2) where it begins in the full frame, row and column.
 
     Returns:
@@ -61,7 +62,7 @@ def disparity_noise(
     """
     batch, frames, height, width = depth_m.shape
     k_strength, k_shared, k_own, k_wrong, k_edges = jax.random.split(key, 5)
-    coarse = (batch, frames, -(-height // CORRELATION_PX), -(-width // CORRELATION_PX))
+    coarse = (batch, frames, _count(height, CORRELATION_PX), _count(width, CORRELATION_PX))
     field = _half_shared(k_shared, k_own, coarse)
     strength = config.training.disparity_noise_px * jax.random.uniform(k_strength, (batch, 1, 1, 1))
     field = strength * field
@@ -69,12 +70,12 @@ def disparity_noise(
         chance = jax.random.uniform(k_wrong, coarse)  # says which cells, and among those uniformly how much
         wrong_px = SPURIOUS_PX * (2.0 * chance / SPURIOUS_SHARE - 1.0)
         field += jnp.where(chance < SPURIOUS_SHARE, wrong_px, 0.0)
-    field = _enlarged(field, CORRELATION_PX, height, width)
+    field = _enlarged(field, CORRELATION_PX, first_px, (height, width))
     fb = profile.fx_px * profile.baseline_m
     if config.training.edge_noise_px:
         table_m = cut(table_depth(profile, config.picture.max_depth_m)[None, None], first_px, (height, width))
         above_px = fb / jnp.maximum(depth_m, 1e-3) - fb / table_m
-        field += _edge_noise(k_edges, above_px, depth_m > 0, config)
+        field += _edge_noise(k_edges, above_px, depth_m > 0, first_px, config)
     # fb / (fb / depth + field), with one division and 0 where depth is 0.
     return depth_m * fb / jnp.maximum(fb + depth_m * field, depth_m * _MIN_DISPARITY_PX)
 
@@ -83,6 +84,7 @@ def _edge_noise(
     key: Key[jax.Array, ""],
     above_px: Float[jax.Array, "B F H W"],
     valid: Bool[jax.Array, "B F H W"],
+    first_px: Int[AnyArray, "#B 2"],
     config: StudentConfig,
 ) -> Float[jax.Array, "B F H W"]:
     """Disparity errors at edges, one a cell of EDGE_CELL_PX, half of it the same in all frames.
@@ -91,12 +93,14 @@ def _edge_noise(
         above_px: disparity, less the empty table's.
     """
     _, _, height, width = above_px.shape
-    highest, lowest = (_around(_cells(jnp.where(valid, sign * above_px, -jnp.inf))) for sign in (1.0, -1.0))
+    highest, lowest = (
+        _around(_cells(jnp.where(valid, sign * above_px, -jnp.inf), first_px)) for sign in (1.0, -1.0)
+    )
     edge = jnp.clip((highest + lowest) / EDGE_RELIEF_PX, 0.0, 1.0)  # a sum: each is of its own sign
     k_strength, k_shared, k_own = jax.random.split(key, 3)
     noise = _half_shared(k_shared, k_own, edge.shape)
     strength = config.training.edge_noise_px * jax.random.uniform(k_strength, (len(valid), 1, 1, 1))
-    return _enlarged(strength * edge * noise, EDGE_CELL_PX, height, width)
+    return _enlarged(strength * edge * noise, EDGE_CELL_PX, first_px, (height, width))
 
 
 def _half_shared(
@@ -107,11 +111,21 @@ def _half_shared(
     return (shared + jax.random.normal(k_own, shape)) / jnp.sqrt(2.0)
 
 
-def _cells(values: Float[jax.Array, "B F H W"]) -> Float[jax.Array, "B F h w"]:
-    """The largest value of each cell of EDGE_CELL_PX."""
-    size = (1, 1, EDGE_CELL_PX, EDGE_CELL_PX)
-    rest = [(0, 0), (0, 0), *((0, -length % EDGE_CELL_PX) for length in values.shape[2:])]
-    return jax.lax.reduce_window(values, -jnp.inf, jax.lax.max, size, size, rest)
+def _count(length: int, cell_px: int) -> int:
+    """Cells that so many pixels touch, wherever they begin."""
+    return -(-(length + cell_px - 1) // cell_px)
+
+
+def _cells(
+    values: Float[jax.Array, "B F H W"], first_px: Int[AnyArray, "#B 2"]
+) -> Float[jax.Array, "B F h w"]:
+    """The largest value of each cell of EDGE_CELL_PX; cells begin where the full frame's do."""
+    size, before = (1, 1, EDGE_CELL_PX, EDGE_CELL_PX), EDGE_CELL_PX - 1
+    rows, columns = (EDGE_CELL_PX * _count(length, EDGE_CELL_PX) for length in values.shape[2:])
+    rest = ((0, 0), (0, 0), (before, rows - values.shape[2]), (before, columns - values.shape[3]))
+    padded = jnp.pad(values, rest, constant_values=-jnp.inf)
+    values = cut(padded, before - first_px % EDGE_CELL_PX, (rows, columns))
+    return jax.lax.reduce_window(values, -jnp.inf, jax.lax.max, size, size, "VALID")
 
 
 def _around(cells: Float[jax.Array, "B F h w"]) -> Float[jax.Array, "B F h w"]:
@@ -119,9 +133,12 @@ def _around(cells: Float[jax.Array, "B F h w"]) -> Float[jax.Array, "B F h w"]:
     return jax.lax.reduce_window(cells, -jnp.inf, jax.lax.max, (1, 1, 3, 3), (1, 1, 1, 1), "SAME")
 
 
-def _enlarged(cells: Float[jax.Array, "B F h w"], cell_px: int, height: int, width: int) -> jax.Array:
-    """(B, F, height, width): a value for every pixel of a cell."""
-    return jnp.repeat(jnp.repeat(cells, cell_px, axis=2), cell_px, axis=3)[:, :, :height, :width]
+def _enlarged(
+    cells: Float[jax.Array, "B F h w"], cell_px: int, first_px: Int[AnyArray, "#B 2"], size: tuple[int, int]
+) -> Float[jax.Array, "B F H W"]:
+    """(B, F, *size): a value for every pixel of a cell. Cells begin where the full frame's do: with the part
+    that the encoder sees, its patches would always have whole ones."""
+    return cut(jnp.repeat(jnp.repeat(cells, cell_px, axis=2), cell_px, axis=3), first_px % cell_px, size)
 
 
 def unseen_objects(
@@ -138,7 +155,8 @@ def unseen_objects(
     is to see of it. Parts of a hand that is about to grasp go too.
 
     Args:
-        depth_m: (B, F, h, w) planar metres, 0 = invalid; a part of the frames, or all.
+        depth_m: (B, F, h, w) planar metres, 0 = invalid; a part of the frames, or all; what
+            lies outside it counts for nothing.
         first_px: (B, 2) where it begins in the full frame, row and column.
         grasp_m: (B, 3) where to grasp, world frame.
     """

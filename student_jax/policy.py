@@ -96,7 +96,8 @@ class StudentPolicy(nn.Module):
         state: Float[AnyArray, "B 9"],
         crop_rc: Int[AnyArray, "B 2"] | None = None,
     ) -> Seen:
-        """(B, 3, H, W) metres, (B, 9), (B, 2) or None for the centred crop."""
+        """(B, 3, H, W) metres, whole frames or the part that is seen (`prepare_depth`), (B, 9), (B, 2) or
+        None for the centred crop."""
         picture = prepare_depth(depth_m, crop_rc, self.profile, self.config)
         return self.encode_picture(picture, state, crop_rc)
 

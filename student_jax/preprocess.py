@@ -163,7 +163,7 @@ def prepare_depth(
             part that the encoder sees, from `cut`.
         crop_rc: (B, 2) integer (row, column) of each sample's crop window, clipped into the frame;
             None takes the centred window (what the exported policy does).
-        profile: the camera that took the frames; H and W must be its own.
+        profile: the camera that took the frames; whole ones must have its H and W.
         config: input size, channels and depth limits.
 
     Returns:

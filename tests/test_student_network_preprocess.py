@@ -120,6 +120,17 @@ def test_a_crop_at_the_centre_equals_the_default(config):
     np.testing.assert_allclose(static, dynamic, atol=1e-6)
 
 
+@pytest.mark.parametrize("config", [CONFIG, RESIZED])
+def test_the_part_that_is_seen_makes_the_picture_of_the_whole_frames(config):
+    rng = np.random.default_rng(2)
+    depth = (TABLE - rng.uniform(0, 0.3, (2, 3, *TABLE.shape))).astype(np.float32)
+    crop, window = jnp.array([[31, 80], [999, -5]]), preprocess.plan_window(PROFILE, config)
+    first_px = preprocess.first_pixel(crop, PROFILE, config)
+    part = preprocess.cut(depth, first_px, (window.rows.length, window.columns.length))
+    made, whole = (preprocess.prepare_depth(x, crop, PROFILE, config) for x in (part, depth))
+    np.testing.assert_allclose(made, whole, atol=1e-6)
+
+
 def test_the_empty_table_is_flat_in_every_crop_and_crops_stay_inside():
     depth = np.repeat(frames_of(TABLE), 3, axis=0)
     crop = jnp.array([[0, 0], [68, 175], [999, -5]])

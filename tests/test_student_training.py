@@ -38,7 +38,7 @@ from student_jax.data import aux_targets, make_frames, random_crops, sharpen_gri
 from student_jax.depth_source import make_source
 from student_jax.frames_io import useful_steps
 from student_jax.policy import PARAMS_FILE, Aux, Seen, init_params, position_to_world
-from student_jax.preprocess import cut, first_pixel, table_depth
+from student_jax.preprocess import cut, table_depth
 from student_jax.privileged import PoseActor, noisy_seen
 
 PROFILE = contract.D455.scaled(0.25)
@@ -191,6 +191,9 @@ def _blind_step(monkeypatch, **training) -> tuple[train.Batch, np.ndarray, float
     monkeypatch.setattr(train, "updated", lambda state, optimizer, grad, decay: grads.append(grad) or state)
     config = dataclasses.replace(CONFIG, training=dataclasses.replace(CONFIG.training, **training))
     batch = train.make_batch(frames_of(), np.arange(4), np.random.default_rng(0), config, PROFILE)
+    pixels = np.arange(PROFILE.height_px * PROFILE.width_px) % 499  # else every part of a frame is alike
+    pixels = pixels.reshape(PROFILE.height_px, PROFILE.width_px).astype(np.uint16)
+    batch = batch.replace(depth_mm=batch.depth_mm + pixels)
     key = jax.random.key_data(jax.random.key(0))
     state = first_state({"encoder": np.float32(0.5)}, optax.identity(), key)
     train.train_step.__wrapped__(config, PROFILE, 5, state, {}, batch)
@@ -225,9 +228,7 @@ def test_a_step_shows_the_network_depth_with_noise_and_without_unseen_objects(
     batch, shown, _ = _blind_step(monkeypatch, **PLAIN | settings)
     parts = [
         depth[:, row : row + shown.shape[2], column : column + shown.shape[3]]
-        for depth, (row, column) in zip(
-            np.asarray(batch.depth_mm), first_pixel(batch.crop_rc, PROFILE, CONFIG), strict=True
-        )
+        for depth, (row, column) in zip(np.asarray(batch.depth_mm), np.asarray(batch.crop_rc), strict=True)
     ]
     np.testing.assert_array_equal(shown, expected(to_metres(np.stack(parts))))
     for grasp_m in grasps:
@@ -501,6 +502,16 @@ def test_edges_of_a_part_of_the_frames_are_told_by_the_table_that_lies_there():
     for i, (row, column) in enumerate(block - first_px):
         near[i, :, row - 8 : row + 12, column - 8 : column + 12] = True
     assert changed[near].any() and not changed[~near].any()
+
+
+def test_cells_of_noise_begin_where_the_frame_s_do_and_not_the_part_s():
+    noise = dataclasses.replace(CONFIG.training, disparity_noise_px=0.25, edge_noise_px=0.0)
+    config = dataclasses.replace(CONFIG, training=noise)
+    part, first_px = jnp.ones((3, 3, 8, 8)), np.array([[2, 4], [1, 0], [0, 1]])
+    made = np.asarray(disparity_noise(jax.random.key(0), part, first_px, PROFILE, config))
+    rows, columns = made[:, :, 0] == made[:, :, 1], made[..., 0] == made[..., 1]
+    alike = np.stack([rows.all((1, 2)), columns.all((1, 2))], axis=-1)  # the first two, in each sample
+    np.testing.assert_array_equal(alike, first_px % 2 == 0)
 
 
 def test_an_unseen_object_in_a_part_of_the_frames_is_found_where_it_lies():

@@ -116,7 +116,7 @@ TABLES: dict[str, Table] = {
         ("sim_gt", "sim_gt_ripple", "rand_noise", "rand_noise_ripple", "ddg", "ddg_ripple"),
     ),
     "filled": Table(
-        "Holes as recorded and filled by the student; filled, with ripple or holes made by hand",
+        "Holes as recorded and filled by the student; filled, with ripple made or holes cut by hand",
         "ddg_filled",
         (
             "sim_gt",
