@@ -385,8 +385,14 @@ def test_the_kept_logs_give_the_pairs_of_the_page(tmp_path, kept, rows_and_p):
             (62, 37), (42, 42), (30, 43),
         ]  # fmt: skip
         filled = _pairs(of["tables"]["filled"])
-        kinds = ("rand_noise_filled", "sim_gt_ellipses_filled", "sim_gt_filled", "ddg")
-        assert [filled[row] for row in kinds] == [(27, 16), (228, 3), (309, 4), (49, 21)]
+        kinds = (
+            "rand_noise_filled",
+            "sim_gt_ripple_filled",
+            "sim_gt_ellipses_filled",
+            "sim_gt_filled",
+            "ddg",
+        )
+        assert [filled[row] for row in kinds] == [(27, 16), (29, 19), (228, 3), (309, 4), (49, 21)]
 
 
 def _pairs(tests: Sequence[dict]) -> dict[str, tuple[int, int]]:
