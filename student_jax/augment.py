@@ -55,7 +55,7 @@ def disparity_noise(
     Args:
         depth_m: (B, F, h, w) planar metres, 0 = invalid; a part of the frames, or all; what
             lies outside it counts for nothing.
-        first_px: (B, 2) where it begins in the full frame, row and column.
+        first_px: (B or 1, 2) where it begins in the full frame, row and column.
 
     Returns:
         The same shape; invalid pixels stay so.
@@ -157,7 +157,7 @@ def unseen_objects(
     Args:
         depth_m: (B, F, h, w) planar metres, 0 = invalid; a part of the frames, or all; what
             lies outside it counts for nothing.
-        first_px: (B, 2) where it begins in the full frame, row and column.
+        first_px: (B or 1, 2) where it begins in the full frame, row and column.
         grasp_m: (B, 3) where to grasp, world frame.
     """
     chosen = jax.random.bernoulli(key, config.training.unseen_share, depth_m.shape[:1])
