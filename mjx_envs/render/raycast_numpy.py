@@ -4,7 +4,6 @@ Quick because a geom is tested only inside its screen-space bounding box and onl
 pixels are shaded. `raycast.py` renders the same picture under JAX.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -54,13 +53,8 @@ def render(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera, far_m: fl
     """
     view = _view(model, data, camera)
     t, winner = _cast(view)
-    segmentation = np.full(t.shape, -1, np.int32)
-    rgb = np.empty((*t.shape, 3), np.float32)
-    rgb[:] = BACKGROUND_RGB
-    normal_w = np.zeros((*t.shape, 3), np.float32)
-    for g, window in _seen(view, winner):
-        _shade(view, g, window, t, winner, rgb, normal_w)
-        segmentation[window][winner[window] == g] = view.geoms.ids[g]
+    rgb, normal_w = _shaded(view, t, winner)
+    segmentation = np.append(view.geoms.ids, np.int32(-1)).take(winner)
     return Buffers(_limited(t, far_m), rgb, segmentation, normal_w)
 
 
@@ -147,7 +141,7 @@ def _cast(view: _View) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) nearest t (inf where nothing is hit) and (H, W) index of the winner (-1)."""
     shape = (view.y.shape[0], view.x.shape[1])
     nearest = np.full(shape, np.inf, np.float32)
-    winner = np.full(shape, -1, np.int32)
+    winner = np.full(shape, -1, np.int16)  # few bytes sort quickly
     for g, window in enumerate(view.windows):
         if window is None:
             continue
@@ -156,39 +150,46 @@ def _cast(view: _View) -> tuple[np.ndarray, np.ndarray]:
         t = ray_geometry.HIT[kind](np, vector(view.origin_g[g]), direction, size)
         nearer = t < nearest[window]
         np.copyto(nearest[window], t, where=nearer)
-        winner[window][nearer] = g
+        np.copyto(winner[window], np.int16(g), where=nearer)
     return nearest, winner
 
 
-def _seen(view: _View, winner: np.ndarray) -> Iterator[tuple[int, Window]]:
-    pixels = np.bincount(winner.ravel() + 1, minlength=len(view.windows) + 1)[1:]
-    for g, window in enumerate(view.windows):
-        if window is not None and pixels[g]:
-            yield g, window
+def _shaded(view: _View, t: np.ndarray, winner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 3) Lambert-shaded colours and (H, W, 3) normals in the world frame.
+
+    What is the same in all pixels of a geom, or where none is, is looked up for all pixels at once.
+    """
+    count = len(view.windows)
+    table = np.zeros((2, count + 1, 3), np.float32)  # the last is for the -1 of pixels that hit nothing
+    table[0, -1] = BACKGROUND_RGB
+    flat = [g for g, kind in enumerate(view.geoms.types) if kind == "plane"]
+    table[1, flat] = view.rot_w[flat, :, 2]
+    for g in flat:
+        table[0, g] = _lambert(table[1, g][None], view.geoms.rgb[g])
+    rgb, normal_w = (values.take(winner, axis=0) for values in table)
+    order = np.argsort(winner, axis=None, kind="stable")
+    first, *ends = np.cumsum(np.bincount(winner.ravel() + 1, minlength=count + 1)).tolist()
+    for g, end in enumerate(ends):
+        pixels, first = order[first:end], end
+        if len(pixels) and g not in flat:
+            normal = _normals(view, g, t, pixels)
+            normal_w.reshape(-1, 3)[pixels] = normal
+            rgb.reshape(-1, 3)[pixels] = _lambert(normal, view.geoms.rgb[g])
+    return rgb, normal_w
 
 
-def _shade(
-    view: _View,
-    g: int,
-    window: Window,
-    t: np.ndarray,
-    winner: np.ndarray,
-    rgb: np.ndarray,
-    normal_w: np.ndarray,
-) -> None:
-    """Write geom g's Lambert-shaded colours and normals into its pixels."""
-    rows, columns = np.nonzero(winner[window] == g)
-    rows += window[0].start
-    columns += window[1].start
-    if view.geoms.types[g] == "plane":
-        normal = view.rot_w[g][:, 2][None]
-    else:
-        direction = _direction(view.rot_g_cam[g], view.x[0, columns], view.y[rows, 0])
-        depth = t[rows, columns]
-        point = vector(o + depth * d for o, d in zip(view.origin_g[g], direction, strict=True))
-        local = ray_geometry.NORMAL[view.geoms.types[g]](np, point, view.geoms.size[g])
-        normal = np.stack(local, axis=-1) @ view.rot_w[g].T
-    lambert = np.maximum(normal @ np.asarray(LIGHT_DIRECTION_W, np.float32), 0)
+def _normals(view: _View, g: int, t: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(n, 3) normals in the world frame of geom `g` at n `pixels`, counted row by row."""
+    rows, columns = np.divmod(pixels, t.shape[1])
+    direction = _direction(view.rot_g_cam[g], view.x[0, columns], view.y[rows, 0])
+    depth = t.ravel()[pixels]
+    point = vector(o + depth * d for o, d in zip(view.origin_g[g], direction, strict=True))
+    local = ray_geometry.NORMAL[view.geoms.types[g]](np, point, view.geoms.size[g])
+    return np.stack(local, axis=-1) @ view.rot_w[g].T
+
+
+def _lambert(normal_w: np.ndarray, rgb: np.ndarray) -> np.ndarray:
+    """(n, 3) colours of a geom of colour `rgb` where it has those (n, 3) normals."""
+    lambert = np.maximum(normal_w @ np.asarray(LIGHT_DIRECTION_W, np.float32), 0)
     shade = np.float32(AMBIENT) + np.float32(1 - AMBIENT) * lambert
-    normal_w[rows, columns] = normal
-    rgb[rows, columns] = shade[:, None] * view.geoms.rgb[g]
+    return shade[:, None] * rgb

@@ -239,7 +239,8 @@ class ActiveStereo:
         table = np.tile(np.array([-1.0, default.specular, 0.0, 0.0], np.float32), (count, 1))
         for geom, material in (materials or {}).items():
             table[geom + 1] = material.albedo, material.specular, material.texture, material.translucency
-        albedo, specular, texture, translucency = (column[ids + 1] for column in table.T.copy())
+        rows = ids + 1
+        albedo, specular, texture, translucency = (column.take(rows) for column in table.T.copy())
         unknown = albedo < 0
         if unknown.any():
             albedo[unknown] = 0.05 + 0.9 * (rgb[unknown] @ np.array(NEAR_INFRARED_RGB, np.float32))
@@ -247,8 +248,10 @@ class ActiveStereo:
             T = (T_world_imager * TEXTURE_PX_PER_M).astype(np.float32)
             u, v = (T[i, 0] * x_z + T[i, 1] * y_z + T[i, 2] * z + T[i, 3] for i in (0, 1))
             noise = cv2.remap(self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-            albedo *= np.maximum(1.0 + texture * noise, np.float32(TEXTURE_DARKEST))
-        return np.clip(albedo, 0.0, 1.0), specular, translucency
+            noise *= texture
+            noise += 1.0
+            albedo *= np.maximum(noise, np.float32(TEXTURE_DARKEST), out=noise)
+        return np.clip(albedo, 0.0, 1.0, out=albedo), specular, translucency
 
     def _dots(self, x_m: np.ndarray, y_m: np.ndarray, z_m: np.ndarray, lit_m: np.ndarray) -> np.ndarray:
         """(H, W) brightness of the pattern on points given in the projector's frame; 0 in shadow."""
@@ -265,8 +268,10 @@ class ActiveStereo:
     def _speckle(self, rng: np.random.Generator) -> np.ndarray:
         """(H, W) factor of mean about 1 on laser light; each imager, at another place, sees its own."""
         shape = (self.profile.height_px, self.profile.width_px)
-        noise = rng.standard_normal(shape, dtype=np.float32)
-        return np.maximum(1.0 + np.float32(self.config.speckle_contrast) * noise, 0.0)
+        factor = rng.standard_normal(shape, dtype=np.float32)
+        factor *= np.float32(self.config.speckle_contrast)
+        factor += 1.0
+        return np.maximum(factor, 0.0, out=factor)
 
     def _expose(self, radiance: np.ndarray, exposure: float, rng: np.random.Generator) -> np.ndarray:
         """(H, W) uint8: blur of the lens, shot and read noise, saturation, quantisation."""
@@ -276,8 +281,12 @@ class ActiveStereo:
             radiance = cv2.GaussianBlur(radiance, (side, side), c.lens_blur_px)
         signal = np.minimum(radiance * np.float32(exposure), 1.0)
         sigma = np.sqrt(signal / np.float32(c.full_well_electrons) + np.float32(c.read_noise**2))
-        noise = rng.standard_normal(signal.shape, dtype=np.float32)
-        return np.clip(255.0 * (signal + sigma * noise) + 0.5, 0, 255).astype(np.uint8)
+        picture = rng.standard_normal(signal.shape, dtype=np.float32)
+        picture *= sigma
+        picture += signal
+        picture *= 255.0
+        picture += 0.5
+        return np.clip(picture, 0, 255, out=picture).astype(np.uint8)
 
 
 def blur_side_px(sigma_px: float) -> int:
@@ -345,19 +354,26 @@ def albedo_texture(
 def _unit(x, y, z) -> tuple[np.ndarray, np.ndarray]:
     """((3, H, W) unit vectors, (H, W) lengths)."""
     vector = np.stack([x, y, z])
-    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    return vector / np.maximum(length, np.float32(1e-6)), length
+    length = np.sqrt(_dot(vector, vector))
+    vector /= np.maximum(length, np.float32(1e-6))
+    return vector, length
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    total = a[0] * b[0]
+    total += a[1] * b[1]
+    total += a[2] * b[2]
+    return total
 
 
 def _reflect(normal, to_light, to_view) -> tuple[np.ndarray, np.ndarray]:
     """Lambert's cosine and the Blinn-Phong highlight, (H, W) each."""
     diffuse = np.maximum(_dot(normal, to_light), 0)
     half = to_light + to_view
-    squared = np.maximum(_dot(normal, half), 0) ** 2 / np.maximum(_dot(half, half), np.float32(1e-6))
+    highlight = np.maximum(_dot(normal, half), 0)
+    highlight *= highlight
+    highlight /= np.maximum(_dot(half, half), np.float32(1e-6))
     for _ in range(SHININESS_DOUBLINGS - 1):
-        squared = squared * squared
-    return diffuse, squared * (diffuse > 0)
+        highlight *= highlight
+    highlight *= diffuse > 0
+    return diffuse, highlight
