@@ -27,6 +27,7 @@ from ddgrasp.config import Config
 from ddgrasp.presets import get_preset
 from mjx_envs import inverse_kinematics
 from mjx_envs.render import raycast
+from student_jax.data import LEAD_IN, kept_of_a_demo
 
 TENSOR_FLOPS = 494.7e12
 """H100 SXM, TF32 without sparsity: what XLA uses for float32 products and convolutions by default (NVIDIA's
@@ -87,16 +88,19 @@ def rows(config: Config) -> Iterator[Row]:
         yield Row("demos", "rendering: colour", steps, chunks, tensor=False)
 
     yield Row("ddg", "generator: train step", ddg.training.steps)
-    drawn = demos.episodes * (1 - student.training.clean_share)
-    drawn += student.dagger.rounds * student.dagger.episodes + config.evaluation.student_trials
-    batches = drawn * length / ddg.sampling.batch_size
-    yield Row("student", f"sampler: {ddg.sampling.sampler}", batches, ddg.sampling.steps)
+    stretch, live = student.training.demo_stretch_steps, student.dagger.rounds * student.dagger.episodes
+    seen = min(length, stretch + LEAD_IN) if stretch else length
+    drawn = demos.episodes * (1 - student.training.clean_share) * seen
+    drawn += (live + config.evaluation.student_trials) * length
+    yield Row(
+        "student", f"sampler: {ddg.sampling.sampler}", drawn / ddg.sampling.batch_size, ddg.sampling.steps
+    )
 
-    rendered = student.dagger.rounds * student.dagger.episodes + 2 * config.evaluation.student_trials
+    rendered = live + 2 * config.evaluation.student_trials
     yield Row("student", "rendering: depth", rendered * length / demos.parallel, chunks, tensor=False)
     fitted = student.training.steps + student.dagger.rounds * student.dagger.steps
     yield Row("student", "student: train step", fitted)
-    frames = (demos.episodes + student.dagger.rounds * student.dagger.episodes) * length
+    frames = demos.episodes * kept_of_a_demo(student, length) + live * length
     yield Row("student", "student: features", frames / student.training.batch_size)
     yield Row("student", "student: DAgger acting", student.dagger.rounds * length)
     poses = student.poses.rounds * student.poses.steps

@@ -115,10 +115,11 @@ def load_frames(
 
 
 def load_held_out(root: Path, config: DDGConfig, prior: Prior, seed: int, progress: Progress) -> Frames:
-    """The held-out frames alone, for a generator that is not fitted. Where every picture can be used, no
-    other recording is read; where not, which ones are held out shows in the reading."""
+    """The held-out frames alone, for a generator that is not fitted. Where every picture can be used, those
+    of the other recordings are looked at and let go; where not, which ones are held out shows in the reading.
+    """
     folders, fraction = _folders(root), config.training.holdout_fraction
-    lengths = _lengths_if_whole(folders)
+    lengths = _lengths_if_whole(folders, config, prior)
     if lengths is None:
         return load_frames(root, config, prior, seed, progress).split(fraction)[1]
     held = held_out_count(lengths, fraction)
@@ -132,15 +133,19 @@ def load_held_out(root: Path, config: DDGConfig, prior: Prior, seed: int, progre
     return frames.part(slice(-held, None))
 
 
-def _lengths_if_whole(folders: list[Path]) -> Int[np.ndarray, " R"] | None:
-    """Frames of each recording; None if one of them has some that are damaged, black or there again."""
-    lengths = []
+def _lengths_if_whole(folders: list[Path], config: DDGConfig, prior: Prior) -> Int[np.ndarray, " R"] | None:
+    """Frames of each recording; None if one of them, or one of its frames, cannot be used (`_read`)."""
+    size, lengths = (config.depth.height_px, config.depth.width_px), []
     for folder in folders:
         try:
             recording = find_recordings(folder)[0]
         except UserError:
             return None
         if recording.skipped or recording.meta.get("repeated_frames"):
+            return None
+        if prior.needs_rgb and not recording.color_aligned:
+            return None
+        if not all(crop_nearest(recording.depth_mm(i), size).any() for i in range(len(recording))):
             return None
         lengths.append(len(recording))
     return np.array(lengths)
@@ -195,7 +200,7 @@ def _read_all(
             if (size := (recording.height_px, recording.width_px)) not in sizes:  # each crop is told once
                 sizes.add(size)
                 _tell_of_crop(recording, config, progress)
-            frames, rgb, left_out = _read(recording, count, config, prior, progress)
+            frames, rgb, left_out, consecutive = _read(recording, count, config, prior, progress)
         except UserError as error:
             if len(folders) == 1:
                 raise
@@ -204,9 +209,9 @@ def _read_all(
             continue
         skipped += left_out
         rng = np.random.default_rng((seed, number))
-        priors.append(prior.from_recording(frames, rgb, rng, recording.consecutive).astype(np.float16))
+        priors.append(prior.from_recording(frames, rgb, rng, consecutive).astype(np.float16))
         depth[number] = frames
-        if not recording.consecutive:
+        if not consecutive:
             apart.add(number)
         sensors[str(recording.meta.get("sensor", "unnamed"))] += 1
     if len(sensors) > 1:
@@ -242,9 +247,9 @@ def _folders(root: Path) -> list[Path]:
 
 def _read(
     recording: Recording, count: int, config: DDGConfig, prior: Prior, progress: Progress
-) -> tuple[np.ndarray, np.ndarray | None, int]:
+) -> tuple[np.ndarray, np.ndarray | None, int, bool]:
     """The usable ones of the first `count` frames: (depth (T, H, W) in metres at the generator's size, rgb
-    (T, h, w, 3) if the prior wants it, number of frames left out).
+    (T, h, w, 3) if the prior wants it, number of frames left out, whether they follow each other in time).
     """
     if recording.skipped:
         progress.note(recording.skipped_summary())
@@ -268,7 +273,9 @@ def _read(
     if blind:
         progress.note(f"{recording.path}: left out {blind} frame(s) without a valid pixel in the window")
     rgb = np.stack([recording.rgb(int(i)) for i in usable]) if prior.needs_rgb else None
-    return frames[usable], rgb, len(recording.skipped) + len(frames) - len(usable)
+    no_gap = bool(seen[usable[0] : usable[-1] + 1].all())  # a frame that came again is none
+    left_out = len(recording.skipped) + len(frames) - len(usable)
+    return frames[usable], rgb, left_out, recording.consecutive and no_gap
 
 
 def _tell_of_crop(recording: Recording, config: DDGConfig, progress: Progress) -> None:

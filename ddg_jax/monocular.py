@@ -9,13 +9,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from ddg_jax.network_prior import DepthNetworkPrior, metric_depth
+from ddg_jax.network_prior import FEWEST_VALID, DepthNetworkPrior, metric_depth
 from ddgrasp.config import DDGConfig
 from ddgrasp.depth import to_metres, to_millimetres
 from foundation import catalog
-
-_FEWEST_VALID = 2
-"""Two pixels fix scale and shift; a frame with fewer stays without depth."""
 
 
 class MonocularDepth:
@@ -39,7 +36,7 @@ class MonocularDepth:
         measured_m = to_metres(measured_mm)
         made_m = np.zeros_like(measured_m)
         for i, frame_m in enumerate(measured_m):
-            if np.count_nonzero(frame_m) >= _FEWEST_VALID:
+            if np.count_nonzero(frame_m) >= FEWEST_VALID:
                 relative = self._prior.relative(rgb[i : i + 1], frame_m.shape)[0]
                 made_m[i] = metric_depth(relative, frame_m, self._far_m)
         return to_millimetres(made_m)

@@ -20,6 +20,8 @@ from foundation import catalog, store
 from foundation.long_video import fit_scale_shift
 
 NETWORKS = (catalog.VIDEO_DEPTH, catalog.IMAGE_DEPTH)
+FEWEST_VALID = 2
+"""Pixels that fix scale and shift of relative depth."""
 _BATCH = 8
 """Pictures that the image network is given together."""
 
@@ -128,7 +130,7 @@ def metric_depth(
       depth_m: measured depth of the same shape, 0 = invalid. UserError if fewer than two pixels are valid.
     """
     valid = depth_m > 0
-    if np.count_nonzero(valid) < 2:
+    if np.count_nonzero(valid) < FEWEST_VALID:
         raise UserError("Relative depth cannot be made metric: the measured depth has no two valid pixels.")
     scale, shift = fit_scale_shift(relative[valid], 1 / depth_m[valid])
     return (1 / np.maximum(scale * relative + shift, 1 / far_m)).astype(np.float32)

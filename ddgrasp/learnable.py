@@ -3,9 +3,14 @@
 What was made by such a one is read as ever, so that these are no checks of the configuration's own.
 """
 
+import math
+
 from ddgrasp import contract
 from ddgrasp.config import Config, DDGDiffusionConfig, StudentConfig, TeacherConfig
 from ddgrasp.errors import UserError
+
+_MOST_BONUS = 1e15
+"""Its square, which the critic's loss has, summed over a batch is far from float32's largest number."""
 
 
 def check_learnable(config: Config) -> None:
@@ -14,6 +19,7 @@ def check_learnable(config: Config) -> None:
     if config.scale == 1:  # a trial run has too few iterations for anything
         _check_actor(config.teacher)
         _check_time(config)
+    _check_bonus(config)
     _check_noise(config.ddg.diffusion)
     _check_losses(config.student)
     _check_head(config.student)
@@ -40,6 +46,20 @@ def _check_time(config: Config) -> None:
         raise UserError(
             f"world.episode_steps is {config.world.episode_steps}; success is an object held for the last "
             f"{contract.HOLD_STEPS}, and would never be seen: take more."
+        )
+
+
+def _check_bonus(config: Config) -> None:
+    """PPO's sums of it are float32."""
+    reward = config.world.reward
+    if not config.teacher.total_steps:
+        return
+    count = min(reward.bonus_max_count, config.world.episode_steps)
+    if math.log(reward.bonus_base) + count * math.log(reward.bonus_growth) > math.log(_MOST_BONUS):
+        raise UserError(
+            f"world.reward.bonus_base {reward.bonus_base:g} times bonus_growth {reward.bonus_growth:g} to "
+            f"the power of {count} (the lesser of bonus_max_count and episode_steps) is a bonus beyond "
+            f"{_MOST_BONUS:g}: take a lower bonus_growth or bonus_max_count."
         )
 
 

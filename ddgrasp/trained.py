@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ddgrasp.artifacts import MANIFEST, is_finished, read_artifact, read_manifest
-from ddgrasp.config import Config
+from ddgrasp.config import GUIDE, NOTHING, Config
 from ddgrasp.errors import UserError
 from ddgrasp.files import to_json
 from ddgrasp.shipped import NAME, PRETRAINED, holding
@@ -55,5 +55,7 @@ def trained_objects(config: Mapping[str, Any], stage: str) -> tuple[str, ...]:
 def _start(config: Mapping[str, Any], stage: str, folder: Path | None) -> str:
     """What it began from; nothing where `folder` is shipped and that is not: another may lie there here."""
     start = config[stage][_START[stage]]
+    if stage == "teacher" and start in (NOTHING, GUIDE):  # whatever folder has that name
+        return ""
     is_shipped = folder is not None and folder.resolve().is_relative_to(PRETRAINED.resolve())
     return "" if is_shipped and Path(start).parts[:1] != (NAME,) else start

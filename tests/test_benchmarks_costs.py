@@ -23,6 +23,20 @@ def test_calls_of_the_paper_preset_by_hand():
     assert found["student", "sampler: ddim"].calls == pytest.approx(drawn)
 
 
+def test_of_a_demo_s_stretch_no_more_is_drawn_than_the_stretch_and_what_its_first_picture_shows():
+    config = PRESETS["laptop"]
+    training, head = config.student.training, config.student.head
+    assert (config.demos.episodes, training.demo_stretch_steps, training.clean_share) == (1200, 12, 0.3)
+    calls = {row.program: row.calls for row in costs.rows(config)}
+    dagger = config.student.dagger.rounds * config.student.dagger.episodes * 60
+    trials = config.evaluation.student_trials * 60
+    assert calls["sampler: ddim"] == pytest.approx(
+        (1200 * 0.7 * (12 + 2) + dagger + trials) / config.ddg.sampling.batch_size
+    )
+    kept = 1200 * (12 + 2 + head.chunk - 1)
+    assert calls["student: features"] == pytest.approx((kept + dagger) / training.batch_size)
+
+
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_every_row_is_a_program(name):
     assert {row.program for row in costs.rows(PRESETS[name])} <= PROGRAMS.keys()

@@ -200,6 +200,31 @@ def test_what_is_held_out_is_so_among_the_frames_that_can_be_used(tmp_path, last
     np.testing.assert_array_equal(data.load_held_out(*given).depth_m, held.depth_m)
 
 
+@pytest.mark.parametrize("blind", [40, 12])
+def test_what_is_held_out_is_so_whatever_earlier_recordings_lack(tmp_path, blind):
+    """All or some of the first recording's frames show nothing in the window that a wide generator sees."""
+    edge = np.zeros((64, 64), np.uint16)
+    edge[0] = 900
+    for name, count in (("a", blind), ("b", 0)):
+        write_depth(tmp_path / name, [edge] * count + [flat((64, 64), 900 + n) for n in range(40 - count)])
+    config = replace(WIDE, training=DDGTrainingConfig(holdout_fraction=0.1))
+    given = tmp_path, config, prior.make_prior(config), 0, Progress(quiet=True)
+    training, held = data.load_frames(*given).split(0.1)
+    assert len(training) + len(held) == 80 - blind
+    np.testing.assert_array_equal(data.load_held_out(*given).depth_m, held.depth_m)
+
+
+def test_frames_around_blind_ones_do_not_follow_each_other(tmp_path):
+    edge = np.zeros((64, 64), np.uint16)
+    edge[0] = 900
+    for blind, apart in ((4, True), (0, False)):
+        frames = [flat((64, 64), 900)] * 5
+        frames[blind] = edge
+        write_depth(tmp_path / f"{blind}", [*frames, flat((64, 64), 1500)], consecutive_frames=True)
+        found = data.load_frames(tmp_path / f"{blind}", WIDE, prior.make_prior(WIDE), 0, Progress(quiet=True))
+        assert (len(found), found.apart == {0}) == (5, apart)
+
+
 def _record(path, frames: int = 2, size=(36, 64), **changes):
     write_depth(path, frames * [flat(size, 900)])
     set_meta(path, **changes)

@@ -50,6 +50,22 @@ def test_colour_of_recordings_that_are_not_scored_counts_for_nothing(tmp_path):
     assert score_data.load_real(tmp_path, 32, 9).unaligned == (tmp_path / "a",)
 
 
+def test_frames_that_are_blind_at_the_score_s_size_are_left_out(tmp_path):
+    blind = np.zeros((72, 128), np.uint16)
+    blind[0, 0] = 700  # no pixel of the score's, which are every fourth
+    frames = [flat((72, 128), 700 + n) for n in range(24)]
+    about = {"fx_px": 80.0, "sensor": "RealSense D435", "consecutive_frames": True}
+    write_depth(tmp_path / "a", [*frames[:12], blind, *frames[13:]], **about)
+    found = score_data.load_real(tmp_path / "a", 32, 24)
+    assert (found.blind, len(found.depth_mm), found.apart) == (1, 23, {0: tmp_path / "a"})
+    assert found.depth_mm.min() == 700 and 712 not in found.depth_mm
+    behind = score_data.load_real(tmp_path / "a", 32, 11)
+    assert (behind.blind, len(behind.depth_mm), behind.apart) == (0, 11, {})
+    write_depth(tmp_path / "b", [blind], **about)
+    with pytest.raises(UserError, match="its last 1 frames have no depth at 32x18"):
+        score_data.load_real(tmp_path / "b", 32, 1)
+
+
 @pytest.mark.parametrize("by", ["column monocular", "prior of simulated colour"])
 def test_colour_of_another_view_is_refused_before_the_fit(tmp_path, by):
     """By whoever would ask for it once the generator is there; what it is fitted on is aligned."""

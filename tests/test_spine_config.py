@@ -275,6 +275,23 @@ def test_a_teacher_whose_actor_would_never_learn_is_refused():
         check_learnable(preset)
 
 
+def test_a_bonus_beyond_float32_is_refused_before_the_policy_has_learnt_to_hold():
+    args = ["--preset", "demo", "--world.reward.bonus-growth", "20", "--world.reward.bonus-max-count"]
+    with pytest.raises(UserError, match=r"bonus_growth 20 to the power of 60 .* is a bonus beyond 1e\+15"):
+        check_learnable(parse("run", [*args, "1000"]).config)
+    check_learnable(parse("run", [*args, "10"]).config)
+    check_learnable(
+        parse(
+            "run", [*args, "1000", "--teacher.start", "pretrained/teacher", "--teacher.total-steps", "0"]
+        ).config
+    )
+
+
+def test_a_whole_number_beyond_all_floats_is_refused():
+    with pytest.raises(UserError, match="total_steps is 1000"):
+        parse("run", ["--preset", "demo", "--teacher.total-steps", str(10**400)])
+
+
 def test_a_schedule_that_does_not_end_in_noise_is_refused_before_it_is_fitted_and_read_as_ever():
     shifted = DDGDiffusionConfig(500, "linear", 3.0)
     ddg = dataclasses.replace(PRESETS["demo"].ddg, diffusion=shifted)

@@ -43,6 +43,14 @@ def test_objects_of_all_starts_were_trained_on(earlier, stage):
     assert trained_objects(to_json(of(("cube",), "runs/gone")), stage) == ("cube",)
 
 
+@pytest.mark.parametrize("start", ["guide", "nothing"])
+def test_a_run_that_has_a_start_s_name_is_none(earlier, start, monkeypatch):
+    monkeypatch.chdir(earlier.parent)
+    earlier.rename(start)
+    assert trained_objects(to_json(of(("cube",), start)), "teacher") == ("cube",)
+    assert trained_objects(to_json(of(("cube",), f"./{start}")), "teacher") == ("cube", "can", "apple")
+
+
 def test_a_teacher_that_is_taken_as_it_is_was_not_trained_on_the_run_s(earlier):
     taken = to_json(of(("lemon",), str(earlier), total_steps=0))
     assert trained_objects(taken, "teacher") == ("can", "apple")

@@ -33,7 +33,7 @@ class Range:
 
     def trouble(self, value: float) -> str:
         """What was expected instead of `value`, in words; empty if the value is fine."""
-        if not math.isfinite(value):
+        if not isinstance(value, Integral) and not math.isfinite(value):  # a whole one may be beyond floats
             return "a finite number, " + self._both()
         if value < self.least or (self.above and value == self.least):
             return self._both() if self.most < _ONE_SIDED_FROM else self._lower()

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Int, UInt8, UInt16
 
+from ddg_jax.network_prior import FEWEST_VALID
 from ddgrasp import depth
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
@@ -178,7 +179,10 @@ class RealFrames:
     unaligned: tuple[Path, ...] = ()
     """Recordings among them whose colour is not aligned to depth."""
     apart: Mapping[int, Path] = field(default_factory=dict)
-    """Recordings among them whose frames may be of different moments (`Recording.consecutive`), by number."""
+    """Recordings among them whose frames may be of different moments (`Recording.consecutive`), or of which
+    some are left out as blind, by number."""
+    blind: int = 0
+    """How many are left out, since hardly a pixel is valid at this size."""
 
     @property
     def blocks(self) -> list[int]:
@@ -201,7 +205,7 @@ def real_size(root: Path, width_px: int) -> tuple[int, int]:
 
 def load_real(root: Path, width_px: int, last: int) -> RealFrames:
     """The `last` frames of the recordings at or below `root`, at `width_px` (nearest neighbours), without
-    those that only came again: they would stand on both sides.
+    those that only came again, which would stand on both sides, and those that are blind at that size.
 
     Raises UserError for recordings of different sizes, or none, or if those that the frames are of have
     different optics, or unknown ones.
@@ -211,16 +215,22 @@ def load_real(root: Path, width_px: int, last: int) -> RealFrames:
     taken = [(number, i) for number, i in frames[-last:] if not recordings[number].repeats(i)]
     if not taken:
         raise UserError(f"{root}: its last {last} frames are one picture, come again: record a moving view.")
+    size = _size(recordings[0], width_px)
+    pictures = {at: depth.crop_nearest(recordings[at[0]].depth_mm(at[1]), size) for at in taken}
+    blind = {at for at, picture in pictures.items() if np.count_nonzero(picture) < FEWEST_VALID}
+    if not (taken := [at for at in taken if at not in blind]):
+        raise UserError(f"{root}: its last {last} frames have no depth at {size[1]}x{size[0]}.")
     numbers = np.array([number for number, _ in taken])
     scored = [recordings[number] for number in np.unique(numbers)]
     focal_px, baseline_m = _optics(scored)
     unaligned = tuple(r.path for r in scored if not r.color_aligned)
-    apart = {int(n): r.path for n, r in zip(np.unique(numbers), scored, strict=True) if not r.consecutive}
-    size, chosen = _size(recordings[0], width_px), [(recordings[number], i) for number, i in taken]
-    depth_mm = np.stack([depth.crop_nearest(r.depth_mm(i), size) for r, i in chosen])
-    rgb = np.stack([cv2.resize(r.rgb(i), size[::-1], interpolation=cv2.INTER_AREA) for r, i in chosen])
+    whole = {number for number, r in enumerate(recordings) if r.consecutive} - {number for number, _ in blind}
+    apart = {int(number): recordings[number].path for number in np.unique(numbers) if number not in whole}
+    depth_mm = np.stack([pictures[at] for at in taken])
+    chosen = [recordings[number].rgb(i) for number, i in taken]
+    rgb = np.stack([cv2.resize(picture, size[::-1], interpolation=cv2.INTER_AREA) for picture in chosen])
     focal_px *= width_px / recordings[0].width_px
-    return RealFrames(len(frames), depth_mm, rgb, numbers, focal_px, baseline_m, unaligned, apart)
+    return RealFrames(len(frames), depth_mm, rgb, numbers, focal_px, baseline_m, unaligned, apart, len(blind))
 
 
 def _optics(recordings: Sequence[Recording]) -> tuple[float, float]:

@@ -70,6 +70,8 @@ def run(job: Job) -> Artifact:
     with_rgb = make_prior(config.ddg).needs_sim_rgb or monocular_network(config.score, config.ddg) is not None
     score_data.check_colour(frames, with_rgb)
     extractors = [score_features.load(name) for name in config.score.features]
+    if frames.blind:
+        job.progress.note(f"left out {frames.blind} frame(s) to score, which have hardly a valid pixel")
     if frames.apart:
         job.progress.note(_apart(frames))
     fitted = _fit(job, root, fit_frames)
