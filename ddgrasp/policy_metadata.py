@@ -217,7 +217,38 @@ def _check_values(metadata: PolicyMetadata, source: str) -> None:
     closing = metadata.closing_steps
     if not isinstance(closing, int) or isinstance(closing, bool) or closing < 0:
         raise UserError(f"{source}: closing_steps is {closing!r}, expected 0 or more: {REMEDY}.")
+    _check_limits(metadata, source)
+    seen = metadata.profile
+    if (seen.height_px, seen.width_px) != (metadata.depth_height, metadata.depth_width):
+        raise UserError(
+            f"{source}: camera's fx {focal_px:g} is of {seen.width_px}x{seen.height_px} pixels, its depth "
+            f"has {metadata.depth_width}x{metadata.depth_height}: {REMEDY}."
+        )
     if metadata.execute_steps > metadata.chunk:
         raise UserError(
             f"{source}: execute_steps is {metadata.execute_steps}, more than the chunk of {metadata.chunk}."
         )
+
+
+def _check_limits(metadata: PolicyMetadata, source: str) -> None:
+    """Limits that the start pose is beyond would have the safety filter drive the arm, whatever is asked."""
+    for name in ("joint_lower_rad", "joint_upper_rad"):
+        value = getattr(metadata, name)
+        if (
+            not isinstance(value, tuple)
+            or len(value) != len(contract.ARM_JOINTS)
+            or not all(map(_finite, value))
+        ):
+            raise UserError(
+                f"{source}: {name} is {value!r}, expected {len(contract.ARM_JOINTS)} numbers: {REMEDY}."
+            )
+    limits = zip(metadata.joint_lower_rad, contract.HOME_RAD, metadata.joint_upper_rad, strict=True)
+    for name, (lower, home, upper) in zip(contract.ARM_JOINTS, limits, strict=True):
+        if not lower < home < upper:
+            raise UserError(
+                f"{source}: {name} may be at {lower:g} to {upper:g} rad, and starts at {home:g}: {REMEDY}."
+            )
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -5,7 +5,7 @@ All timestamps are seconds on the clock's own monotonic scale, so that ages can 
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8, UInt16
@@ -214,6 +214,15 @@ class Device(Protocol):
 
     def device_name(self) -> str:
         """As it calls itself, once it has started."""
+        ...
+
+
+@runtime_checkable
+class Replayed(Protocol):
+    """A camera that shows what another has recorded."""
+
+    def recorded_as(self) -> dict[str, Any]:
+        """What meta.json must say of its frames where they are recorded again, None for what is not known."""
         ...
 
 

@@ -21,7 +21,7 @@ from jaxtyping import UInt8, UInt16
 from ddgrasp import contract
 from ddgrasp.depth import to_millimetres
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
-from deploy.interfaces import Camera, Device, Filmed, Judge
+from deploy.interfaces import Camera, Device, Filmed, Judge, Replayed
 from deploy.interrupts import unbroken
 from deploy.loop_report import Step
 from rig.film import Film, contact_sheet
@@ -47,7 +47,7 @@ class DeploymentRecord:
     ):
         """`profile` is the policy's picture; `film_every` as in `DeployConfig`."""
         self._camera, self._picture_every, self._film_every = camera, film_every, film_every
-        self._meta = {
+        self._meta: dict[str, Any] = {
             "sensor": sensor, "fx_px": profile.fx_px, "baseline_m": profile.baseline_m,
             "color_aligned_to_depth": isinstance(camera, Filmed),  # a camera's own is of another lens
         }  # fmt: skip
@@ -107,6 +107,9 @@ class DeploymentRecord:
             if isinstance(self._camera, Device) and (name := self._camera.device_name()):
                 self._meta["sensor"] = f"{name}, brought to the policy's picture"
                 self._meta.pop("baseline_m", None)  # known by the name
+            if isinstance(self._camera, Replayed):
+                told = self._meta | self._camera.recorded_as()
+                self._meta = {name: value for name, value in told.items() if value is not None}
         if again := step.frame.timestamp_s == self._newest_s:  # the loop holds, and has no other
             self._meta["consecutive_frames"] = False
         self._newest_s = step.frame.timestamp_s

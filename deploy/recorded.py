@@ -10,6 +10,7 @@ from ddgrasp import contract
 from ddgrasp.config import Config
 from deploy.interfaces import Filmed
 from deploy.loop_report import Step
+from deploy.policy import OnnxPolicy
 from deploy.record import DeploymentRecord
 from deploy.trials import Bench, Trial, TrialResult, Watch
 from rig.film import Film
@@ -34,7 +35,8 @@ class RecordingBench:
     """Runs trials on another bench and keeps them."""
 
     def __init__(self, what: RecordedBench, config: Config, policy_path: Path):
-        self._what, self._config, self._policy_path = what, config, policy_path
+        self._what, self._policy_path = what, policy_path
+        self._profile = OnnxPolicy(policy_path).info.profile
         self._bench = what.make(config, policy_path)
 
     def run(self, trial: Trial, watch: Watch | None = None) -> tuple[TrialResult, Film]:
@@ -47,8 +49,7 @@ class RecordingBench:
             def look(step: Step, camera: Filmed) -> bool | None:
                 if step.index == 0:  # also where a trial is run again
                     frames.close()
-                    profile = self._config.world.profile
-                    kept[:] = [DeploymentRecord(camera, profile, _sensor(about), 1)]
+                    kept[:] = [DeploymentRecord(camera, self._profile, _sensor(about), 1)]
                     frames.enter_context(kept[0].into(folder))
                 kept[0].look(step)
                 return None if watch is None else watch(step, camera)

@@ -341,10 +341,10 @@ _make_bench: Callable[[], Bench]
 def _start_worker(
     config: Config, policy_path: Path, make: Callable[[Config, Path], Bench], parent: int
 ) -> None:
-    """Leave Ctrl-C to the parent, and go when the parent has gone."""
-
+    """Leave Ctrl-C and a terminal that closes to the parent, and go when the parent has gone."""
     global _make_bench
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
     _make_bench = partial(make, config, policy_path)
 

@@ -351,6 +351,26 @@ def test_nobody_to_ask_moves_nothing(tmp_path, bench, monkeypatch):
     assert bench.arm.commands == 0
 
 
+def test_an_arm_that_was_led_aside_is_planned_for_from_where_it_is(tmp_path, bench, monkeypatch):
+    begun, real = [], session.poses.is_free_way
+
+    def noted(bench, stood, target):
+        begun.append(stood)
+        return real(bench, stood, target)
+
+    aside = np.array(HOME_RAD) + 0.05
+
+    def led(question: str) -> None:
+        if question.startswith("Hold"):
+            bench.arm.q_rad = aside.copy()
+
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(session, "ask_person", led)
+    monkeypatch.setattr(session.poses, "is_free_way", noted)
+    session.run(fast(), options(tmp_path, yes=False), lambda text: None)
+    np.testing.assert_allclose(begun[0], aside)
+
+
 def test_a_board_is_asked_for_whatever_may_move_unasked(tmp_path, bench, monkeypatch):
     monkeypatch.setitem(registry.IMAGERS, "realsense", lambda setup: bench.imager)
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: False))

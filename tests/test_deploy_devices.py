@@ -472,6 +472,30 @@ def test_an_arm_that_is_held_up_on_its_way_to_the_start_is_given_up(monkeypatch)
     assert next(seconds) < franka_robot.START_S + 4
 
 
+@pytest.mark.parametrize("led_rad", [0.0, 0.5])
+def test_an_arm_that_is_led_aside_while_a_person_is_asked_moves_to_its_start(monkeypatch, led_rad):
+    arm = SimpleNamespace(state=SimpleNamespace(q=np.asarray(HOME_RAD)))
+    moved, asked = [], []
+
+    def led(question: str) -> None:
+        asked.append(question)
+        arm.state.q = arm.state.q + led_rad
+
+    robot = _connected()
+    robot._arm, robot._confirm = arm, led
+    monkeypatch.setattr(robot, "_home", lambda gripper: None)
+    monkeypatch.setattr(robot, "_to", lambda q_rad, **how: q_rad)
+    monkeypatch.setattr(robot, "_wait_at_start", moved.append)
+    arm.move = lambda motion, asynchronous: moved.append(motion)
+    robot._go_to_start(None)
+    assert "(0.00 rad away)" in asked[0]
+    if not led_rad:
+        assert not moved
+        return
+    np.testing.assert_array_equal(moved[0], HOME_RAD)
+    assert moved[1] > franka_robot.START_S + 0.5
+
+
 @pytest.mark.parametrize(
     ("module", "start", "extra"),
     [

@@ -18,9 +18,11 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy import interrupts, session
 from deploy.devices.options import SessionOptions
+from deploy.devices.replay_camera import ReplayCamera
 from deploy.interfaces import CameraError, Frame, RobotError
 from deploy_support import KinematicRobot, constant_bias, describe, write_policy
 from evaluation.report import deployments
+from recording_support import flat, write_depth
 from sensors.recordings import writer as writing
 from sensors.recordings.recording import Recording, find_recordings
 from sensors.recordings.writer import RecordingWriter
@@ -112,6 +114,44 @@ def test_a_bought_camera_s_recording_names_it_and_has_its_own_baseline(run, name
     assert recording.meta["sensor"] == f"Intel RealSense {name}, brought to the policy's picture"
     assert recording.optics() == pytest.approx((168.6, baseline_m), abs=0.1)
     assert recording.optics()[1] == pytest.approx(baseline_m, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("meta", "hz", "consecutive"),
+    [
+        ({"hz": 2.0, "consecutive_frames": False, "baseline_m": 0.05, "fx_px": 100.0}, 2.0, False),
+        ({"hz": 30.0, "consecutive_frames": True, "fx_px": 100.0}, 10.0, True),
+        ({}, None, False),
+    ],
+)
+def test_what_was_replayed_is_recorded_as_what_it_was(run, tmp_path, meta, hz, consecutive):
+    """Another camera's frames say its baseline, and how far apart they are."""
+    frames = [flat((180, 320), 700 + n) for n in range(20)]
+    write_depth(tmp_path / "other", frames, sensor="a D435", color_aligned_to_depth=True, **meta)
+    profile = contract.D455.scaled(0.25)
+
+    def replay(clock):
+        return ReplayCamera.open(tmp_path / "other", clock, profile)
+
+    kept = Recording.open(run(replay, camera_name="replay", recording=tmp_path / "other")[1])
+    original = Recording.open(tmp_path / "other")
+    assert kept.meta["sensor"] == "a D435, replayed" and kept.color_aligned
+    assert (kept.meta.get("hz"), kept.consecutive) == (hz, consecutive)
+    assert kept.fx_px == original.fx_px
+    if meta:
+        assert kept.optics() == original.optics() == (100.0, 0.05)
+
+
+def test_what_was_replayed_in_another_size_has_the_policy_s_focal_length(run, tmp_path):
+    about = {"sensor": "a D435", "fx_px": 300.0, "color_aligned_to_depth": True}
+    write_depth(tmp_path / "other", [flat((480, 640), 700)] * 8, **about)
+    profile = contract.D455.scaled(0.25)
+    folder = run(
+        lambda clock: ReplayCamera.open(tmp_path / "other", clock, profile),
+        camera_name="replay", recording=tmp_path / "other",
+    )[1]  # fmt: skip
+    kept = Recording.open(folder)
+    assert kept.optics() == (profile.fx_px, 0.05) and not kept.color_aligned
 
 
 def test_steps_are_on_the_disk_while_it_runs_so_that_a_kill_leaves_them(run, tmp_path):

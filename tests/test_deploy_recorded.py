@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,16 @@ def test_a_recorded_trial_ends_when_its_watcher_says_so(tmp_path, policy):
     result, _ = bench.run(Trial(3, "cube"), lambda step, camera: step.index == 1)
     bench.close()
     assert result.steps == len(Recording.open(tmp_path / "kept" / "0003-cube")) == 2
+
+
+def test_what_a_trial_leaves_has_the_policy_s_focal_length_whatever_the_configuration_s_scale(
+    tmp_path, policy
+):
+    other = replace(CONFIG, world=replace(CONFIG.world, camera_scale=0.5))
+    bench = RecordedBench(lambda config, path: Rig(CONFIG, path), tmp_path / "kept", {"camera": "stereo"})
+    bench(other, policy).run(Trial(3, "cube"), lambda step, camera: step.index == 1)
+    kept = Recording.open(tmp_path / "kept" / "0003-cube")
+    assert (kept.width_px, kept.fx_px) == (160, CONFIG.world.profile.fx_px)
 
 
 def test_trials_that_were_not_recorded_are_not_passed_over(tmp_path, policy):

@@ -315,6 +315,19 @@ def test_ctrl_c_costs_no_trial_that_runs(tmp_path, ctrl_c):
     assert {0, 1} <= {*made} and len(made) < 6  # one more may wait in the workers' queue
 
 
+class LosesItsTerminal(SaysWhenItRuns):
+    """A bench whose worker is told, as its parent is, that the terminal has closed."""
+
+    def run(self, trial: Trial) -> tuple[TrialResult, np.ndarray]:
+        os.kill(os.getpid(), signal.SIGHUP)
+        return super().run(trial)
+
+
+def test_a_terminal_that_closes_costs_no_trial_that_runs(tmp_path):
+    ((tried_one, _),) = run_trials(CONFIG, tmp_path, [Trial(3, "apple")], 1, LosesItsTerminal)
+    assert tried_one.index == 3
+
+
 def test_a_film_lives_no_longer_than_who_takes_it_wants(tmp_path):
     films = []
     for _, film in run_trials(CONFIG, tmp_path, [Trial(i, "apple") for i in range(3)], 1, SaysWhenItRuns):

@@ -59,6 +59,15 @@ def test_a_file_of_before_does_not_latch_a_closing():
         ({"camera": {"fx": "640"}}, "camera's fx is '640', expected pixels"),
         ({"camera": None}, "camera's fx is None, expected pixels"),
         ({"closing_steps": -1}, "closing_steps is -1, expected 0 or more"),
+        ({"joint_lower_rad": None}, "joint_lower_rad is None, expected 7 numbers"),
+        ({"joint_lower_rad": GOOD.joint_lower_rad[:6]}, r"joint_lower_rad is \(.*\), expected 7 numbers"),
+        ({"joint_upper_rad": (*GOOD.joint_upper_rad[:6], "3")}, "expected 7 numbers"),
+        (
+            {"joint_lower_rad": GOOD.joint_upper_rad, "joint_upper_rad": GOOD.joint_lower_rad},
+            r"may be at 2\.\d+ to -2\.\d+ rad, and starts at 0",
+        ),
+        ({"joint_lower_rad": 7 * (0.5,)}, r"may be at 0\.5 to 2\.\d+ rad, and starts at 0"),
+        ({"depth_width": 640}, "is of 320x180 pixels, its depth has 640x180"),
     ],
 )
 def test_contradictions_are_one_line_errors(changes, message):

@@ -170,9 +170,10 @@ def _take(
         "robot's right, its plate no more than 10 mm beyond the pattern below and beside it, and clear the "
         f"table of everything else: the hand closes, then the arm moves through {len(ways)} poses. Ready?"
     )
-    number, stood = 0, np.array(HOME_RAD)
+    number = 0
     try:
         driver.grip(close=True)
+        stood = driver.joints()  # not where it was planned from: a person may have led it aside
         for number, q_target in enumerate(ways, start=1):
             if not poses.is_free_way(bench, stood, q_target):  # not the planned one: a pose was left out
                 came = "left out, no free way from the last pose that was reached"

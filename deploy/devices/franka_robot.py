@@ -203,21 +203,25 @@ class FrankaRobot:
     def _go_to_start(self, gripper: Any) -> None:
         """Gripper homed and open, the arm at the start pose; a person is asked before either moves."""
         assert self._confirm is not None
-        away_rad = float(np.max(np.abs(np.asarray(self._arm.state.q) - HOME_RAD)))
         speed = min(self._config.start_dynamics, self._config.dynamics)
         self._confirm(
             f"The {self._limits.name} at {self._config.host} will home its gripper, which drops what it "
-            f"holds, and move to the start pose ({away_rad:.2f} rad away) at "
+            f"holds, and move to the start pose ({self._away_rad():.2f} rad away) at "
             f"{100 * speed:.2g} % of its speed. Is the way clear?"
         )
         self._moved = True
         self._say("homing the gripper")
         self._home(gripper)
+        away_rad = self._away_rad()  # it may have been led elsewhere meanwhile
         if away_rad > AT_START_RAD:
             self._say("moving to the start pose")
             slower = speed / self._config.dynamics
             self._arm.move(self._to(np.array(HOME_RAD), relative_dynamics_factor=slower), asynchronous=True)
             self._wait_at_start(START_S + 2.0 * away_rad / (speed * min(self._limits.joint_velocity_rad_s)))
+
+    def _away_rad(self) -> float:
+        """From the start pose, the joint that is furthest."""
+        return float(np.max(np.abs(np.asarray(self._arm.state.q) - HOME_RAD)))
 
     def _home(self, gripper: Any) -> None:
         """Homed and open: where homing leaves the fingers is the hand's affair. Raises HandError."""
@@ -247,7 +251,7 @@ class FrankaRobot:
         while True:
             self._arm.poll_motion()
             state = self._arm.state
-            if np.max(np.abs(np.asarray(state.q) - HOME_RAD)) <= AT_START_RAD:
+            if self._away_rad() <= AT_START_RAD:
                 self._arm.join_motion()  # what follows is of another kind, and must not cut it short
                 return
             if state.time.to_sec() - begun_s > longest_s:

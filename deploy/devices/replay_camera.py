@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import UInt16
@@ -41,6 +41,8 @@ class ReplayCamera:
         names its focal length."""
         self._recording, self._clock, self._period_s = recording, clock, period_s
         self._profile, self._had = profile, _camera(recording)
+        size = (recording.height_px, recording.width_px)
+        self._brought = profile is not None and (profile.height_px, profile.width_px) != size
         self._start_s: float | None = None
         self._shown = -1
         self._frame: Frame | None = None
@@ -76,14 +78,27 @@ class ReplayCamera:
             self._frame = Frame(self._depth_mm(index), due_s, self._recording.rgb(index))
         return self._frame
 
+    def recorded_as(self) -> dict[str, Any]:
+        """See Replayed: as slow as they were recorded, where the loop sees every one of them."""
+        meta, hz = self._recording.meta, self._recording.meta.get("hz")
+        brought = self._profile if self._brought and self._had is not None else None
+        return {
+            "sensor": f"{meta.get('sensor', 'unnamed')}, replayed",
+            "fx_px": brought.fx_px if brought else self._recording.fx_px,
+            "baseline_m": meta.get("baseline_m"),
+            "hz": min(hz, contract.CONTROL_HZ) if hz else None,
+            "consecutive_frames": self._recording.consecutive,
+            "color_aligned_to_depth": self._recording.color_aligned and not self._brought,
+        }
+
     def stop(self) -> None:
         """Nothing to close."""
 
     def _depth_mm(self, index: int) -> UInt16[np.ndarray, "H W"]:
-        depth_mm, wanted = self._recording.depth_mm(index), self._profile
-        if wanted is None or self._had is None or depth_mm.shape == (wanted.height_px, wanted.width_px):
+        depth_mm = self._recording.depth_mm(index)
+        if self._profile is None or self._had is None or not self._brought:
             return depth_mm
-        return at_profile(depth_mm, self._had, wanted)
+        return at_profile(depth_mm, self._had, self._profile)
 
 
 def _camera(recording: "sensors.recordings.recording.Recording") -> contract.CameraProfile | None:
