@@ -70,7 +70,7 @@ def check_place(study: Study, resume: bool) -> None:
         if artifacts.is_finished(made):  # else rows differ in more than the depth
             attempts.check_start(made, start)
     pipeline.create(study.out)
-    attempts.begin(study.out, LAST_STAGE, study.config)
+    attempts.begin(study.out, LAST_STAGE, study.config, clean=False)  # other rows may be made there
     for name in study.rows:
         _check_trials(study, name)
 

@@ -123,7 +123,10 @@ def config_of(value: Mapping[str, Any], path: Path) -> dict[str, Any] | None:
 
 
 def _damaged(path: Path) -> UserError:
-    return UserError(f"{path} is no manifest of this project: delete {path.parent} and run the stage again.")
+    return UserError(
+        f"{path} is no manifest of this project: move it elsewhere if it is another program's; if "
+        f"{path.parent} is a stage of a run, delete that and run the stage again."
+    )
 
 
 def read_artifact(directory: Path | str) -> Artifact:

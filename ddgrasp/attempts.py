@@ -31,14 +31,16 @@ def begin(
     inputs: Mapping[str, str] | None = None,
     *,
     write: bool = True,
+    clean: bool = True,
 ) -> None:
     """Marks `directory` as the place where `stage` is being made with this configuration and these inputs.
 
     UserError if an unfinished attempt there used others, or another contract version: its checkpoints would
-    not fit. Without `write` it only looks: another process marks the place.
+    not fit. Without `write` it only looks: another process marks the place. Without `clean` half-written
+    files stay: another process may be writing them.
     """
     inputs = dict(inputs or {})
-    if write:
+    if write and clean:
         for litter in Path(directory).glob(f"{TEMPORARY}*"):  # of an attempt that was killed mid-write
             if litter.is_dir() and not litter.is_symlink():
                 shutil.rmtree(litter)

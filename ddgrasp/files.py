@@ -9,6 +9,7 @@ import dataclasses
 import io
 import json
 import os
+import secrets
 import shutil
 import tempfile
 import zipfile
@@ -34,7 +35,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
+    temporary = _temporary(path)
     try:
         yield temporary
         _fsync(temporary)
@@ -86,7 +87,7 @@ def replace_folder(folder: Path, path: Path) -> None:
 def _folder_beside(path: Path) -> Iterator[Path]:
     """A temporary name, which the caller makes a folder of and renames; it goes away on any error."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
+    temporary = _temporary(path)
     try:
         yield temporary
         _fsync(path.parent)
@@ -94,6 +95,12 @@ def _folder_beside(path: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         _name(error, temporary, path)
         raise
+
+
+def _temporary(path: Path) -> Path:
+    """A name beside `path` that nothing has, whatever a process of the same number left: in a container all
+    have one."""
+    return path.with_name(f"{TEMPORARY}{os.getpid()}-{secrets.token_hex(4)}-{path.name}")
 
 
 def _name(error: BaseException, temporary: Path, path: Path) -> None:

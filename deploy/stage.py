@@ -18,7 +18,7 @@ from ddgrasp.progress import Progress
 from ddgrasp.trained import trained_objects
 from deploy.timing import Timings
 from deploy.trial_log import TrialLog
-from deploy.trials import RULES, TrialResult, lasting, plan, run_trials, tried
+from deploy.trials import RULES, TrialResult, keep_results, lasting, plan, run_trials, tried
 from rig.film import Film, contact_sheet
 
 STAGE = "deploy"
@@ -35,15 +35,18 @@ def run(job: Job) -> Artifact:
     trials = plan(rig)
     with progress.task("trials", len(trials)) as task:
         task.start_at(len(log.results))
+
+        def keep(result: TrialResult, film: Film) -> None:
+            log.append(result)
+            _keep_film(directory, result, film, progress)
+            done = [r for r in log.results.values() if not r.realtime]
+            task.advance(success=sum(r.success for r in done) / max(len(done), 1))
+
         simulated = lasting(rig, contract.TRIAL_S), config.deploy.workers
         # Latency is measured with the machine to itself, hence one process on the real clock.
         for batch, (settings, workers) in ((False, simulated), (True, (rig, 1))):
             todo = [t for t in trials if t.realtime is batch and (t.index, t.realtime) not in log.results]
-            for result, film in run_trials(settings, policy_path, todo, workers):
-                log.append(result)
-                _keep_film(directory, result, film, progress)
-                done = [r for r in log.results.values() if not r.realtime]
-                task.advance(success=sum(r.success for r in done) / max(len(done), 1))
+            keep_results(run_trials(settings, policy_path, todo, workers), keep)
     results = [log.results[(trial.index, trial.realtime)] for trial in trials]
     return job.finish(metrics(results, trained_objects(to_json(config), "student")))
 

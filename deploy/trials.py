@@ -1,11 +1,12 @@
 """Trials of an exported policy on the development rig, through the very loop that would drive a robot."""
 
 import atexit
+import contextlib
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, replace
@@ -231,7 +232,7 @@ def run_trials(
     trials: Sequence[Trial],
     workers: int,
     make: Callable[[Config, Path], Bench] = Rig,
-) -> Iterator[tuple[TrialResult, Film]]:
+) -> Generator[tuple[TrialResult, Film], None, None]:
     """Results of `trials` as they come, from `workers` fresh processes (0: all in this one).
 
     `make` makes what every process tries them on.
@@ -269,6 +270,22 @@ def run_trials(
         raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
+
+
+def keep_results(
+    made: Generator[tuple[TrialResult, Film], None, None], keep: Callable[[TrialResult, Film], None]
+) -> None:
+    """Gives `keep` whatever comes of `run_trials`. Ctrl-C in the middle of it costs no more than while it
+    waits: trials that run come to their end, and are kept."""
+    try:
+        for result, film in made:
+            keep(result, film)
+    except KeyboardInterrupt as interrupt:
+        with contextlib.suppress(KeyboardInterrupt):
+            keep(*made.throw(interrupt))
+            for result, film in made:
+                keep(result, film)
+        raise
 
 
 def _has_ended_well(future: Future) -> bool:

@@ -25,7 +25,7 @@ from deploy.recorded import RecordedBench, episode_folder
 from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
 from deploy.trial_log import TrialLog, read_log, read_own
-from deploy.trials import RULES, Bench, Rig, Trial, TrialResult, lasting, run_trials
+from deploy.trials import RULES, Bench, Rig, Trial, TrialResult, keep_results, lasting, run_trials
 from evaluation import failure_modes, wilson
 from evaluation.treatments import RECORDED, TreatmentName, make_treatment
 from rig import seeds
@@ -197,17 +197,32 @@ def run_missing(
     out.mkdir(parents=True, exist_ok=True)
     with alone_in(out):
         log = TrialLog(out / TRIALS_FILE, _as_begun(out, header))
+        _check_objects(out, trials, log.results)
         todo = [trial for trial in trials if (trial.index, False) not in log.results]
         with progress.task("trials", len(trials)) as task:
             task.start_at(len(trials) - len(todo))
-            for result, film in run_trials(config, policy, todo, workers, make):
+
+            def keep(result: TrialResult, film: Film) -> None:
                 alike = [(r.object_name, r.success) for r in log.results.values()]
                 shown = alike.count((result.object_name, result.success))
                 log.append(result)
                 if film.steps and shown < (1 if result.success else failures):
                     _keep(out, result, film)
                 task.advance(success=sum(r.success for r in log.results.values()) / len(log.results))
+
+            keep_results(run_trials(config, policy, todo, workers, make), keep)
     return [log.results[trial.index, False] for trial in trials]
+
+
+def _check_objects(out: Path, trials: Sequence[Trial], done: Mapping[tuple[int, bool], TrialResult]) -> None:
+    """UserError if one of `trials` has been of another object: the list that numbers them has changed."""
+    for trial in trials:
+        had = done.get((trial.index, False))
+        if had is not None and had.object_name != trial.object_name:
+            raise UserError(
+                f"{out} has trial {trial.index} of {had.object_name!r}, a number that {trial.object_name!r} "
+                "has now: objects were added since; choose another --out."
+            )
 
 
 def check_place(config: Config, policy: Path, series: Series, out: Path) -> None:

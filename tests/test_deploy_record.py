@@ -539,6 +539,8 @@ def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
     for written, message in (
         ("{", "not valid JSON"),
         ("{}", "has no 'success'"),
+        ("null", "has no 'success'"),
+        ("5", "has no 'success'"),
         ('{"success": true, "steps": 3, "events": []}', "lacks holds, missed_deadlines, fault, latency_ms"),
         (None, "success\" is 'yes'"),
     ):

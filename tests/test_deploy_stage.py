@@ -35,7 +35,7 @@ from deploy import trials as rig_eval
 from deploy.clock import SimClock
 from deploy.devices.rig_robot import SimRobot
 from deploy.stage import TrialLog, metrics
-from deploy.trials import Trial, TrialResult, plan, run_trials, tried
+from deploy.trials import Trial, TrialResult, keep_results, plan, run_trials, tried
 from deploy_support import write_policy
 from evaluation.rig_trials import Series
 from job_support import make_job
@@ -326,6 +326,20 @@ class LosesItsTerminal(SaysWhenItRuns):
 def test_a_terminal_that_closes_costs_no_trial_that_runs(tmp_path):
     ((tried_one, _),) = run_trials(CONFIG, tmp_path, [Trial(3, "apple")], 1, LosesItsTerminal)
     assert tried_one.index == 3
+
+
+def test_ctrl_c_while_one_is_kept_costs_no_trial_that_runs(tmp_path, ctrl_c):
+    trials, kept = [Trial(i, "apple") for i in range(12)], []
+
+    def keep(tried_one: TrialResult, film: object) -> None:
+        kept.append(tried_one.index)
+        if len(kept) == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt), pipeline._interruptible("deploy"):
+        keep_results(run_trials(CONFIG, tmp_path, trials, 2, SaysWhenItRuns), keep)
+    assert sorted(kept) == [int(path.name.split("-")[1]) for path in sorted(tmp_path.glob("begun-*"))]
+    assert len(kept) < 12
 
 
 def test_a_film_lives_no_longer_than_who_takes_it_wants(tmp_path):

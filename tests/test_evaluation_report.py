@@ -110,6 +110,12 @@ def test_the_table_ends_with_the_student_in_the_rig(run_dir, capsys):
     assert any("clean depth: success 70.0 % of 10" in line and "loaded" in line for line in lines)
 
 
+def test_a_folder_of_another_stage_is_not_reported_as_the_one_it_is_called(tmp_path):
+    artifacts.finish(tmp_path / "ddg", "export", CONFIG, seconds=1, metrics={"max_abs_diff": 1e-5})
+    artifacts.finish(tmp_path / "student", "student", CONFIG, seconds=1, metrics=METRICS["student"])
+    assert "ddg" not in build_report(tmp_path)["stages"]
+
+
 def test_depth_that_is_not_the_generator_s_is_not_called_so(tmp_path):
     config = replace(CONFIG, student=StudentConfig(depth_source="dextrah"))
     artifacts.finish(tmp_path / "student", "student", config, seconds=1, metrics=METRICS["student"])

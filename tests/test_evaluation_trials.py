@@ -275,6 +275,14 @@ def test_a_log_of_before_goes_on_and_keeps_its_header(tmp_path, policy):
         rig_trials.run(other, policy, SERIES, tmp_path, 0, QUIET)
 
 
+def test_another_object_s_trial_of_the_same_number_is_not_taken_for_it(tmp_path, policy, monkeypatch):
+    rig_trials.run(CONFIG, policy, SERIES, tmp_path, 0, QUIET)
+    known = Series.known
+    monkeypatch.setattr(Series, "known", lambda self: ("stick", *known(self)))
+    with pytest.raises(UserError, match=r"has trial 4000 of 'cube', a number that 'banana' has now"):
+        rig_trials.run(CONFIG, policy, replace(SERIES, objects=("banana",)), tmp_path, 0, QUIET)
+
+
 def test_what_a_policy_was_trained_on_is_seen_whichever_list_has_it(tmp_path, policy):
     config = replace(CONFIG, world=replace(CONFIG.world, objects=("wheel", "tin")))
     series = replace(SERIES, objects=("wheel", "apple"), trials=1)

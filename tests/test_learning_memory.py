@@ -73,14 +73,20 @@ def test_trials_by_themselves_are_told_or_refused_before_they_begin(tmp_path, mo
     trials = config.evaluation.student_trials
     assert need.disk == trials * config.world.episode_steps * 2 * 90 * 160
     assert need.device >= student_memory.acting_bytes(config, trials)
-    artifacts.finish(run / "student", "student", config, seconds=1.0, metrics={})
+    for stage in ("teacher", "ddg"):
+        artifacts.finish(run / stage, stage, config, seconds=1.0, metrics={})
+    another = artifacts.finish(tmp_path / "teacher", "teacher", config, seconds=2.0, metrics={})
+    parents = [artifacts.read_artifact(run / "ddg"), another]
+    artifacts.finish(run / "student", "student", config, seconds=1.0, metrics={}, parents=parents)
 
     def evaluate() -> None:
         parse("student eval", [str(run), "--trials", "300"]).run()
 
     with pytest.raises(UserError, match="params.msgpack"):  # it got as far as that
         evaluate()
-    assert capsys.readouterr().err.startswith("student eval: about ")
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith(f"{run}/student was made of another teacher than {run}/teacher, which it is")
+    assert said[1].startswith("student eval: about ")
     free = SimpleNamespace(free=10**8)
     monkeypatch.setattr("learning.memory.shutil.disk_usage", lambda path: free)
     with pytest.raises(UserError, match=r"^Stage student eval needs about 0\.4 GB of disk in .*TMPDIR"):

@@ -49,6 +49,28 @@ def test_a_failing_write_leaves_the_previous_file_and_no_litter(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["params.bin"]
 
 
+def test_what_a_process_of_the_same_number_left_or_writes_is_in_nobody_s_way(tmp_path, monkeypatch):
+    """In a container every process is number 1."""
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    with new_folder(tmp_path / "set") as left, atomic_path(tmp_path / "file") as half:
+        left.mkdir()
+        half.write_bytes(b"half")
+        with new_folder(tmp_path / "set") as folder:
+            folder.mkdir(exist_ok=False)
+        atomic_write_bytes(tmp_path / "file", b"whole")
+        assert half.read_bytes() == b"half" and (tmp_path / "file").read_bytes() == b"whole"
+
+
+def test_another_s_half_written_file_stays_where_it_may_be_at_work(tmp_path):
+    with atomic_path(tmp_path / "study.png") as temporary:
+        temporary.write_bytes(b"half")
+        attempts.begin(tmp_path, "export", CONFIG, clean=False)
+        assert temporary.exists()
+        attempts.begin(tmp_path, "export", CONFIG)
+        assert not temporary.exists()
+        temporary.write_bytes(b"whole")
+
+
 def test_a_folder_appears_whole_or_not_at_all(tmp_path):
     with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "sets" / "set") as temporary:
         (temporary / "inner").mkdir(parents=True)
@@ -265,7 +287,7 @@ def test_notes_that_are_none_are_named(tmp_path, damage):
     path = directory / artifacts.MANIFEST
     made = read_json(path)
     path.write_text(json.dumps([] if damage == "whole" else made | {damage.replace("inputs", "parents"): 3}))
-    with pytest.raises(UserError, match=r"teacher/manifest\.json is no manifest of this project: delete"):
+    with pytest.raises(UserError, match=r"teacher/manifest\.json is no manifest of this project: move it"):
         artifacts.require(tmp_path, "teacher", CONFIG)
 
 
@@ -347,7 +369,8 @@ def test_a_manifest_of_other_values_than_this_project_writes_is_named(tmp_path, 
     with pytest.raises(UserError) as error:
         artifacts.require(tmp_path, "export", CONFIG)
     assert str(error.value) == (
-        f"{path} is no manifest of this project: delete {directory} and run the stage again."
+        f"{path} is no manifest of this project: move it elsewhere if it is another program's; if "
+        f"{directory} is a stage of a run, delete that and run the stage again."
     )
     if "origin" in damage:
         return

@@ -42,6 +42,7 @@ class StudentEval:
     def run(self) -> None:
         """Prints success on clean depth and on training's, with Wilson intervals, and perception's error."""
         config = load_config(self.run_dir, "student")
+        _tell_of_others(self.run_dir)
         from ddgrasp.progress import Progress
         from evaluation import wilson
         from evaluation.report.summary import perceived
@@ -62,6 +63,19 @@ class StudentEval:
             success = counts["success"]
             rate = wilson.describe(wilson.success(success["successes"], success["n"]))
             print(f"{name:<14} {rate}{perceived(counts)}")
+
+
+def _tell_of_others(run_dir: Path) -> None:
+    """Says on standard error which of a run's parts are not those that its student was made of."""
+    made_of = artifacts.read_manifest(run_dir / "student").parents
+    for name in ("teacher", "ddg"):
+        if (digest := made_of.get(name)) and artifacts.read_artifact(run_dir / name).hash != digest:
+            print(
+                f"{run_dir / 'student'} was made of another {name} than {run_dir / name}, which it is "
+                "measured with.",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 @dataclass(frozen=True)

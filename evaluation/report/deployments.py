@@ -67,7 +67,7 @@ def find(folder: Path) -> list[Deployment]:
 def _report(path: Path) -> Mapping[str, Any]:
     """A report, of which people may set `success` by hand. Raises UserError unless it is one."""
     report = read_json(path)
-    if "success" not in report:
+    if not isinstance(report, dict) or "success" not in report:
         raise UserError(
             f"{path} has no 'success': it is not what `ddgrasp deploy` leaves; move it elsewhere."
         )

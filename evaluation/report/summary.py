@@ -38,11 +38,12 @@ def build_report(run_dir: Path) -> dict[str, Any]:
     `teacher.backends`, if `ddgrasp teacher compare` was, is `evaluation.backends.table`;
     `student.perception`, if `ddgrasp student perception` was, is `evaluation.perception.tabulate`.
     """
-    found = {
+    read = {
         stage.name: artifacts.read_artifact(run_dir / stage.name)
         for stage in (*STAGES, *ON_REQUEST)
         if artifacts.is_finished(run_dir / stage.name)
     }
+    found = {name: made for name, made in read.items() if made.manifest.stage == name}
     if not found:
         raise UserError(f"{run_dir} {_why_nothing(run_dir)}")
     outdated = _outdated(found)
