@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ddgrasp import upgrades
 from ddgrasp.config import Config
 from ddgrasp.errors import UserError
 from ddgrasp.files import to_json
@@ -16,6 +17,13 @@ from ddgrasp.stages import INDIFFERENT, config_fields, get_stage
 def config_hash(config: Config, stage: str) -> str:
     """Hash over the parts of the configuration that `stage` depends on, and nothing else."""
     return _hash(_relevant(to_json(config), stage))
+
+
+def config_hashes(config: Config, stage: str) -> list[str]:
+    """`config_hash`, and those that earlier versions gave to the same configuration, which lacked fields."""
+    made = to_json(config)
+    earlier = (upgrades.without(made, version) for version in range(upgrades.VERSION, 1, -1))
+    return list(dict.fromkeys(_hash(_relevant(there, stage)) for there in earlier if there is not None))
 
 
 def check_same(

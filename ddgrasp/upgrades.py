@@ -153,6 +153,18 @@ def upgraded(config: Mapping[str, Any], version: int) -> dict[str, Any]:
     return made
 
 
+def without(config: Mapping[str, Any], version: int) -> dict[str, Any] | None:
+    """The JSON of a configuration of today without what `version`, 2 or later, lacked; None where it has a
+    value that could not be had then. Names that moved stay today's."""
+    made = copy.deepcopy(dict(config))
+    for lacking in range(version, VERSION):
+        for name, value in _ADDED_AFTER[lacking].items():
+            section, field = _section_of(made, name)
+            if section.pop(field, value) != value:
+                return None
+    return made
+
+
 def _name_start(teacher: dict[str, Any]) -> None:
     """Version 2 said by two fields what a policy starts from."""
     source, rounds = teacher.pop("init_from", ""), teacher.get("clone_rounds", _CLONE_ROUNDS)

@@ -9,7 +9,7 @@ from typing import Any
 from ddgrasp import contract
 from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
-from ddgrasp.config_hash import config_hash
+from ddgrasp.config_hash import config_hashes
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_bytes, to_json
 from ddgrasp.job import Job
@@ -17,7 +17,7 @@ from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.progress import Progress
 from ddgrasp.trained import trained_objects
 from deploy.timing import Timings
-from deploy.trial_log import TrialLog
+from deploy.trial_log import CONFIG_HASH, TrialLog
 from deploy.trials import RULES, TrialResult, keep_results, lasting, plan, run_trials, tried
 from rig.film import Film, contact_sheet
 
@@ -79,7 +79,7 @@ def _header(config: Config, policy_path: Path) -> dict[str, Any]:
         )
     return {
         "policy_sha256": hashlib.sha256(policy_path.read_bytes()).hexdigest(),
-        "config_hash": config_hash(config, STAGE),
+        CONFIG_HASH: config_hashes(config, STAGE),
         "trial_s": contract.TRIAL_S,
         "objects": list(tried(config).world.objects),
     } | RULES

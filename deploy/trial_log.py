@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,9 @@ from ddgrasp.config_hash import differences
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_text
 from deploy.trials import TrialResult
+
+CONFIG_HASH = "config_hash"
+"""What a header calls the hash of the configuration, or those that it may have."""
 
 
 class TrialLog:
@@ -24,9 +27,10 @@ class TrialLog:
         configuration or rule.
 
         Args:
-            header: what the trials belong to: the policy and the configuration.
+            header: what the trials belong to: the policy and the configuration, whose hash may be several,
+              of which a new log has the first, one that is there its own (`config_hashes`).
         """
-        self._path, self._header = path, header
+        self._path, self._header = path, _as_had(header, read_log(path)[0])
         self.results = self._read()
         if self.results:
             self._write()  # so that the next line starts on a line of its own
@@ -54,10 +58,19 @@ class TrialLog:
         atomic_write_text(self._path, "".join(map(_line, lines)))
 
 
+def _as_had(header: dict[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
+    """`header` with one hash of its configuration: that of the log, where it is one of them."""
+    hashes, had = header.get(CONFIG_HASH), there.get(CONFIG_HASH)
+    if not isinstance(hashes, list):
+        return header
+    return header | {CONFIG_HASH: had if had in hashes else hashes[0]}
+
+
 def read_own(path: Path, header: dict[str, Any]) -> list[TrialResult]:
     """The finished trials in a log. Raises UserError, which says what differs, if they belong to something
     else than `header` says."""
     there, results = read_log(path)
+    header = _as_had(header, there)
     if results and there != header:
         others = ", ".join(differences(there, header))
         raise UserError(

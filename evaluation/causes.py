@@ -21,7 +21,7 @@ from ddgrasp.versions import library_versions
 from deploy.changes import Change
 from deploy.fr3_trials import Fr3Bench
 from deploy.generated_camera import GENERATED, SHIPPED, digest
-from deploy.trial_log import read_log
+from deploy.trial_log import CONFIG_HASH, read_log
 from deploy.trials import Bench, Rig, TrialResult
 from evaluation import paired, rig_trials, wilson
 from evaluation.rig_trials import Series
@@ -240,7 +240,7 @@ def _row(out: Path, name: str, tried: Mapping[str, Mapping[int, bool]]) -> dict[
 def _differing(one: Path, other: Path) -> list[str]:
     """In what two rows were tried otherwise, policy and configuration included."""
     headers = [read_log(folder / rig_trials.TRIALS_FILE)[0] for folder in (one, other)]
-    return rig_trials.differing(*headers, alike=("policy_sha256", "config_hash"))
+    return rig_trials.differing(*headers, alike=("policy_sha256", CONFIG_HASH))
 
 
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:

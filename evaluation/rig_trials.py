@@ -12,7 +12,7 @@ from typing import Any, Literal
 from ddgrasp import contract
 from ddgrasp.alone import alone_in
 from ddgrasp.config import Config, StereoConfig
-from ddgrasp.config_hash import config_hash
+from ddgrasp.config_hash import config_hashes
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from ddgrasp.progress import Progress
@@ -24,7 +24,7 @@ from deploy.policy import OnnxPolicy
 from deploy.recorded import RecordedBench, episode_folder
 from deploy.stage import STAGE
 from deploy.treatment import Replacement, Treatment
-from deploy.trial_log import TrialLog, read_log, read_own
+from deploy.trial_log import CONFIG_HASH, TrialLog, read_log, read_own
 from deploy.trials import RULES, Bench, Rig, Trial, TrialResult, keep_results, lasting, run_trials
 from evaluation import failure_modes, wilson
 from evaluation.treatments import RECORDED, TreatmentName, make_treatment
@@ -368,7 +368,7 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any], alike: Sequence[
     known = (_DRAWS,) if _DRAWS in one and _DRAWS in other else ()
     if known and one[_DRAWS] != other[_DRAWS]:  # says it in words, where a header does
         known = (*known, STEREO)
-    covered = ("seconds",) if "config_hash" in alike else ()
+    covered = ("seconds",) if CONFIG_HASH in alike else ()
     keys = [key for key in (*_SAME, *known, *alike) if key not in covered]
     pairs = {key: (one.get(key), other.get(key)) for key in keys}
     return [f"{key} is {here}, not {there}" for key, (here, there) in pairs.items() if here != there]
@@ -380,7 +380,7 @@ def made_with(config: Config, policy: Path, trained: Sequence[str]) -> dict[str,
     config = replace(config, world=replace(config.world, objects=_listed()))
     return {
         "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
-        "config_hash": config_hash(config, STAGE),
+        CONFIG_HASH: config_hashes(config, STAGE),
         _DRAWS: _draws_hash(config),
         _TRAINED: list(trained),
     } | RULES

@@ -16,6 +16,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
+from ddgrasp.shipped import PRETRAINED
 from deploy import treatment
 from deploy.policy import OnnxPolicy
 from deploy.trial_log import read_log
@@ -273,6 +274,31 @@ def test_a_log_of_before_goes_on_and_keeps_its_header(tmp_path, policy):
     other = replace(CONFIG, world=replace(CONFIG.world, random=replace(CONFIG.world.random, joint_rad=0.0)))
     with pytest.raises(UserError, match="begun otherwise: config_hash is"):
         rig_trials.run(other, policy, SERIES, tmp_path, 0, QUIET)
+
+
+def test_a_log_of_an_earlier_version_goes_on_where_its_fields_alone_were_fewer(tmp_path, policy):
+    rig_trials.run(CONFIG, policy, SERIES, tmp_path, 0, QUIET)
+    log = tmp_path / TRIALS
+    header, *trials = log.read_text().splitlines(keepends=True)
+    now, then, *_ = rig_trials._header(CONFIG, policy, SERIES)["config_hash"]
+    assert json.loads(header)["config_hash"] == now != then
+    log.write_text("".join([json.dumps(json.loads(header) | {"config_hash": then}) + "\n", *trials]))
+    rig_trials.run(CONFIG, policy, replace(SERIES, trials=2), tmp_path, 0, QUIET)
+    assert read_log(log)[0]["config_hash"] == then and len(read_log(log)[1]) == 2
+    holes = replace(CONFIG, student=replace(CONFIG.student, ellipse_dropout=4.0))  # of a later version
+    with pytest.raises(UserError, match="begun otherwise: config_hash is"):
+        rig_trials.check_place(holes, policy, SERIES, tmp_path)
+
+
+@pytest.mark.parametrize("row", ["ddg", "sim_gt"])
+def test_the_configuration_of_shipped_logs_is_known_whatever_fields_have_come_since(row):
+    kept = read_log(PRETRAINED / "table2" / "trials" / "development-test-10" / row / TRIALS)[0]
+    series = Series("development", split="test", number=10, trials=50)
+    folder = PRETRAINED / "table2" / row
+    config = artifacts.config_from_json(artifacts.read_manifest(folder).config)
+    header = rig_trials._header(config, folder / POLICY_FILE, series)
+    assert kept["policy_sha256"] == header["policy_sha256"]
+    assert kept["config_hash"] in header["config_hash"][1:]
 
 
 def test_another_object_s_trial_of_the_same_number_is_not_taken_for_it(tmp_path, policy, monkeypatch):

@@ -64,6 +64,16 @@ def test_version_1_and_back_loses_nothing(name):
     assert upgrades.upgraded(value, upgrades.VERSION) == value
 
 
+@pytest.mark.parametrize("version", range(2, upgrades.VERSION + 1))
+def test_what_a_version_lacked_is_taken_away_and_comes_back(version):
+    value = json.loads(json.dumps(to_json(CONFIG)))
+    before = upgrades.without(value, version)
+    assert before is not None and (before == value) == (version == upgrades.VERSION)
+    assert upgrades.upgraded(before, max(version, 3)) == value if version > 2 else "scale" not in before
+    newer = json.loads(json.dumps(to_json(PRESETS["demo"])))  # retries, which version 9 could not
+    assert (upgrades.without(newer, version) is None) == (version < 14)
+
+
 def test_fields_named_by_hand_arrive_where_they_belong():
     flat = {
         "preset": "mine",
