@@ -14,6 +14,7 @@ from app.commands import parse
 from ddg_jax import stage, start
 from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator, generate, predict
+from ddgrasp import artifacts
 from ddgrasp.config import (
     Config,
     DDGConfig,
@@ -273,3 +274,22 @@ def test_flicker_is_counted_within_recordings_only():
     valid = np.array([0, 1, 1, 0, 0], bool)[:, None, None] * np.ones((1, 2, 2), bool)
     assert stage.flicker_fraction(valid, np.array([0, 0, 0, 1, 1])) == pytest.approx(1 / 3)
     assert np.isnan(stage.flicker_fraction(valid, np.arange(5)))
+
+
+OTHERWISE = {
+    "depth": {"near_m": 0.3, "far_m": 5.0, "surface": "planes", "representation": "depth"},
+    "diffusion": {"steps": 90, "schedule": "linear", "log_snr_shift": -1.0},
+    "unet": {"space_to_depth": 2, "widths": (8, 16), "blocks": (1, 1), "attention_heads": 2},
+}
+
+
+@pytest.mark.parametrize(("section", "name"), [(s, name) for s, names in OTHERWISE.items() for name in names])
+def test_a_generator_with_other_numbers_than_its_start_is_refused(tmp_path, section, name):
+    diffusion = dataclasses.replace(CONFIG.ddg.diffusion, steps=600)  # enough for a linear one too
+    ddg = dataclasses.replace(CONFIG.ddg, diffusion=diffusion)
+    artifacts.finish(tmp_path / "ddg", "ddg", dataclasses.replace(CONFIG, ddg=ddg), seconds=1.0, metrics={})
+    own = dataclasses.replace(getattr(ddg, section), **{name: OTHERWISE[section][name]})
+    graft = dataclasses.replace(ddg.graft, noise_threshold=-0.2)
+    other = dataclasses.replace(ddg, init_from=str(tmp_path), graft=graft, **{section: own})
+    with pytest.raises(UserError, match=rf"has ddg\.{section}\.{name} .*, this configuration"):
+        start.check(other)

@@ -105,3 +105,12 @@ def test_a_clock_that_follows_a_robot_needs_one_that_tells_the_time():
     with pytest.raises(UserError, match="robot 'sim' has no clock of its own: set deploy.clock machine"):
         keep_time_of(KinematicRobot(SimClock()), clock, SessionOptions("sim"))
     keep_time_of(KinematicRobot(SimClock()), RealClock(), SessionOptions("sim"))
+
+
+@pytest.mark.parametrize("model", contract.ARMS)
+def test_a_real_arm_brakes_before_its_limits_as_its_maker_says(model):
+    config, arm = replace(DEPLOY, franka=FrankaConfig(model=model)), contract.ARMS[model]
+    limits = safety_filter(config, describe(), "franka").limits
+    assert limits.braking_rad_s2 == arm.braking_rad_s2
+    assert limits.braking_reserve_rad_s == arm.braking_reserve_rad_s and min(arm.braking_reserve_rad_s) > 0
+    assert safety_filter(config, describe(), "sim").limits.braking_rad_s2 is None

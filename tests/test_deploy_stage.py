@@ -399,3 +399,17 @@ def test_loop_moves_the_arm_as_the_training_environment_does(policy):
     rig = rig_eval.Rig(CONFIG, policy)
     rig.run(trial)
     np.testing.assert_allclose(rig._world.data.qpos, world.data.qpos, atol=1e-6)
+
+
+@pytest.mark.parametrize("close", [True, False])
+def test_a_sim_robot_that_holds_keeps_what_its_gripper_does(close):
+    from rig.world import RigWorld
+
+    world, clock = RigWorld(objects=("cube",)), SimClock()
+    world.reset(0, "cube")
+    robot = SimRobot(world, clock)
+    robot.start()
+    robot.command(robot.read_state().q_rad, close)
+    robot.hold()
+    clock.sleep_until(1.0)
+    assert (robot.read_state().width_m < 0.01) == close

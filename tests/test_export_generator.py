@@ -289,3 +289,10 @@ def test_the_file_names_the_recordings_camera(tmp_path):
     assert exported.describe(artifact, CAMERA, room, "CC0").licence == "CC0"
     assert exported.describe(artifact, CAMERA).camera == {}  # not a run's own recordings
     assert described.planes(3) == 1 + 2 * 3 and described.stochastic
+
+
+def test_the_file_says_how_its_noise_hangs_together_over_time(tmp_path):
+    finished(made(CAMERA), tmp_path)
+    sampling = replace(CAMERA.sampling, frame_correlation=0.9, deviation_correlation=0.2)
+    info = exported.describe(artifacts.read_artifact(tmp_path), replace(CAMERA, sampling=sampling))
+    assert (info.frame_correlation, info.deviation_correlation) == (0.9, 0.2)

@@ -235,3 +235,19 @@ def test_without_noise_the_procedural_models_change_nothing():
     np.testing.assert_allclose(
         procedural.kinect(off, PROFILE)(jax.random.key(0), depth, None), depth, rtol=1e-5
     )
+
+
+def test_dextrah_frays_edges_by_its_shift_and_mixes_no_depths():
+    off = DextrahConfig(shift_px=1.5, disparity_px=0, dropout=0.0, random_value=0.0, stick=0.0)
+    clean = np.full(SIZE, 1.2, np.float32)
+    clean[:, 80:] = 0.6
+    noisy = np.asarray(procedural.dextrah(off, PROFILE)(jax.random.key(0), clean, None))
+    frayed = np.abs(noisy - clean) > 1e-3
+    assert frayed[:, 78:82].mean() > 0.1 and not frayed[:, :70].any() and not frayed[:, 90:].any()
+    np.testing.assert_allclose(noisy, np.where(noisy > 0.9, 1.2, 0.6), rtol=1e-5)
+
+
+def test_kinect_s_depth_is_off_by_its_axial_noise():
+    config = KinectConfig(shift_px=0, axial_per_m=0.002, steps_per_px=1e4)
+    noisy = np.asarray(procedural.kinect(config, PROFILE)(jax.random.key(0), jnp.full(SIZE, 1.5), None))
+    assert noisy.std() == pytest.approx(0.002 * 1.5**2, rel=0.05)

@@ -1,16 +1,18 @@
 """ImageNet's ResNet-18 as the student's first encoder weights."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
 import checkpoint_support as files
-from ddgrasp.config import EncoderConfig, StudentConfig, WorldConfig
+from ddgrasp.config import Config, EncoderConfig, StudentConfig, WorldConfig
 from ddgrasp.errors import UserError
+from ddgrasp.progress import Progress
 from foundation import convert, store
-from student_jax import policy, pretrained_encoder
+from student_jax import dagger, policy, pretrained_encoder
 from weights_support import resnet18
 
 PROFILE = WorldConfig().profile
@@ -102,3 +104,16 @@ def test_another_encoder_is_refused_and_none_is_said(weights):
         )
     with pytest.raises(UserError, match="weights convert"):
         pretrained_encoder.source(replace(RESNET18, encoder=replace(RESNET18.encoder, weights="nowhere")))
+
+
+def test_a_student_begins_with_the_weights_that_its_report_names(weights, tmp_path, monkeypatch):
+    directory, theirs = weights
+    student = replace(RESNET18, encoder=replace(RESNET18.encoder, weights=str(directory)))
+    monkeypatch.setattr(dagger, "init_params", lambda *_: {"encoder": fresh_encoder(student)})
+    nobody: Any = None
+    trainer = dagger.Trainer(Config("test", student=student), nobody, nobody, tmp_path, Progress(quiet=True))
+    trainer._restore()
+    np.testing.assert_array_equal(
+        trainer.params["encoder"]["stage3_block1"]["second"]["conv"]["kernel"],
+        theirs["layer4.1"]["conv2"]["kernel"],
+    )

@@ -339,3 +339,22 @@ def test_every_episode_has_a_camera_of_its_own_within_the_configured_error(compi
         assert np.abs(axis).max() <= most_m + 1e-6 and np.ptp(axis) > most_m / 2
         assert np.diff(np.sort(axis)).min() > 1e-6
     assert len(np.unique(cameras[:, :3, :3].reshape(len(cameras), -1), axis=0)) == 2 * COUNT
+
+
+def test_a_plan_fits_on_the_demos_and_after_every_round_on_all_so_far(trainer, roller, monkeypatch):
+    fits = []
+
+    def fit(self, phase, steps):
+        fits.append((phase, steps, len(self._store)))
+        return {}
+
+    monkeypatch.setattr(dagger.Trainer, "_restore", lambda self: None)
+    monkeypatch.setattr(dagger.Trainer, "_fit", fit)
+    monkeypatch.setattr(dagger.Trainer, "_fit_on_poses", lambda self: fit(self, "poses", 0))
+    monkeypatch.setattr(dagger.Trainer, "_fit_on_perception", lambda self: fit(self, "head", 0))
+    monkeypatch.setattr(dagger.frames_io, "add_noisy_demos", lambda *_: None)  # the fixture's are there
+    trainer._student = replace(CONFIG.student, dagger=replace(CONFIG.student.dagger, steps=7))
+    trainer.run(range(DEMOS))
+    rounds = [(f"dagger-{i}", 7, DEMOS + i * COUNT) for i in (1, 2, 3)]
+    first = [("poses", 0, DEMOS), ("demos", CONFIG.student.training.steps, DEMOS)]
+    assert fits == [*first, *rounds, ("head", 0, DEMOS + 3 * COUNT)]

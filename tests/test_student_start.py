@@ -99,3 +99,17 @@ def test_a_start_whose_holes_were_left_open_is_taken_and_that_is_said(
         )._restore()
     (said,) = Notes.said
     assert "trained with student.picture.fill_holes False, here it is True" in said
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "here"),
+    [
+        ("picture", "channels", ("valid", "relief")), ("encoder", "output_stride", 4),
+        ("hand_view", "pitch_m", 0.006), ("head", "diffusion_steps", 60),
+    ],
+)  # fmt: skip
+def test_a_start_whose_numbers_mean_something_else_is_refused(finished, section, name, here):
+    """Arrays of the same shape."""
+    other = replace(finished, **{section: replace(getattr(finished, section), **{name: here})})
+    with pytest.raises(UserError, match=rf"student\.{section}\.{name} .*, this configuration .*: use"):
+        start._check_meaning(other)

@@ -641,3 +641,31 @@ def test_an_object_that_is_not_seen_is_a_hole_as_large_as_it_is():
     np.testing.assert_array_equal(
         unseen_objects(jax.random.key(0), stack, WHOLE, grasp, PROFILE, none), stack
     )
+
+
+def test_a_share_of_the_objects_that_lie_is_not_seen():
+    training = dataclasses.replace(CONFIG.training, unseen_share=0.25)
+    config = dataclasses.replace(CONFIG, training=training)
+    depth, stack, first_px, size, (row, column) = _parts_of_a_block()
+    x, y = (column + 2 - PROFILE.cx_px) / PROFILE.fx_px, (row + 2 - PROFILE.cy_px) / PROFILE.fy_px
+    camera = nominal_camera(PROFILE).T_world_cam
+    place = camera[:3, 3] + camera[:3, :3] @ [x, y, 1.0] * depth[row + 2, column + 2]
+    part, first_px = cut(stack, first_px, size)[:1].repeat(400, 0), first_px[:1].repeat(400, 0)
+    grasp = jnp.asarray(place, jnp.float32)[None].repeat(400, 0)
+    made = unseen_objects(jax.random.key(0), part, first_px, grasp, PROFILE, config)
+    assert (np.asarray(made) == 0).any((1, 2, 3)).mean() == pytest.approx(0.25, abs=0.07)
+
+
+def test_a_step_s_average_has_the_configured_decay(monkeypatch):
+    """Of two steps the first has rate 0; decay min(0.9, (1 + n) / (10 + n)) is 0.9 from step 80 on."""
+    monkeypatch.setattr(train, "StudentPolicy", _Blind)
+    training = dataclasses.replace(CONFIG.training, **PLAIN, ema_decay=0.9)
+    config = dataclasses.replace(CONFIG, training=training)
+    batch = train.make_batch(frames_of(), np.arange(4), np.random.default_rng(0), config, PROFILE)
+    key = jax.random.key_data(jax.random.key(0))
+    state = first_state({"encoder": np.float32(0.5)}, train.make_optimizer(config, 500), key)
+    state = state.replace(step=jnp.asarray(200))
+    for _ in range(2):
+        state, _ = train.train_step.__wrapped__(config, PROFILE, 500, state, {}, batch)
+    moved, averaged = (float(tree["encoder"]) - 0.5 for tree in (state.params, state.ema))
+    assert abs(moved) > 1e-6 and averaged == pytest.approx(0.1 * moved, rel=1e-2)

@@ -8,11 +8,12 @@ import pytest
 
 from ddgrasp.config import TeacherConfig, WorldConfig
 from ddgrasp.errors import UserError
+from ddgrasp.layout import OBSERVATION
 from ddgrasp.progress import Progress
 from mjx_envs.grasp_env import GraspEnv
 from ppo import learner, warmup
 from ppo.policy import TeacherPolicy, from_learner
-from teacher_support import learner_without_envs
+from teacher_support import learner_without_envs, still_teacher
 
 TEACHER = TeacherConfig(
     start="guide", clone_rounds=2, clone_steps=200, clone_envs=64, hidden=(64,), gripper_std=0.4
@@ -98,3 +99,14 @@ def test_a_clone_that_diverges_ends_in_one_line(clone, monkeypatch):
     with pytest.raises(UserError, match="Cloning the guide diverged in round 0: clone_loss is nan") as error:
         clone()
     assert "\n" not in str(error.value)
+
+
+def test_the_guide_acts_in_its_share_and_the_policy_otherwise(collector, monkeypatch):
+    """A policy of zeros stands still."""
+    monkeypatch.setattr(warmup, "ACTION_NOISE", 0.0)
+    moved = []
+    for share in (0.0, 1.0):
+        seen, _ = collector(still_teacher(), UNSEEN, share)
+        arm = seen[:, OBSERVATION.arm].reshape(STEPS, -1, 7)
+        moved.append(np.abs(arm[-1] - arm[0]).max(axis=1))
+    assert moved[0].max() < 0.03 and moved[1].min() > 0.1

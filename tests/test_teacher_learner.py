@@ -411,3 +411,22 @@ def test_step_sizes_fall_to_a_tenth_while_each_of_both_learns():
         assert float(taken[steps // 2]) == pytest.approx(0.55 * rate, rel=1e-3)
         assert float(taken[steps - 1]) == pytest.approx((0.1 + 0.9 / steps) * rate, rel=1e-3)
         assert float(taken[steps]) == pytest.approx(0.1 * rate, rel=1e-3)
+
+
+def test_training_leaves_the_policy_of_its_best_evaluation(tmp_path, monkeypatch):
+    """Each iteration doubles the weights: those after the second are four times the first ones."""
+    teacher = dataclasses.replace(TEACHER, eval_every=1)
+    first, rates = learner_without_envs(teacher), iter([0.1, 0.4, 0.9, 0.2, 0.3])
+
+    def iterate(state):
+        curves = {name: jnp.zeros(()) for name in ("success", *learner.COUNTED)}
+        return replace(_scaled(state, 2.0), iteration=state.iteration + 1), curves, {}
+
+    monkeypatch.setattr(ppo_train, "_start", lambda *_: first)
+    monkeypatch.setattr(ppo_train, "compile_iteration", lambda *_: iterate)
+    monkeypatch.setattr(ppo_train, "_evaluate", lambda *_: next(rates))
+    with Checkpoints(tmp_path / "c") as saved:
+        config = dataclasses.replace(CONFIG, teacher=teacher)
+        ppo_train._train(config, tmp_path, object.__new__(AutoReset), saved, Progress(quiet=True))
+    kept = teacher_policy.load_state(tmp_path)["layers"]["hidden_0"]["kernel"]
+    np.testing.assert_allclose(kept, 4.0 * first.params.policy["params"]["hidden_0"]["kernel"], rtol=1e-6)

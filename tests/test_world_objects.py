@@ -376,3 +376,13 @@ def test_a_thirteenth_object_is_one_dataclass(monkeypatch, spec, layout):
             world.command(targets[:7], close=bool(action[7] > 0))
             world.step(contract.CONTROL_DT_S)
         assert world.success(), seed
+
+
+@pytest.mark.parametrize("name", EVERYTHING)
+def test_a_larger_one_is_so_in_all_of_its_parts(name):
+    layout = slot_layout([get_object(name)])
+    nominal = get_object(name).model(layout)
+    large = nominal.scaled(1.05, 1.0, 1.0)
+    for part in ("slot_size", "slot_pos"):
+        np.testing.assert_allclose(getattr(large, part), 1.05 * getattr(nominal, part))
+    np.testing.assert_array_equal(large.slot_quat, nominal.slot_quat)
