@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ddgrasp import contract
 from ddgrasp.errors import UserError
 from deploy.policy import OnnxPolicy
 from deploy_support import HOME_RAD, SHAPE, constant_bias, depth_mm, describe, write_policy
@@ -208,7 +209,7 @@ def test_damaged_file_of_a_finished_export_says_what_to_delete(tmp_path):
 
 
 def test_graph_that_contradicts_its_metadata_is_refused(tmp_path):
-    lying = describe(depth_height=SHAPE[0] + 1).to_json()
+    lying = describe(profile=contract.D455.scaled(0.05)).to_json()
     with pytest.raises(UserError, match="'depth' has shape"):
         OnnxPolicy(write_policy(tmp_path / "p.onnx", properties={"ddgrasp": lying}))
     lying = describe("float32_m").to_json()
