@@ -17,6 +17,7 @@ from ddgrasp.presets import PRESETS
 from ddgrasp.progress import Progress
 from learning import memory
 from recording_support import flat, set_meta, write_depth
+from sensors.recordings.writer import RecordingWriter
 from sensors.statistics.holes import fill_from_background
 
 
@@ -334,6 +335,27 @@ def test_what_cannot_be_used_is_named_and_counted(recordings):
     )
     few = data.load_frames(recordings, config, prior.make_prior(config), 0, Progress(quiet=True), 3)
     np.testing.assert_array_equal(few.depth_m, frames.depth_m[:3])
+
+
+def test_colours_are_those_of_the_frames_that_can_be_used(tmp_path):
+    """Frame n is 60 n bright; the second is blind in the window that a wide generator sees."""
+    edge = np.zeros((64, 64), np.uint16)
+    edge[0] = 900
+    with RecordingWriter(tmp_path / "a", {}) as writer:
+        for number in range(4):
+            depth_mm = edge if number == 1 else flat((64, 64), 900 + number)
+            writer.add(np.full((64, 64, 3), 60 * number, np.uint8), depth_mm)
+
+    class Coloured(prior.InverseDepthPrior):
+        needs_rgb = True
+
+        def from_recording(self, depth, rgb, rng, consecutive=True):
+            self.seen = rgb.mean(axis=(1, 2, 3))
+            return super().from_recording(depth, None, rng, consecutive)
+
+    coloured = Coloured(0.0)
+    data.load_frames(tmp_path, WIDE, coloured, 0, Progress(quiet=True))
+    np.testing.assert_allclose(coloured.seen, [0, 120, 180], atol=5)
 
 
 def test_no_frame_behind_the_first_ones_is_read_for_those_that_cannot_be_used(tmp_path):
