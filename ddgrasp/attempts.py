@@ -37,7 +37,7 @@ def begin(
 
     UserError if an unfinished attempt there used others, or another contract version: its checkpoints would
     not fit. Without `write` it only looks: another process marks the place. Without `clean` half-written
-    files stay: another process may be writing them.
+    files stay, those of killed attempts too: another process may be writing them.
     """
     inputs = dict(inputs or {})
     if write and clean:

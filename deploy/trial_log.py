@@ -33,7 +33,7 @@ class TrialLog:
         self._path, self._header = path, _as_had(header, read_log(path)[0])
         self.results = self._read()
         if self.results:
-            self._write()  # so that the next line starts on a line of its own
+            self._write(self.results)  # so that the next line starts on a line of its own
 
     def append(self, result: TrialResult) -> None:
         """Add a finished trial; it is on the disk when this returns.
@@ -41,20 +41,21 @@ class TrialLog:
         Raises UserError if others have begun the file meanwhile, as `__init__` does.
         """
         if not self.results:
-            self.results = {**self._read(), result.key: result}
-            self._write()
+            results = {**self._read(), result.key: result}
+            self._write(results)
+            self.results = results  # not before: a write that was interrupted has left no file to add to
             return
-        self.results[result.key] = result
         with open(self._path, "a") as file:
             file.write(_line(asdict(result)))
             file.flush()
             os.fsync(file.fileno())
+        self.results[result.key] = result
 
     def _read(self) -> dict[tuple[int, bool], TrialResult]:
         return {result.key: result for result in read_own(self._path, self._header)}
 
-    def _write(self) -> None:
-        lines = [self._header, *map(asdict, self.results.values())]
+    def _write(self, results: Mapping[tuple[int, bool], TrialResult]) -> None:
+        lines = [self._header, *map(asdict, results.values())]
         atomic_write_text(self._path, "".join(map(_line, lines)))
 
 

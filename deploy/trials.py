@@ -275,8 +275,8 @@ def run_trials(
 def keep_results(
     made: Generator[tuple[TrialResult, Film], None, None], keep: Callable[[TrialResult, Film], None]
 ) -> None:
-    """Gives `keep` whatever comes of `run_trials`. Ctrl-C in the middle of it costs no more than while it
-    waits: trials that run come to their end, and are kept."""
+    """Gives `keep` whatever comes of `run_trials`. Ctrl-C costs at most the one that is being kept: trials
+    that run come to their end, and are kept."""
     try:
         for result, film in made:
             keep(result, film)

@@ -155,6 +155,9 @@ def run(
     about = {"number": series.number, "policy": str(policy), "other_tables": config.record.other_tables}
     if set_to := rig_trials.stereo_set_to(config):
         belong_to[rig_trials.STEREO] = about[rig_trials.STEREO] = set_to
+    # Rows are compared by it: new ones of a folder that an earlier version began have that version's.
+    there = {read_log(out / name / rig_trials.TRIALS_FILE)[0].get(CONFIG_HASH) for name in ROWS}
+    belong_to[CONFIG_HASH] = sorted(belong_to[CONFIG_HASH], key=lambda made: made not in there)
     headers = {name: belong_to | {"row": name} for name in names}
     if generated := [name for name in names if ROWS[name].generated]:
         drawn_by = {"generator_sha256": digest(generator, config.world.profile)}

@@ -266,7 +266,7 @@ def test_after_something_in_the_way_the_arm_goes_back_and_takes_free_ways_alone(
     monkeypatch.setattr(poses, "is_free_way", lambda *way: False)
     with pytest.raises(UserError, match="none of 7 poses gave a picture"):
         session.run(fast(), options(tmp_path), said.append)
-    assert said[-1] == "pose 7 of 7: left out, no free way from the last pose that was reached"
+    assert said[-1] == "pose 7 of 7: left out, no free way from where the arm stands"
 
 
 def test_an_arm_that_gets_neither_on_nor_back_ends_the_run(tmp_path, bench):

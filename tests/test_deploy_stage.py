@@ -30,7 +30,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.layout import QPOS
 from ddgrasp.progress import Progress
 from ddgrasp.shipped import PRETRAINED
-from deploy import stage
+from deploy import stage, trial_log
 from deploy import trials as rig_eval
 from deploy.clock import SimClock
 from deploy.devices.rig_robot import SimRobot
@@ -413,3 +413,19 @@ def test_a_sim_robot_that_holds_keeps_what_its_gripper_does(close):
     robot.hold()
     clock.sleep_until(1.0)
     assert (robot.read_state().width_m < 0.01) == close
+
+
+def test_a_log_whose_first_write_is_interrupted_begins_with_its_header_all_the_same(tmp_path, monkeypatch):
+    path, header = tmp_path / "trials.jsonl", {"policy_sha256": "a"}
+    log, write = TrialLog(path, header), trial_log.atomic_write_text
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trial_log, "atomic_write_text", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        log.append(result(0))
+    monkeypatch.setattr(trial_log, "atomic_write_text", write)
+    for index in (1, 2):
+        log.append(result(index))
+    assert {key[0] for key in TrialLog(path, header).results} == {1, 2}

@@ -220,6 +220,18 @@ def test_logs_of_other_lengths_are_not_paired_and_old_ones_without_go_on(tmp_pat
         causes.run(CONFIG, policy, (causes.REFERENCE,), long, tmp_path / "again", 0)
 
 
+def test_new_rows_of_a_folder_that_an_earlier_version_began_are_compared_with_its_own(tmp_path, policy):
+    short = replace(SERIES, objects=("cube",))
+    causes.run(CONFIG, policy, (causes.REFERENCE,), short, tmp_path, 0)
+    log = tmp_path / causes.REFERENCE / rig_trials.TRIALS_FILE
+    config = causes.one_pose(replace(short, rig="development").configured(CONFIG, policy))
+    now, then, *_ = rig_trials.made_with(config, policy, ())["config_hash"]
+    log.write_text(log.read_text().replace(now, then))
+    made = causes.run(CONFIG, policy, (causes.REFERENCE, "ideal"), short, tmp_path, 0)
+    assert read_log(tmp_path / "ideal" / rig_trials.TRIALS_FILE)[0]["config_hash"] == then
+    assert made["rows"][-1]["pairs"] is not None
+
+
 def test_a_row_that_was_begun_otherwise_is_said_before_any_is_tried(tmp_path, policy):
     names = causes.chosen(("ideal", "off_10mm"))
     short = replace(SERIES, objects=("cube",))

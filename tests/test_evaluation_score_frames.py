@@ -59,6 +59,8 @@ def test_frames_that_are_blind_at_the_score_s_size_are_left_out(tmp_path):
     found = score_data.load_real(tmp_path / "a", 32, 24)
     assert (found.blind, len(found.depth_mm), found.apart) == (1, 23, {0: tmp_path / "a"})
     assert found.depth_mm.min() == 700 and 712 not in found.depth_mm
+    first = score_data.load_real(tmp_path / "a", 32, 12)  # no gap: nothing is before it
+    assert (first.blind, len(first.depth_mm), first.apart) == (1, 11, {})
     behind = score_data.load_real(tmp_path / "a", 32, 11)
     assert (behind.blind, len(behind.depth_mm), behind.apart) == (0, 11, {})
     write_depth(tmp_path / "b", [blind], **about)

@@ -85,7 +85,7 @@ def test_trials_by_themselves_are_told_or_refused_before_they_begin(tmp_path, mo
     with pytest.raises(UserError, match="params.msgpack"):  # it got as far as that
         evaluate()
     said = capsys.readouterr().err.splitlines()
-    assert said[0].startswith(f"{run}/student was made of another teacher than {run}/teacher, which it is")
+    assert said[0].startswith(f"{run}/student names another teacher, by its manifest, than {run}/teacher,")
     assert said[1].startswith("student eval: about ")
     free = SimpleNamespace(free=10**8)
     monkeypatch.setattr("learning.memory.shutil.disk_usage", lambda path: free)

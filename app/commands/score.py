@@ -63,7 +63,8 @@ class Scoring:
         stage, source = get_stage(stage_name), self.run_dir or self.out
         for name in stage.parents:
             if artifacts.is_finished(source / name):
-                artifacts.check_stage("--run-dir", source / name, name)
+                option = "--run-dir" if self.run_dir else "--out"
+                artifacts.check_stage(option, source / name, name)
         config = replace(load_config(source, "ddg"), score=self.score, seed=self.seed)
         parents = {name: artifacts.read_artifact(source / name) for name in stage.parents}
         pipeline.make(stage, config, self.out, resume=self.resume, parents=parents)

@@ -42,7 +42,7 @@ class StudentEval:
     def run(self) -> None:
         """Prints success on clean depth and on training's, with Wilson intervals, and perception's error."""
         config = load_config(self.run_dir, "student")
-        _tell_of_others(self.run_dir)
+        _tell_of_others(self.run_dir, config)
         from ddgrasp.progress import Progress
         from evaluation import wilson
         from evaluation.report.summary import perceived
@@ -65,14 +65,16 @@ class StudentEval:
             print(f"{name:<14} {rate}{perceived(counts)}")
 
 
-def _tell_of_others(run_dir: Path) -> None:
-    """Says on standard error which of a run's parts are not those that its student was made of."""
+def _tell_of_others(run_dir: Path, config: Config) -> None:
+    """Says on standard error what a student is measured with and its manifest does not name."""
+    from student_jax.source_check import LEARNED
+
     made_of = artifacts.read_manifest(run_dir / "student").parents
-    for name in ("teacher", "ddg"):
+    for name in ("teacher", *(("ddg",) if config.student.depth_source in LEARNED else ())):
         if (digest := made_of.get(name)) and artifacts.read_artifact(run_dir / name).hash != digest:
             print(
-                f"{run_dir / 'student'} was made of another {name} than {run_dir / name}, which it is "
-                "measured with.",
+                f"{run_dir / 'student'} names another {name}, by its manifest, than {run_dir / name}, which "
+                "it is measured with.",
                 file=sys.stderr,
                 flush=True,
             )

@@ -175,8 +175,8 @@ def _take(
         driver.grip(close=True)
         stood = driver.joints()  # not where it was planned from: a person may have led it aside
         for number, q_target in enumerate(ways, start=1):
-            if not poses.is_free_way(bench, stood, q_target):  # not the planned one: a pose was left out
-                came = "left out, no free way from the last pose that was reached"
+            if not poses.is_free_way(bench, stood, q_target):  # the planned one may be from elsewhere
+                came = "left out, no free way from where the arm stands"
             elif driver.go(q_target):
                 stood, came = q_target, _view(driver, imager, options.board, taken)
             else:

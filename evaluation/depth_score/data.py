@@ -180,7 +180,7 @@ class RealFrames:
     """Recordings among them whose colour is not aligned to depth."""
     apart: Mapping[int, Path] = field(default_factory=dict)
     """Recordings among them whose frames may be of different moments (`Recording.consecutive`), or of which
-    some are left out as blind, by number."""
+    some between them are left out as blind, by number."""
     blind: int = 0
     """How many are left out, since hardly a pixel is valid at this size."""
 
@@ -224,8 +224,11 @@ def load_real(root: Path, width_px: int, last: int) -> RealFrames:
     scored = [recordings[number] for number in np.unique(numbers)]
     focal_px, baseline_m = _optics(scored)
     unaligned = tuple(r.path for r in scored if not r.color_aligned)
-    whole = {number for number, r in enumerate(recordings) if r.consecutive} - {number for number, _ in blind}
-    apart = {int(number): recordings[number].path for number in np.unique(numbers) if number not in whole}
+    kept = {n: [i for number, i in taken if number == n] for n, _ in blind}
+    gaps = {n for n, i in blind if kept[n] and min(kept[n]) < i < max(kept[n])}
+    apart = {
+        int(n): recordings[n].path for n in np.unique(numbers) if n in gaps or not recordings[n].consecutive
+    }
     depth_mm = np.stack([pictures[at] for at in taken])
     chosen = [recordings[number].rgb(i) for number, i in taken]
     rgb = np.stack([cv2.resize(picture, size[::-1], interpolation=cv2.INTER_AREA) for picture in chosen])
