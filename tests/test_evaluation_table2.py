@@ -379,6 +379,7 @@ def test_the_kept_logs_give_the_pairs_of_the_page(tmp_path, kept, rows_and_p):
     if kept == "development-test-10":
         ripple = _pairs(of["tables"]["ripple"])
         assert (ripple["ddg_ripple"], ripple["rand_noise_ripple"]) == ((19, 23), (46, 21))
+        assert ripple["sim_gt_ripple"] == (301, 16)
         assert _pairs(of["tables"]["grafting"]) == {"paper_ddg_no_graft": (217, 26)}
     if kept == "development-test-12-overexposed":
         holes = _pairs(of["tables"]["ellipses"])
