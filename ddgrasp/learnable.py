@@ -51,9 +51,9 @@ def _check_time(config: Config) -> None:
 
 def _check_bonus(config: Config) -> None:
     """PPO's sums of it are float32."""
-    reward = config.world.reward
     if not config.teacher.total_steps:
         return
+    reward = config.world.reward
     count = min(reward.bonus_max_count, config.world.episode_steps)
     if math.log(reward.bonus_base) + count * math.log(reward.bonus_growth) > math.log(_MOST_BONUS):
         raise UserError(

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -30,8 +30,10 @@ class TrialLog:
             header: what the trials belong to: the policy and the configuration, whose hash may be several,
               of which a new log has the first, one that is there its own (`config_hashes`).
         """
-        self._path, self._header = path, _as_had(header, read_log(path)[0])
-        self.results = self._read()
+        there, results = read_log(path)
+        self._path, self._header = path, _as_had(header, there)
+        _check_own(path, self._header, there, results)
+        self.results = {result.key: result for result in results}
         if self.results:
             self._write(self.results)  # so that the next line starts on a line of its own
 
@@ -71,14 +73,19 @@ def read_own(path: Path, header: dict[str, Any]) -> list[TrialResult]:
     """The finished trials in a log. Raises UserError, which says what differs, if they belong to something
     else than `header` says."""
     there, results = read_log(path)
-    header = _as_had(header, there)
+    _check_own(path, _as_had(header, there), there, results)
+    return results
+
+
+def _check_own(
+    path: Path, header: Mapping[str, Any], there: Mapping[str, Any], results: Sequence[TrialResult]
+) -> None:
     if results and there != header:
         others = ", ".join(differences(there, header))
         raise UserError(
             f"{path} was begun otherwise: {others}. Choose another --out, or delete {path.parent} and its "
             f"{len(results)} trials."
         )
-    return results
 
 
 def read_log(path: Path) -> tuple[dict[str, Any], list[TrialResult]]:
