@@ -153,6 +153,8 @@ def test_monocular_depth_is_fitted_to_the_measured_one():
     np.testing.assert_allclose(network_prior.metric_depth(relative, measured, 10.0), truth, rtol=1e-5)
     with pytest.raises(UserError, match="no two valid"):
         network_prior.metric_depth(relative, np.zeros((6, 8)), 10.0)
+    nearer = network_prior.metric_depth(relative, measured, 1.0)
+    np.testing.assert_allclose(nearer, np.minimum(truth, 1.0), rtol=1e-5)
 
 
 def test_monocular_depth_has_the_scale_of_what_was_measured_and_no_holes(weights):

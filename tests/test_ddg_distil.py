@@ -148,6 +148,23 @@ def test_teacher_and_student_see_the_prior_under_the_same_noise(monkeypatch):
     assert off.std() == pytest.approx(0.2, rel=0.05) and abs(off.mean()) < 0.02
 
 
+def test_a_step_s_average_has_the_configured_decay(monkeypatch):
+    """Not compiled; decay min(0.9, (1 + n) / (10 + n)) is 0.9 from step 80 on. Half the steps warm up."""
+    monkeypatch.setattr(distil, "predict_clean", lambda config, params, x_k, *_: params["w"] * x_k)
+    training = dataclasses.replace(DISTILLED.training, distil_steps=500, ema_decay=0.9)
+    config = dataclasses.replace(DISTILLED, training=training)
+    params = {"w": jnp.float32(0.5)}
+    optimizer = train.make_optimizer(config, 500, distil.LEARNING_RATE)
+    state = first_state(params, optimizer, jax.random.key_data(jax.random.key(0)))
+    state = state.replace(step=jnp.asarray(200))
+    path = distil.teacher_path(100, 4, np.array([0, 1, 2, 3]), "trailing")
+    x_0, c = jnp.zeros((4, 16, 24, 2)), jnp.full((4, 16, 24), 0.7)
+    for _ in range(2):
+        state, _ = distil.distil_step.__wrapped__(config, state, params, 1.0, path, x_0, c)
+    moved, averaged = (float(tree["w"]) - 0.5 for tree in (state.params, state.ema))
+    assert abs(moved) > 1e-6 and averaged == pytest.approx(0.1 * moved, rel=1e-2)
+
+
 @pytest.fixture(scope="module")
 def teacher():
     return jax.tree.map(np.asarray, made_up_teacher())

@@ -4,6 +4,7 @@ import dataclasses
 from functools import cache
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
@@ -158,6 +159,21 @@ def test_a_step_puts_the_configured_noise_on_the_prior(monkeypatch):
     train.train_step.__wrapped__(config, state, x_0, c)
     off = np.asarray(given[0]) - c
     assert off.std() == pytest.approx(0.2, rel=0.05) and abs(off.mean()) < 0.02
+
+
+def test_a_step_s_average_has_the_configured_decay(monkeypatch):
+    """Not compiled; decay min(0.9, (1 + n) / (10 + n)) is 0.9 from step 80 on. The first step has rate 0."""
+    monkeypatch.setattr(train, "noise_loss", lambda config, params, *_: params["w"])
+    config = dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, steps=500, ema_decay=0.9))
+    key = jax.random.key_data(jax.random.key(0))
+    state = first_state({"w": np.float32(0.5)}, train.make_optimizer(config, 500), key)
+    state = state.replace(step=jnp.asarray(200))
+    for _ in range(2):
+        state, _ = train.train_step.__wrapped__(
+            config, state, np.zeros((8, 16, 24, 2)), np.zeros((8, 16, 24))
+        )
+    moved, averaged = (float(tree["w"]) - 0.5 for tree in (state.params, state.ema))
+    assert abs(moved) > 1e-6 and averaged == pytest.approx(0.1 * moved, rel=1e-2)
 
 
 def test_resume_equals_an_uninterrupted_run(tmp_path):

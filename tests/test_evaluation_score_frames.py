@@ -46,7 +46,8 @@ def write_recording(path: Path, aligned: bool) -> None:
 def test_colour_of_recordings_that_are_not_scored_counts_for_nothing(tmp_path):
     write_recording(tmp_path / "a", aligned=False)
     write_recording(tmp_path / "b", aligned=True)
-    assert score_data.load_real(tmp_path, 32, 8).unaligned == ()
+    found = score_data.load_real(tmp_path, 32, 8)
+    assert found.unaligned == () and found.focal_px == 20.0  # 40 px of a picture twice as wide
     assert score_data.load_real(tmp_path, 32, 9).unaligned == (tmp_path / "a",)
 
 

@@ -110,6 +110,17 @@ def test_occlusion_shadow_lies_on_the_left_of_an_object():
     assert np.mean(np.abs(middle.astype(int) - 600) < 15) > 0.95
 
 
+def test_the_projector_s_dots_do_not_reach_behind_an_object():
+    """It stands right of the left imager, which sees the unlit band of the wall left of the object."""
+    camera, half_m, near_m = ActiveStereo(StereoConfig(), PROFILE), 0.1, 0.5
+    plain = {geom: Material(0.5, specular=0.0) for geom in (0, 1)}
+    left, _ = camera.infrared(wall(1.6, near_m, half_m), T_WORLD_CAM, np.random.default_rng(0), plain)
+    edges = (round(PROFILE.cx_px + side * half_m / near_m * PROFILE.fx_px) for side in (-1, 1))
+    rough = np.abs(np.diff(left[70:110].astype(float), axis=1)).mean(axis=0)
+    behind, beside = (rough[at : at + 8].mean() for at in (next(edges) - 11, next(edges) + 3))
+    assert behind < 0.4 * beside
+
+
 def test_holes_come_from_matching_without_texture_there_is_no_depth():
     blank = {0: Material(0.5)}
     assert np.mean(sense(wall(0.8), materials=blank, projector_power=0.0) > 0) < 0.05

@@ -656,6 +656,19 @@ def test_a_share_of_the_objects_that_lie_is_not_seen():
     assert (np.asarray(made) == 0).any((1, 2, 3)).mean() == pytest.approx(0.25, abs=0.07)
 
 
+def test_the_head_s_average_has_the_configured_decay(monkeypatch):
+    """As the step's on pictures, below."""
+    monkeypatch.setattr(train, "diffusion_loss", lambda config, policy, head, *_: head["w"])
+    config = dataclasses.replace(CONFIG, training=dataclasses.replace(CONFIG.training, ema_decay=0.9))
+    key = jax.random.key_data(jax.random.key(0))
+    state = first_state({"w": np.float32(0.5)}, train.make_optimizer(config, 500), key)
+    state = state.replace(step=jnp.asarray(200))
+    for _ in range(2):
+        state, _ = train.head_step.__wrapped__(config, PROFILE, 500, state, None, None, None)
+    moved, averaged = (float(tree["w"]) - 0.5 for tree in (state.params, state.ema))
+    assert abs(moved) > 1e-6 and averaged == pytest.approx(0.1 * moved, rel=1e-2)
+
+
 def test_a_step_s_average_has_the_configured_decay(monkeypatch):
     """Of two steps the first has rate 0; decay min(0.9, (1 + n) / (10 + n)) is 0.9 from step 80 on."""
     monkeypatch.setattr(train, "StudentPolicy", _Blind)

@@ -201,6 +201,8 @@ def test_shares_of_exploring_starts_are_turned_down(exploring):
     random = replace(NOTHING, pregrasp_share=0.5, held_share=0.5)
     env = AutoReset(GraspEnv(WorldConfig(objects=("cube",), random=random)))
     state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 400))
+    length = env.env.config.episode_steps  # episodes of a batch do not end together
+    np.testing.assert_array_equal(state.info["episode"].steps, np.arange(400) % length)
     qpos = np.asarray(jax.jit(env.refresh)(state, exploring).info["next"][0].qpos)
     held = qpos[:, QPOS.object_pos][:, 2] > 0.026
     moved = np.abs(qpos[:, QPOS.arm] - contract.HOME_RAD).max(axis=1) > 1e-6
