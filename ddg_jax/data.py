@@ -19,7 +19,14 @@ from ddgrasp.depth import crop_nearest, inverse_depth, window
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import memory
-from sensors.recordings.recording import Recording, depth_picture_count, find_recordings, recording_folders
+from sensors.recordings.recording import (
+    META_FILE,
+    Recording,
+    depth_picture_count,
+    find_recordings,
+    recording_folders,
+    unfinished,
+)
 from sensors.statistics.holes import fill_from_background, smooth_surface
 from sensors.statistics.planes import on_planes
 
@@ -160,6 +167,8 @@ def _loaded(
     host = frames_bytes(config, pictures if max_frames is None else min(pictures, max_frames))
     memory.check(memory.Need("ddg", 0, host, remedy="the number of recordings"), root)
     most = sys.maxsize if max_frames is None else max_frames
+    for folder in unfinished(root):
+        progress.note(f"left out: {folder} has no {META_FILE}, so it is unfinished or no recording")
     depth, priors, apart, skipped, refused = _read_all(
         folders, config, prior, seed, progress, most, first_number
     )

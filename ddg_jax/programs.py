@@ -43,7 +43,7 @@ def sampler(config: DDGConfig) -> Program:
 
 
 def _state(config: DDGConfig) -> Any:
-    return jax.eval_shape(partial(train.init_state, config), key_data())
+    return train.init_state.eval_shape(config, key_data())
 
 
 def _maps(config: DDGConfig, count: int) -> tuple[Any, Any]:

@@ -72,8 +72,7 @@ class Generator:
             spacing = "quadratic"
         sampling = replace(config.sampling, sampler=sampler, steps=steps, spacing=spacing)
         config = replace(config, sampling=sampling)
-        shapes = jax.eval_shape(partial(init_params, config), jax.random.key(0))
-        params = load_params(file, shapes)
+        params = load_params(file, init_params.eval_shape(config, jax.random.key(0)))
         return cls(config, params, make_prior(config))
 
     def on_devices(self, sharding: NamedSharding) -> Params:

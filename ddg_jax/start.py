@@ -36,13 +36,17 @@ def check(config: DDGConfig) -> None:
     fitted = artifacts.config_from_json(manifest.config).ddg
     network = config.prior.source in NETWORKS
     unused = "prior.blur_px" if network else "prior.input_px"
-    for name in _THE_SAME:
-        there, here = map(attrgetter(name), (fitted, config))
-        if there != here and name != unused:
-            raise UserError(
-                f"The generator in {source} has ddg.{name} {there!r}, this configuration {here!r}: "
-                "use the same value, or fit a new one (name none to begin with)."
-            )
+    pairs = {name: tuple(map(attrgetter(name), (fitted, config))) for name in _THE_SAME if name != unused}
+    other = {name: (there, here) for name, (there, here) in pairs.items() if there != here}
+    if other:
+        first, *more = other
+        there, here = other[first]
+        besides = f" (others: {', '.join(more)})" if more else ""
+        raise UserError(
+            f"The generator in {source} has ddg.{first} {there!r}, this configuration {here!r}{besides}: "
+            f"take the preset that it was fitted with ({manifest.config['preset']}), the same values, or fit "
+            "a new one (name none to begin with)."
+        )
     if network:
         _check_weights(source, manifest.metrics.get("prior_source"), weights_folder(config))
 

@@ -64,6 +64,7 @@ def make_optimizer(config: DDGConfig, steps: int, scale: float = 1.0) -> optax.G
     )
 
 
+@partial(jax.jit, static_argnums=0)
 def init_params(config: DDGConfig, key: Key[Array, ""]) -> Params:
     """Fresh parameters of the network."""
     c = jnp.zeros((1, config.depth.height_px, config.depth.width_px))

@@ -43,7 +43,9 @@ class Reported(NamedTuple):
 class DepthGenerator:
     """A file of `ddgrasp ddg export`, ready to run."""
 
-    def __init__(self, path: Path | str, *, device: str = "cpu", threads: int = 0, seed: int = 0):
+    def __init__(
+        self, path: Path | str, *, device: str = "cpu", threads: int = 0, seed: int = 0, batch: int = 64
+    ):
         """Loads and checks the file.
 
         Args:
@@ -51,6 +53,7 @@ class DepthGenerator:
           device: cpu, cuda or cuda:1, where the network runs; cuda needs onnxruntime-gpu.
           threads: of the CPU; 0 takes all cores.
           seed: of the noise of calls that are given none.
+          batch: frames that go through the network at once; a call may have more, for as much memory.
 
         Raises:
           UserError: no such file, no generator, a device that onnxruntime does not have, or no number where
@@ -59,6 +62,8 @@ class DepthGenerator:
         self.path = shipped(path)
         check_count("threads", threads, 0)
         check_count("seed", seed, 0)
+        check_count("batch", batch, 1)
+        self._batch = batch
         self._kind, self._device_number = _device(device)
         self._session = _open(self.path, self._kind, self._device_number, threads)
         self.info = names.read(self._session.get_modelmeta().custom_metadata_map, str(self.path))
@@ -95,8 +100,7 @@ class DepthGenerator:
                 f"Noise is {type(given).__name__} {shape}; {steps} evaluations of {len(frames)} frames take "
                 f"{wanted}: let the generator's noise() make it."
             )
-        run = self._run_numpy if isinstance(depth_m, np.ndarray) else self._run_torch
-        return Reported(*(made.reshape(depth_m.shape) for made in run(frames, given, steps)))
+        return Reported(*(made.reshape(depth_m.shape) for made in self._run(frames, given, steps)))
 
     def noise(self, count: int, *, seed: int = 0, device: str = "") -> "EpisodeNoise":
         """Noise of `count` cameras that run side by side, for a call per frame.
@@ -171,6 +175,17 @@ class DepthGenerator:
     def _feed(self, depth: Array, noise: Array, steps: int) -> dict[str, Array]:
         given = {names.INPUT_DEPTH: depth, names.INPUT_NOISE: noise}
         return given if self.info.fixed_steps else given | {names.INPUT_STEPS: np.array(steps, np.int64)}
+
+    def _run(self, frames: Array, noise: Array, steps: int) -> Sequence[Array]:
+        host = isinstance(frames, np.ndarray)
+        run, join = (
+            (self._run_numpy, np.concatenate)
+            if host
+            else (self._run_torch, importlib.import_module("torch").cat)
+        )
+        cuts = [slice(at, at + self._batch) for at in range(0, len(frames), self._batch)]
+        parts = [run(frames[cut], noise[cut], steps) for cut in cuts]
+        return parts[0] if len(parts) == 1 else [join(made) for made in zip(*parts, strict=True)]
 
     def _run_numpy(self, frames: np.ndarray, noise: Array, steps: int) -> Sequence[np.ndarray]:
         depth, normal = (np.ascontiguousarray(_host(values), np.float32) for values in (frames, noise))

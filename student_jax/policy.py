@@ -8,6 +8,7 @@
     eps = policy.apply({"params": params}, noisy_action, k, cond, method="denoise")
 """
 
+from functools import partial
 from typing import NamedTuple, TypeVar, cast
 
 import jax
@@ -173,13 +174,13 @@ def noise_schedule(config: StudentConfig) -> diffusion.Schedule:
     return diffusion.schedule_of(diffusion.cosine_betas(config.head.diffusion_steps, TERMINAL_TIME))
 
 
+@partial(jax.jit, static_argnums=(1, 2))  # one program; op by op it takes many times longer
 def init_params(key: Key[jax.Array, ""], config: StudentConfig, profile: CameraProfile) -> dict:
     """Fresh parameters (a dict of float32 arrays)."""
     depth = jnp.zeros((1, contract.DEPTH_FRAMES, profile.height_px, profile.width_px))
     action = jnp.zeros((1, config.head.chunk, contract.ACTION_SIZE))
     state, k = jnp.zeros((1, contract.POLICY_STATE_SIZE)), jnp.zeros((1,), jnp.int32)
-    init = jax.jit(StudentPolicy(config, profile).init)  # one program; op by op it takes many times longer
-    return dict(init(key, depth, state, action, k)["params"])
+    return dict(StudentPolicy(config, profile).init(key, depth, state, action, k)["params"])
 
 
 def told_the_change(config: StudentConfig, params: dict) -> dict:
@@ -198,8 +199,8 @@ def told_the_change(config: StudentConfig, params: dict) -> dict:
 
 
 def param_shapes(config: StudentConfig, profile: CameraProfile) -> dict:
-    """Tree of jax.ShapeDtypeStruct: what `init_params` would give, without computing it."""
-    return jax.eval_shape(lambda key: init_params(key, config, profile), jax.random.key(0))
+    """Tree of jax.ShapeDtypeStruct: what `init_params` would give, without computing it. Traced once."""
+    return init_params.eval_shape(jax.random.key(0), config, profile)
 
 
 def sample_from_seen(

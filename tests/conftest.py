@@ -37,7 +37,8 @@ os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # emitters, and an unknown flag ends the process.
 if tuple(map(int, version("jax").split(".")[:2])) < (0, 12):
     _FAST = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FAST}"
+    if _FAST not in (_flags := os.environ.get("XLA_FLAGS", "")):  # a worker has them from who started it, and
+        os.environ["XLA_FLAGS"] = f"{_flags} {_FAST}"  # the cache takes the same ones twice for others
 
 SLOW = (
     "test_flow_debug", "test_deploy_fr3", "test_teacher_devices", "test_evaluation_score",

@@ -159,14 +159,15 @@ class ScriptedLibrary:
 
     def __init__(
         self, numbers: Iterable[Any], *, start_error: str = "", serials: tuple[str, ...] = (SERIAL,),
-        unit_m: float = 0.0001,
+        unit_m: float = 0.0001, silent: str = "", stop_error: str = "",
     ):  # fmt: skip
         self._numbers, self._start_error, self._serials = iter(numbers), start_error, serials
         self._unit_m = unit_m
         self._depth, self._rgb, self._gray = depth_mm(0), rgb(0), np.zeros(SIZE, np.uint8)
         self.said: list[Any] = []
-        self.silent = ""
+        self.silent = silent
         """What switching the projector raises, if not empty: it streams, and does not answer."""
+        self._stop_error = stop_error
         self.stopped = False
 
     @property
@@ -202,6 +203,8 @@ class ScriptedLibrary:
     def stop(self) -> None:
         self.said.append("stop")
         self.stopped = True
+        if self._stop_error:
+            raise RuntimeError(self._stop_error)
 
     def poll_for_frames(self) -> Any:
         self.said.append("poll")

@@ -318,6 +318,7 @@ def test_what_cannot_be_used_is_named_and_counted(recordings):
     _record(recordings / "mixed")
     _depth(recordings, "mixed", 1, np.full((18, 32), 900, np.uint16))
     _record(recordings / "unit", depth_unit_m=0.00001)
+    (recordings / "loose" / "depth").mkdir(parents=True)
     _record(recordings / "blind", size=(64, 64))
     edge = np.zeros((64, 64), np.uint16)
     edge[0] = 900  # outside the window that a wide generator sees of a square picture
@@ -326,7 +327,13 @@ def test_what_cannot_be_used_is_named_and_counted(recordings):
     assert len(frames) == 2 + 2 + 1
     assert (frames.skipped_frames, frames.refused_recordings) == (3, 2)
     assert frames.recording.tolist() == [0, 0, 1, 1, 2] and frames.number.tolist() == [0, 1, 0, 1, 0]
-    for words in ("000001.png: no valid depth", "000000.jpg is missing", "32x18", "unit: median depth"):
+    for words in (
+        "000001.png: no valid depth",
+        "000000.jpg is missing",
+        "32x18",
+        "unit: median depth",
+        "loose has no meta.json",
+    ):
         assert sum(words in line for line in said) == 1, (words, said)
     assert any("blind: left out 1 frame(s) without a valid pixel in the window" in line for line in said)
     assert said[-1] == "left out 3 frame(s), and 2 of 5 recording(s)"

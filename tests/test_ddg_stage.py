@@ -197,6 +197,7 @@ def test_starting_from_a_fitted_generator(fitted, recordings, tmp_path, capsys):
         ({"blur_px": 2.0}, "ddg.prior.blur_px 1.0, this configuration 2.0"),
         ({"noise": 0.1}, "ddg.prior.noise 0.03, this configuration 0.1"),
         ({"source": "metric_inverse_depth"}, "ddg.prior.source 'inverse_depth'"),
+        ({"noise": 0.1, "blur_px": 2.0}, r"blur_px 1.0.*2.0 \(others: prior.noise\): .* with \(test\)"),
         ({"jitter": 0.0, "decoy_holes": 0.0, "in_sim": "rgb", "input_px": 28, "weights": "x"}, ""),
     ],
 )

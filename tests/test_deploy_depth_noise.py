@@ -94,6 +94,9 @@ def test_frames_do_not_see_each_other(generator, scene):
     together = generator.generate(scene, noise)
     alone = [generator.generate(scene[i : i + 1], noise[i : i + 1]) for i in range(2)]
     assert np.mean(together.mask != np.concatenate([made.mask for made in alone])) < 1e-3
+    in_turns = DepthGenerator(FILE, threads=1, batch=1).generate(scene, noise)  # as many at once as it may
+    for made, (first, second) in zip(in_turns, zip(*alone, strict=True), strict=True):
+        np.testing.assert_array_equal(made, np.concatenate([first, second]))
 
 
 def test_evaluations_can_be_asked_for(generator, scene):
@@ -189,6 +192,8 @@ def test_what_is_no_number_is_refused(generator, scene):
         generator(scene, steps=0)
     with pytest.raises(UserError, match="count is -1; expected a whole number of at least 1"):
         generator.noise(-1)
+    with pytest.raises(UserError, match="batch is 0; expected a whole number of at least 1"):
+        DepthGenerator(FILE, batch=0)
     with pytest.raises(UserError, match="seed is -3; expected a whole number of at least 0"):
         generator.noise(1, seed=-3)
     for wrong in (2.5, "4", None, True):  # the tests' own check of types would stop these at the door
@@ -244,6 +249,8 @@ def test_tensors_give_what_arrays_give(generator, scene):
     assert made.depth_m.shape == (*scene.shape, 1) and made.mask.dtype == torch.bool
     for tensor, array in zip(made, wanted, strict=True):
         np.testing.assert_array_equal(tensor[..., 0].numpy(), array)
+    in_turns = DepthGenerator(FILE, threads=1, batch=1)
+    np.testing.assert_array_equal(in_turns(torch.from_numpy(scene), noise), in_turns(scene, noise))
     half = generator(torch.from_numpy(scene).half(), noise)  # NumPy noise will do
     assert half.dtype == torch.float32
     drawn = generator.noise(2, seed=1, device="cpu")

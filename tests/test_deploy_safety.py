@@ -235,7 +235,9 @@ def test_from_any_pose_a_step_keeps_the_curve_of_braking_and_the_slow_way_down()
         target, _, changed = filter_.target(q, rng.choice([-1.0, 1.0], 8))
         step = target - q
         room = np.where(step > 0, upper - q, q - lower)
-        assert (np.abs(step) <= filter_._braked(room) + 1e-9).all()
+        can_stop = np.sqrt(2 * np.array(limits.braking_rad_s2) * np.maximum(room - np.abs(step), 0))
+        speed = np.abs(step) / limits.period_s
+        assert (speed <= np.maximum(can_stop - np.array(limits.braking_reserve_rad_s), 0) + 1e-9).all()
         assert (np.abs(step) <= change + 1e-9).all()
         here_m, there_m = (kinematics.grip_position(x)[2] for x in (q, target))
         if there_m < limits.approach_below_m:

@@ -473,7 +473,7 @@ def test_the_paper_s_generator_is_taken_from_elsewhere_and_stays_the_same(tmp_pa
     paper, other = fitted("paper"), get_preset("debug").ddg.depth
     assert planned("--paper-generator", paper) == paper and planned() == ""
     another = fitted("another", depth=other)
-    with pytest.raises(UserError, match="has ddg.depth.representation .* use the same value"):
+    with pytest.raises(UserError, match="has ddg.depth.representation .* the same values"):
         planned("--paper-generator", another)
     with pytest.raises(UserError, match=r"--paper-generator is \S+student, which is of stage 'student'"):
         planned("--paper-generator", "pretrained/student")

@@ -159,6 +159,13 @@ def test_a_file_plays_once_both_streams_have_started(monkeypatch):
     assert list(realsense._frames(None, Path("desk.bag"), Gaps())) == []
     assert said == ["speed", "pause", "start", "resume", "wait", "stop"]
 
+    def broken(*_: object) -> None:
+        raise RuntimeError("bad chunk")
+
+    pipeline.try_wait_for_frames = broken
+    with pytest.raises(UserError, match=r"desk.bag: cannot be read \(bad chunk\)"):
+        list(realsense._frames(None, Path("desk.bag"), Gaps()))
+
 
 # --- a scripted camera -----------------------------------------------------------------------------
 
@@ -227,6 +234,7 @@ def test_frames_that_a_killed_recording_left_are_not_recorded_over(tmp_path, mon
     parse("record import", [str(tmp_path / ".take.partial"), "--out", str(tmp_path / "kept")]).run()
     (kept,) = find_recordings(tmp_path / "kept")
     assert "2 frames" in capsys.readouterr().out and not kept.color_aligned and kept.fx_px
+    assert kept.meta["hz"] == 10
 
 
 def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, monkeypatch):
@@ -237,7 +245,7 @@ def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, monkeypatch):
 
 
 def test_a_camera_that_stops_keeps_what_it_gave(tmp_path, monkeypatch, capsys):
-    library = scripted(monkeypatch, [*range(1, 20), TIMEOUT])
+    library = scripted(monkeypatch, [*range(1, 20), TIMEOUT], stop_error="No device connected")
     with pytest.raises(UserError, match=r"the camera stopped \(Frame didn't arrive within 3000\).*is kept"):
         record(tmp_path, "--frames", 100)
     assert numbers_in(tmp_path / "take") == [16, 19] and library.stopped
@@ -270,13 +278,36 @@ def test_a_take_that_ends_far_away_is_kept(tmp_path, monkeypatch, capsys):
     scripted(monkeypatch, [*range(1, 29), *range(6000, 6030)])
     record(tmp_path, "--frames", 12)
     assert capsys.readouterr().out.endswith(f"{tmp_path / 'take'}: 12 frames\n")
-    assert len(list((tmp_path / "take" / "depth").iterdir())) == 12
+    assert len(Recording.open(tmp_path / "take")) == 12
+    parse("record import", [str(tmp_path / "take"), "--out", str(tmp_path / "again")]).run()
+    assert len(find_recordings(tmp_path / "again")[0]) == 12
+
+
+def test_a_take_that_cannot_be_ended_leaves_its_frames_to_be_imported(tmp_path, monkeypatch, capsys):
+    """Another one may take what room is left on the disk: these frames do not come again."""
+    scripted(monkeypatch, count(1))
+
+    def full(path: Path, data: bytes, sync: bool = False) -> None:
+        if path.name == "meta.json":
+            raise OSError(28, "No space left on device")
+        write(path, data, sync)
+
+    write = writing._write
+    with monkeypatch.context() as patch, pytest.raises(UserError) as error:
+        patch.setattr(writing, "_write", full)
+        record(tmp_path, "--frames", 2)
+    said, left = str(error.value), tmp_path / ".take.partial"
+    assert "No space left" in said and f"its 2 frames are in {left};" in said
+    parse("record import", [str(left), "--out", str(tmp_path / "kept")]).run()
+    (kept,) = find_recordings(tmp_path / "kept")
+    assert len(kept) == 2
 
 
 @pytest.mark.parametrize(
     ("numbers", "how", "args", "message"),
     [
         ([TIMEOUT], {}, (), "has started but gives no frames"),
+        ((), {"silent": "hwmon"}, (), r"streams, and does not answer \(hwmon\): plug it in anew"),
         ((), {"start_error": "No device connected", "serials": ()}, (), "no RealSense camera is connected"),
         ((), {"start_error": "No device"}, ("--serial", "000132"), "Did you mean '000123'"),
         ((), {"start_error": "Couldn't resolve"}, ("--width", 65), "no depth and colour of 65x48 at 30 Hz"),

@@ -213,6 +213,10 @@ def test_a_frame_that_is_left_out_between_others_ends_consecutive_frames(tmp_pat
     for index in damaged:
         (path / "color" / f"{index}.jpg").unlink()
     assert Recording.open(path).consecutive == consecutive
+    if consecutive:  # one that somebody took away, as is advised of pictures that cannot be read
+        for kept in (path / "depth" / "9.png", path / "color" / "9.jpg"):
+            kept.unlink()
+        assert not Recording.open(path).consecutive
     set_meta(path, consecutive_frames=False)
     assert not Recording.open(path).consecutive
 
@@ -326,7 +330,14 @@ def test_undeclared_unit_is_refused(tmp_path, value):
 
 @pytest.mark.parametrize(
     "fields",
-    [{"fx_px": "382.7"}, {"fx_px": -382.7}, {"baseline_m": True}, {"consecutive_frames": "false"}, {"hz": 0}],
+    [
+        {"fx_px": "382.7"},
+        {"fx_px": -382.7},
+        {"baseline_m": True},
+        {"consecutive_frames": "false"},
+        {"hz": 0},
+        {"frames": "6"},
+    ],
 )
 def test_fields_of_another_kind_are_refused(tmp_path, fields):
     path = _write(tmp_path / "a")

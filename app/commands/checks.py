@@ -112,7 +112,7 @@ def _try_writing(option: str, path: Path, folder: Path, kind: str) -> None:
             raise UserError(f"{option} is {path}, and {there} is no folder: name {kind} elsewhere.")
         folder.mkdir(parents=True, exist_ok=True)
         (tried := folder / f"{TEMPORARY}{os.getpid()}-{path.name}").touch()
-        tried.unlink()
+        tried.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(
             f"{option} is {path}, where nothing can be written ({error.strerror}): name {kind} elsewhere."
@@ -229,7 +229,13 @@ def check_networks(config: Config, run_dir: Path, stages: Collection[str] = ON_P
 
 
 def tell_needs(config: Config, run_dir: Path, stages: Collection[str] = ON_PICTURES) -> None:
-    """`check_networks`, its lines on standard error."""
+    """`check_networks`, its lines on standard error, and how a generator that is loaded will be drawn, where
+    that is otherwise than as it was made."""
+    from ddg_jax import start
+
+    if config.ddg.init_from and "ddg" in stages and not artifacts.is_finished(run_dir / "ddg"):
+        if other := start.drawn_otherwise(config.ddg):
+            print(other, file=sys.stderr, flush=True)
     for need in check_networks(config, run_dir, stages):
         print(need, file=sys.stderr, flush=True)
 

@@ -24,6 +24,7 @@ from sensors.recordings.recording import (
     META_FILE,
     NEAREST_MEDIAN_M,
     UNIT_CHECK_FRAMES,
+    UNIT_IS_CERTAIN,
     check_fields,
 )
 from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, in_time, paired
@@ -38,7 +39,7 @@ DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 REALSENSE_SUFFIXES = (".bag", ".db3")
 KEPT_META = (
     "sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth", "repeated_frames",
-    "licence", "source",
+    "licence", "source", UNIT_IS_CERTAIN,
 )  # fmt: skip
 """What is taken over of a folder's own meta.json."""
 
@@ -77,13 +78,16 @@ def import_recording(source: Source, path: Path) -> Imported:
     Raises:
         UserError: `path` exists, no usable frame, or depth whose median cannot be a D4xx's in that unit (of
             the first frames alone, where the unit is certain).
+        Trouble: the recording of a `source` that cannot be read again could not be ended: says where its
+            frames are.
         OSError: a frame could not be written, and `source` keeps none then, or it was the first.
     """
     if path.exists():
         raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
     skipped, medians_m, size, frames, gaps, last = [], [], None, 0, False, False
     loss, marked, unlike = "", 0, ""
-    with RecordingWriter(path, source.meta) as writer:
+    certain = {UNIT_IS_CERTAIN: True} if source.unit_is_certain else {}
+    with RecordingWriter(path, source.meta | certain, keep=source.cut_short is not None) as writer:
         for frame in map(_without_markers, source.frames()):
             medians_m += _median_m(frame, source.depth_unit_m)
             depth_mm, reason = _usable(frame, source.depth_unit_m, size)
@@ -286,7 +290,8 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
             yield RawFrame(file.name, _read_depth(file), None if color is None else _read_rgb(color))
 
     kept = {name: own[name] for name in KEPT_META if name in own}
-    return Source(folder, frames, depth_unit_m, {**kept, **meta}, note=note)
+    certain = bool(kept.pop(UNIT_IS_CERTAIN, False)) and depth_unit_m == own["depth_unit_m"]
+    return Source(folder, frames, depth_unit_m, {**kept, **meta}, unit_is_certain=certain, note=note)
 
 
 def _own_meta(file: Path) -> dict[str, Any]:

@@ -5,6 +5,7 @@ camera is in `realsense_live.py`. Run on files of synthetic frames that pyrealse
 (`.db3`) wrote; no file of a real camera was at hand.
 """
 
+import contextlib
 import importlib
 import math
 from collections.abc import Iterable, Iterator
@@ -28,8 +29,9 @@ def file_source(file: Path) -> Source:
         UserError: pyrealsense2 is not installed, or `file` has no such streams.
     """
     rs = load_pyrealsense2()
-    _, _, profile = _opened(rs, file)
-    meta, unit_m = describe(rs, profile)
+    with _readable(file):
+        _, _, profile = _opened(rs, file)
+        meta, unit_m = describe(rs, profile)
     gaps = Gaps()
     return Source(
         file, lambda: _frames(rs, file, gaps), unit_m, meta, unit_is_certain=True, closing_meta=gaps.meta
@@ -100,28 +102,41 @@ def load_pyrealsense2() -> Any:
 
 
 def _frames(rs: Any, file: Path, gaps: Gaps) -> Iterator[RawFrame]:
-    pipeline, config, profile = _opened(rs, file)
-    playback = profile.get_device().as_playback()
-    # Before the start: what is played in real time until then is lost to a slow reader.
-    playback.set_real_time(False)
-    # Else one stream may be at the file's end, or well into it, before the other has started: of 246 readings
-    # of a file of 20 frames 8 lacked 1 to 19. To resume takes the library up to 10 s.
-    playback.pause()
-    pipeline.start(config)
+    with _readable(file):
+        pipeline, config, profile = _opened(rs, file)
+        playback = profile.get_device().as_playback()
+        # Before the start: what is played in real time until then is lost to a slow reader.
+        playback.set_real_time(False)
+        # Else one stream may be at the file's end, or well into it, before the other has started: of 246
+        # readings of a file of 20 frames 8 lacked 1 to 19. To resume takes the library up to 10 s.
+        playback.pause()
+        pipeline.start(config)
     try:
-        playback.resume()
-        for number, frame in once(_sets(pipeline)):
+        with _readable(file):
+            playback.resume()
+        for number, frame in once(_sets(pipeline, file)):
             if number is not None:
                 gaps.count(number)
             yield frame
     finally:
-        pipeline.stop()
+        with contextlib.suppress(RuntimeError):
+            pipeline.stop()
 
 
-def _sets(pipeline: Any) -> Iterator[tuple[int | None, float, RawFrame]]:
+@contextlib.contextmanager
+def _readable(file: Path) -> Iterator[None]:
+    """UserError in the place of what librealsense raises inside."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise UserError(f"{file}: cannot be read ({error}); copy it again, or record it anew.") from error
+
+
+def _sets(pipeline: Any, file: Path) -> Iterator[tuple[int | None, float, RawFrame]]:
     """(number of its depth or None, milliseconds between its pictures, frame) of every set of a file."""
     while True:
-        arrived, frames = pipeline.try_wait_for_frames(END_OF_FILE_MS)
+        with _readable(file):
+            arrived, frames = pipeline.try_wait_for_frames(END_OF_FILE_MS)
         if not arrived:
             return
         depth, color = frames.get_depth_frame(), frames.get_color_frame()

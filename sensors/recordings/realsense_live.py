@@ -3,11 +3,11 @@
 Run on librealsense's software device (pyrealsense2 2.59, synthetic frames); not on a camera by us.
 """
 
+import contextlib
 import math
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -139,7 +139,8 @@ def record(options: LiveOptions, path: Path, progress: Progress) -> tuple[Import
     rs = load_pyrealsense2()
     take = Take()
     with _started(rs, options) as (pipeline, profile), _stoppable() as stop:
-        meta, unit_m = describe(rs, profile)
+        meta, unit_m = _described(rs, profile)
+        meta["hz"] = options.hz  # of what is kept, also of a recording that is killed
         progress.note(f"{meta['sensor']}: the first {SETTLE_S:g} s are left out while its exposure settles")
         with progress.task("frames", options.frames) as task:
             source = Source(
@@ -194,7 +195,7 @@ def _kept(
         raise KeyboardInterrupt("Stopped before the first frame: nothing was recorded.")
 
 
-@contextmanager
+@contextlib.contextmanager
 def _started(rs: Any, options: LiveOptions) -> Iterator[tuple[Any, Any]]:
     """(pipeline, profile) of the running camera."""
     pipeline, config = rs.pipeline(), rs.config()
@@ -208,10 +209,19 @@ def _started(rs: Any, options: LiveOptions) -> Iterator[tuple[Any, Any]]:
     except RuntimeError as error:
         raise _not_started(rs, options, error) from error
     try:
-        project(rs, profile)
         yield pipeline, profile
     finally:
-        pipeline.stop()
+        with contextlib.suppress(RuntimeError):  # of a camera that was unplugged
+            pipeline.stop()
+
+
+def _described(rs: Any, profile: Any) -> tuple[dict[str, Any], float]:
+    """`describe` of a camera whose projector is on."""
+    try:
+        project(rs, profile)
+        return describe(rs, profile)
+    except RuntimeError as error:
+        raise Trouble(f"the RealSense streams, and does not answer ({error}): plug it in anew.") from error
 
 
 def _not_started(rs: Any, options: LiveOptions, error: RuntimeError) -> UserError:
@@ -230,7 +240,7 @@ def _not_started(rs: Any, options: LiveOptions, error: RuntimeError) -> UserErro
     )
 
 
-@contextmanager
+@contextlib.contextmanager
 def _stoppable() -> Iterator[threading.Event]:
     """Set by Ctrl-C, SIGTERM and a closed terminal, which otherwise do nothing: a frame is written to its
     end."""

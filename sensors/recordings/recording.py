@@ -32,6 +32,8 @@ COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 NEAREST_MEDIAN_M = 0.08
 FARTHEST_MEDIAN_M = 6.0
 UNIT_CHECK_FRAMES = 5
+UNIT_IS_CERTAIN = "depth_unit_is_certain"
+"""Field of a recording whose camera said its unit: then no median of a whole recording speaks against it."""
 
 D4XX_BASELINE_M = {"D435": 0.050, "D415": 0.055, "D455": D455.baseline_m}
 """Distance between the imagers, from the D400 series datasheet."""
@@ -134,9 +136,11 @@ class Recording:
 
     @property
     def consecutive(self) -> bool:
-        """Whether the frames follow each other in time (temporal statistics make sense), none left out."""
+        """Whether the frames follow each other in time (temporal statistics make sense), none left out, and
+        none taken away of as many as meta.json counts."""
         first, last = in_time(self.depth_files[0]), in_time(self.depth_files[-1])
         gaps = any(first < in_time(frame.file) < last for frame in self.skipped)
+        gaps |= len(self) + len(self.skipped) < (self.meta.get("frames") or 0)
         return bool(self.meta.get("consecutive_frames", False)) and not gaps
 
     @property
@@ -237,6 +241,15 @@ def recording_folders(root: Path) -> list[Path]:
     return sorted(p for p in root.iterdir() if not p.name.startswith(".") and is_recording(p))
 
 
+def unfinished(root: Path) -> list[Path]:
+    """Folders directly below `root` that would be recordings with a meta.json, by name; none if `root` itself
+    has pictures."""
+    if (root / "depth").is_dir() or not root.is_dir():
+        return []
+    inside = sorted(p for p in root.iterdir() if not p.name.startswith("."))
+    return [p for p in inside if (p / "depth").is_dir() and not is_recording(p)]
+
+
 def depth_picture_count(folders: Iterable[Path]) -> int:
     """Depth pictures in recordings, by their names: none is opened."""
     files = (file for folder in folders for file in (folder / "depth").glob("*"))
@@ -277,9 +290,11 @@ def check_fields(file: Path, meta: Mapping[str, Any]) -> None:
     for name in ("fx_px", "baseline_m", "hz"):
         if (value := meta.get(name)) is not None and not _is_positive(value):
             raise UserError(f"{file}: {name} is {value!r}; expected a number above 0, or null.")
-    for name in ("consecutive_frames", "color_aligned_to_depth"):
+    for name in ("consecutive_frames", "color_aligned_to_depth", UNIT_IS_CERTAIN):
         if not isinstance(value := meta.get(name), bool | None):
             raise UserError(f"{file}: {name} is {value!r}; expected true or false, or null.")
+    if not isinstance(value := meta.get("frames"), int | None):
+        raise UserError(f"{file}: frames is {value!r}; expected how many there are, or null.")
 
 
 def _is_positive(value: Any) -> bool:
@@ -297,6 +312,8 @@ def _check_unit(recording: Recording) -> None:
             f"between {DEPTH_UNIT_M:g} and {depth.MAX_MM * DEPTH_UNIT_M:g} m: correct it in {META_FILE}."
         )
     median_m = float(np.median(values)) * DEPTH_UNIT_M
+    if recording.meta.get(UNIT_IS_CERTAIN):
+        return
     if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
         return
     finer = unit / 10 ** round(np.log10(median_m))

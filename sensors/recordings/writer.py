@@ -12,7 +12,7 @@ import numpy as np
 
 from ddgrasp.alone import alone_in
 from ddgrasp.contract import CONTRACT_VERSION, DEPTH_UNIT_M
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble, UserError
 from ddgrasp.files import replace_folder
 from sensors.recordings.recording import META_FILE
 
@@ -35,12 +35,16 @@ class RecordingWriter:
     removes the hidden folder; a previous recording of that name stays as it was. Pictures are on the disk
     before `meta.json` is: a power cut leaves no recording that says it is whole and is not.
 
+    With `keep`, for frames that come but once, the hidden folder stays if it has any, but where they are
+    refused (UserError): leaving raises Trouble then, which says where they are.
+
     Raises UserError on entering if another one is at work under that name.
     """
 
-    def __init__(self, path: str | os.PathLike, meta: dict[str, Any]):
+    def __init__(self, path: str | os.PathLike, meta: dict[str, Any], keep: bool = False):
         self.path = Path(path)
         self.meta = dict(meta)
+        self._keep = keep
         self._temporary = partial_folder(self.path)
         self._alone = ExitStack()
         self._size: tuple[int, int] | None = None
@@ -63,11 +67,20 @@ class RecordingWriter:
             try:
                 if kind is None:
                     self._finish()
-            except BaseException:
-                shutil.rmtree(self._temporary, ignore_errors=True)
+            except BaseException as error:
+                self._leave(error)
                 raise
             if kind is not None:
-                shutil.rmtree(self._temporary, ignore_errors=True)
+                self._leave(value)
+
+    def _leave(self, error: BaseException) -> None:
+        if not self._keep or not self._frames or isinstance(error, UserError):
+            shutil.rmtree(self._temporary, ignore_errors=True)
+        elif isinstance(error, Exception):  # Ctrl-C says what it is
+            raise Trouble(
+                f"{self.path} could not be ended ({error}): its {self._frames} frames are in "
+                f"{self._temporary}; once that is mended, `ddgrasp record import {self._temporary}`."
+            ) from error
 
     def _lock(self) -> None:
         """Makes the hidden folder and keeps others out of it."""
