@@ -116,12 +116,12 @@ def run(job: Job) -> Artifact:
     config, directory, progress = job.config, job.directory, job.progress
     generator = Generator.load(job.parents["ddg"].directory)
     clean = EpisodeStore(job.parents["demos"].directory / DEMOS)
-    noisy = EpisodeStore(directory / STORE, create=True)
-    ends = np.concatenate([[0], clean.ends])
     if generator.prior.needs_sim_rgb and "rgb" not in clean.fields:
         raise UserError(
             f"{clean.path} holds no colour, which the prior needs: ddg.prior.in_sim depth does not."
         )
+    noisy = EpisodeStore(directory / STORE, create=True)
+    ends = np.concatenate([[0], clean.ends])
 
     def read(i: int) -> Clip:
         steps = {name: clean.steps(name, ends[i], ends[i + 1]) for name in _fields(generator)}

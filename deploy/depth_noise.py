@@ -44,7 +44,7 @@ class DepthGenerator:
     """A file of `ddgrasp ddg export`, ready to run."""
 
     def __init__(
-        self, path: Path | str, *, device: str = "cpu", threads: int = 0, seed: int = 0, batch: int = 64
+        self, path: Path | str, *, device: str = "cpu", threads: int = 0, seed: int = 0, batch: int = 32
     ):
         """Loads and checks the file.
 

@@ -72,6 +72,8 @@ def measure_real(folder: Path, profile: CameraProfile, progress: Progress) -> tu
     """
     measured, skipped = [], []
     for recording in progress.track(find_recordings(folder), "real recordings"):
+        if (taken := figures.measured_frames(recording)) < len(recording):
+            progress.note(f"{recording.path}: the first {taken} of {len(recording)} frames are measured")
         decimation = max(1, round(recording.width_px / profile.width_px))
         for factor in sorted({1, decimation}):
             try:

@@ -146,8 +146,11 @@ def run(
     trained = policy_objects(policy, config)
     config = one_pose(series.configured(config, policy))
     trials = series.plan()
-    if config.record.other_tables:  # every row has them
+    if config.record.other_tables and OTHER_TABLES in names:
         names = tuple(name for name in names if name != OTHER_TABLES)
+        Progress(name="causes").note(
+            f"row {OTHER_TABLES} is left out: record.other_tables has it in every row"
+        )
     belong_to = rig_trials.made_with(config, policy, trained) | {
         "number": series.number,
         "seconds": series.seconds,

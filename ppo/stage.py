@@ -65,7 +65,8 @@ def slow_engine(config: Config, platform: str) -> str:
         return ""
     return (
         f"JAX has no accelerator here: MJX steps {config.teacher.num_envs} environments on this machine's "
-        f"cores. {pip_install('cuda')} is for an NVIDIA GPU; --world.backend cpu is many times faster here."
+        f"cores. {pip_install('cuda')} is for an NVIDIA GPU with a driver for CUDA 13; --world.backend cpu "
+        "is many times faster here."
     )
 
 

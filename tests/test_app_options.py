@@ -169,6 +169,8 @@ def test_a_name_that_is_no_utf_8_is_refused_in_one_line(tmp_path):
         ),
         ("play aple --objects aple", "'aple' stands without an option"),
         ("play apple", "'apple' stands without an option: objects are given by --objects apple."),
+        ("play runs/a/policy.onnx", "an option: a policy is given by --policy runs/a/policy.onnx."),
+        ("deploy trials x.onnx --rig fr3", "an option: a policy is given by --policy x.onnx."),
         ("play apple can --trials 2", "objects are given by --objects apple can."),
         ("play --viewer web --out a.mp4", "--out is a.mp4, and --viewer web writes no file: leave out one."),
         ("play --viewer mujoco --out a.mp4", "--out is a.mp4, and --viewer mujoco writes no file"),

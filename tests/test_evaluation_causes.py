@@ -80,7 +80,7 @@ def test_the_table_is_kept_and_its_trials_are_not_run_again(tmp_path, policy):
 
 
 def test_other_tables_are_no_row_where_every_row_has_them_and_settings_of_the_camera_are_told(
-    tmp_path, policy
+    tmp_path, policy, capsys
 ):
     stereo = replace(CONFIG.record.stereo, exposure_target=0.6)
     config = replace(CONFIG, record=replace(CONFIG.record, other_tables=True, stereo=stereo))
@@ -89,6 +89,7 @@ def test_other_tables_are_no_row_where_every_row_has_them_and_settings_of_the_ca
     assert [row["row"] for row in made["rows"]] == [causes.REFERENCE] and made["other_tables"] is True
     assert read_log(tmp_path / causes.REFERENCE / rig_trials.TRIALS_FILE)[0]["stereo"] == made["stereo"]
     assert made["stereo"] == ["exposure_target 0.6"]
+    assert "row other_tables is left out" in "".join(capsys.readouterr())
     assert "record.stereo set to exposure_target 0.6:\n" in (tmp_path / causes.TABLE_FILE).read_text()
 
 

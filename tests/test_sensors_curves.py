@@ -148,6 +148,17 @@ def test_real_recordings_without_a_focal_length_are_left_out_by_name(tmp_path):
         compare.measure_real(tmp_path / "b", D455.scaled(0.125), Progress(quiet=True))
 
 
+def test_of_a_long_recording_the_first_frames_are_measured_and_it_is_said(tmp_path, monkeypatch):
+    write_depth(tmp_path / "a", 9 * [plane_mm(20.0).astype(np.uint16)], sensor="D435", fx_px=FX_PX)
+    monkeypatch.setattr(figures, "MOST_PIXELS", 5 * SIZE[0] * SIZE[1] + 1)
+    progress = Progress(quiet=True)
+    said: list[str] = []
+    monkeypatch.setattr(progress, "note", said.append)
+    measured, _ = compare.measure_real(tmp_path, D455.scaled(0.125), progress)
+    assert [m.frames for m in measured] == [5]
+    assert said == [f"{tmp_path / 'a'}: the first 5 of 9 frames are measured"]
+
+
 def test_losses_count_the_objects_own_pixels():
     depth = np.full((2, *SIZE), 1000, np.uint16)
     depth[:, :10] = 0  # not the object

@@ -25,6 +25,8 @@ def check_words(command: type, args: Sequence[str]) -> None:
         if positionals and not word and not before.startswith("--"):
             raise UserError(f"{positionals[0]} is empty: give a path; . is the current folder.")
     given = " ".join(itertools.takewhile(lambda word: not word.startswith("-"), args))
+    if given.endswith(".onnx") and not positionals and "--policy" in options:
+        raise UserError(f"{given!r} stands without an option: a policy is given by --policy {given}.")
     if given and not positionals and "objects" in kinds(command):
         raise UserError(f"{given!r} stands without an option: objects are given by --objects {given}.")
 

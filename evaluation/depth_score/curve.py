@@ -89,7 +89,7 @@ def _point(
     folder = directory / f"n{size:03d}"
     if (folder / POINT).exists():
         return read_json(folder / POINT)
-    chosen = frames.part(frames.recording < size)
+    chosen = frames.part(slice(int(np.searchsorted(frames.recording, size))))  # views: sorted by recording
     generator = _fitted(config, chosen, folder, progress)
     methods = Methods(config.score, config.seed, generator)
     simulated = loads[len(loads) // 2 :]  # the real side comes first and needs no generator
@@ -142,6 +142,8 @@ def _frames(
     prior = make_prior(config.ddg)
     roots = [record, *([extra] if count > recorded else [])]
     parts = [load_frames(root, config.ddg, prior, config.seed, progress) for root in roots]
+    if len(parts) == 1:
+        return parts[0]
     offsets = np.cumsum([0, recorded])[: len(parts)]
     return Frames(
         np.concatenate([part.depth_m for part in parts]),

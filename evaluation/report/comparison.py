@@ -13,7 +13,7 @@ from evaluation.report.targets import targets, verdict
 COMPARISON_HTML, COMPARISON_PNG = "comparison.html", "comparison.png"
 _NO_RESULT = {
     "stages", "outdated", "config", "preset", "scale", "seed", "machine", "versions", "created",
-    "contract_version", "targets",
+    "contract_version", "targets", "begun",
 }  # fmt: skip
 """Parts of a report that measure nothing."""
 Rows = list[tuple[str, ...]]

@@ -15,7 +15,7 @@ from ddgrasp.stages import ON_REQUEST, STAGES, get_stage
 from evaluation import backends, perception_table, teacher_trials, wilson
 from evaluation.report import deployments
 from evaluation.report.html import leaves
-from evaluation.report.targets import MISSED, targets, verdict
+from evaluation.report.targets import MISSED, NOT_MEASURED, targets, verdict
 
 REPORT = "report.json"
 _TOP_LEVEL = "student_"
@@ -241,9 +241,9 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
             return ["frame to command not measured: on the real clock every step held, no frame came in time"]
         return [f"frame to command p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"]
     if "targets" in metrics:
-        met = [target["met"] for target in metrics["targets"]]
+        met = [target["met"] for target in metrics["targets"] if target["met"] != NOT_MEASURED]
         return [f"{metrics['targets'][0]['target']}: {metrics['targets'][0]['measured']}",
-                f"targets met: {met.count('met')} of {len(met)}"]  # fmt: skip
+                f"targets met: {met.count('met')} of {len(met)} measured"]  # fmt: skip
     return [
         f"{name.replace('_', ' ')} {_number(value)}"
         for name, value in metrics.items()

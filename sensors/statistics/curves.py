@@ -275,7 +275,7 @@ def grid_share(depth_mm: Real[np.ndarray, "*shape"], fb_px_m: float, steps_per_p
     is that far.
     """
     fb = 1000.0 * fb_px_m * steps_per_px
-    values, count = np.unique(depth_mm[depth_mm.astype(np.float64) ** 2 > 4.0 * fb], return_counts=True)
+    values, count = np.unique(depth_mm[depth_mm > np.sqrt(4.0 * fb)], return_counts=True)
     if not len(values):
         return float("nan")
     candidates = fb * np.linspace(1 - FB_TOLERANCE, 1 + FB_TOLERANCE, 41)[:, None]

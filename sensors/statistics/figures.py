@@ -12,10 +12,13 @@ from jaxtyping import UInt16
 from ddgrasp.contract import CameraProfile
 from sensors.recordings.recording import Recording
 from sensors.statistics import curves, stats
-from sensors.statistics.curves import Curve, Stream
+from sensors.statistics.curves import STATIC_FRAMES, Curve, Stream
 
 STEPS_PER_PX = 32
 """D4xx cameras report disparity in 1/32 of a native pixel."""
+MOST_PIXELS = 64_000_000
+"""A recording's that are measured, 157 frames of 848x480: they take 40 bytes a pixel at the peak (100 still
+ones of that size, 2026-11-30)."""
 
 
 @dataclass(frozen=True)
@@ -89,14 +92,20 @@ def measure(camera: str, stream: Stream, steps_per_px: float) -> Figures:
     )
 
 
+def measured_frames(recording: Recording) -> int:
+    """How many of a recording's frames, the first ones, are measured: those that fit into MOST_PIXELS."""
+    most = MOST_PIXELS // (recording.height_px * recording.width_px)
+    return min(len(recording), max(most, STATIC_FRAMES))
+
+
 def stream_of(recording: Recording, factor: int = 1) -> Stream:
-    """A recording's frames, decimated by `factor`, with the baseline of its sensor.
+    """A recording's frames (`measured_frames`), decimated by `factor`, with the baseline of its sensor.
 
     Raises:
         UserError: focal length or sensor unknown (`Recording.optics`).
     """
     fx_px, baseline_m = recording.optics()
-    depth = np.stack([recording.depth_mm(i) for i in range(len(recording))])
+    depth = np.stack([recording.depth_mm(i) for i in range(measured_frames(recording))])
     fb_px_m = fx_px * baseline_m
     static = curves.static_runs(depth, fb_px_m) if recording.consecutive else ()
     if factor > 1:
