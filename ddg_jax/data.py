@@ -3,8 +3,10 @@
 import math
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import overload
 
 import jax
 import numpy as np
@@ -256,9 +258,9 @@ def _folders(root: Path) -> list[Path]:
 
 def _read(
     recording: Recording, count: int, config: DDGConfig, prior: Prior, progress: Progress
-) -> tuple[np.ndarray, np.ndarray | None, int, bool]:
+) -> tuple[np.ndarray, Sequence[np.ndarray] | None, int, bool]:
     """The usable ones of the first `count` frames: (depth (T, H, W) in metres at the generator's size, rgb
-    (T, h, w, 3) if the prior wants it, number of frames left out, whether they follow each other in time).
+    (T of (h, w, 3)) if the prior wants it, number of frames left out, whether they follow each other).
     """
     if recording.skipped:
         progress.note(recording.skipped_summary())
@@ -281,10 +283,32 @@ def _read(
         )
     if blind:
         progress.note(f"{recording.path}: left out {blind} frame(s) without a valid pixel in the window")
-    rgb = np.stack([recording.rgb(int(i)) for i in usable]) if prior.needs_rgb else None
+    rgb = _Colour(recording, usable) if prior.needs_rgb else None
     no_gap = bool(seen[usable[0] : usable[-1] + 1].all())  # a frame that came again is none
     left_out = len(recording.skipped) + len(frames) - len(usable)
     return frames[usable], rgb, left_out, recording.consecutive and no_gap
+
+
+class _Colour(Sequence[np.ndarray]):
+    """Colour of some frames of a recording, each read when it is looked at: a long recording's would take
+    more than all the rest."""
+
+    def __init__(self, recording: Recording, frames: Int[np.ndarray, " T"]):
+        self._recording, self._frames = recording, frames
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @overload
+    def __getitem__(self, index: int) -> np.ndarray: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[np.ndarray]: ...
+
+    def __getitem__(self, index: int | slice) -> np.ndarray | Sequence[np.ndarray]:
+        if isinstance(index, slice):
+            return [self._recording.rgb(int(i)) for i in self._frames[index]]
+        return self._recording.rgb(int(self._frames[index]))
 
 
 def _tell_of_crop(recording: Recording, config: DDGConfig, progress: Progress) -> None:

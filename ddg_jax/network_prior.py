@@ -4,7 +4,7 @@ What the paper leaves open is c in simulation. Both readings are here (`DDGConfi
 on simulated RGB, or simulated depth itself, inverted and normalised as the network's output is.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -24,6 +24,9 @@ FEWEST_VALID = 2
 """Pixels that fix scale and shift of relative depth."""
 _BATCH = 8
 """Pictures that the image network is given together."""
+
+Pictures = UInt8[np.ndarray, "T h w 3"] | Sequence[UInt8[np.ndarray, "h w 3"]]
+"""Colour of T frames: an array, or pictures that are read as they are looked at."""
 
 
 def weights_folder(config: DDGConfig) -> Path:
@@ -50,7 +53,7 @@ class DepthNetworkPrior:
     def from_recording(
         self,
         depth_m: Float[np.ndarray, "T H W"],
-        rgb: UInt8[np.ndarray, "T h w 3"] | None,
+        rgb: Pictures | None,
         rng: np.random.Generator,
         consecutive: bool = True,
     ) -> Float32[np.ndarray, "T H W"]:
@@ -59,7 +62,7 @@ class DepthNetworkPrior:
         size = depth_m.shape[1:]
         if consecutive or rgb is None:
             return self._from_rgb(rgb, size)
-        return np.concatenate([self._from_rgb(frame[None], size) for frame in rgb])
+        return np.concatenate([self._from_rgb([frame], size) for frame in rgb])
 
     def from_sim(
         self, depth_m: Float[np.ndarray, "T H W"], rgb: UInt8[np.ndarray, "T h w 3"] | None = None
@@ -69,22 +72,23 @@ class DepthNetworkPrior:
             return normalise(inverse_depth(depth_m))
         return self._from_rgb(rgb, depth_m.shape[1:])
 
-    def _from_rgb(self, rgb: np.ndarray | None, size: tuple[int, ...]) -> np.ndarray:
+    def _from_rgb(self, rgb: Pictures | None, size: tuple[int, ...]) -> np.ndarray:
         if rgb is None:
             raise UserError(
                 f"ddg.prior.source {self.name} was given no RGB: keep it, or set ddg.prior.in_sim depth."
             )
         return normalise(self.relative(rgb, size))
 
-    def relative(
-        self, rgb: UInt8[np.ndarray, "T h w 3"], size: Sequence[int]
-    ) -> Float[np.ndarray, "T {size[0]} {size[1]}"]:
+    def relative(self, rgb: Pictures, size: Sequence[int]) -> Float[np.ndarray, "T {size[0]} {size[1]}"]:
         """Relative inverse depth as the network gives it, at `size`: neither normalised nor clipped."""
-        return np.stack([at_size(frame, (size[0], size[1])) for frame in self._infer(rgb)])
+        return self._infer(rgb, (size[0], size[1]))
 
     @cached_property
-    def _infer(self) -> Callable[[np.ndarray], np.ndarray]:
-        """(T, h, w, 3) uint8 -> (T, h, w) relative inverse depth; loads the weights when first used."""
+    def _infer(self) -> Callable[[Pictures, tuple[int, int]], np.ndarray]:
+        """T pictures, `size` -> (T, *size) relative inverse depth; loads the weights when first used.
+
+        Each map comes to `size` before the next is made: in pictures' own size they are many times as large.
+        """
         from foundation.convert import depth_network
         from foundation.depth import predict
         from foundation.pictures import in_batches
@@ -94,15 +98,19 @@ class DepthNetworkPrior:
         network = depth_network(manifest.network, dtype=self._config.prior.dtype)
         params, side = variables["params"], self._config.prior.input_px
 
-        def video(rgb: np.ndarray) -> np.ndarray:
+        def video(rgb: Pictures, size: tuple[int, int]) -> np.ndarray:
             if len(rgb) == 1:  # a frame by itself needs no window of 32
-                return np.asarray(predict(network, params, rgb[None], side))[0]
-            return np.stack(list(stream(network, params, rgb, side)))
+                return shrunk(np.asarray(predict(network, params, np.stack(list(rgb))[None], side))[0], size)
+            return shrunk(stream(network, params, rgb, side), size)
 
-        def pictures(rgb: np.ndarray) -> np.ndarray:
-            if len(rgb) == 1:
-                return np.asarray(predict(network, params, rgb, side))
-            return in_batches(lambda part: predict(network, params, part, side), rgb, _BATCH)
+        def pictures(rgb: Pictures, size: tuple[int, int]) -> np.ndarray:
+            def batch(part: np.ndarray) -> np.ndarray:
+                return shrunk(np.asarray(predict(network, params, part, side)), size)
+
+            return batch(np.stack(list(rgb))) if len(rgb) == 1 else in_batches(batch, rgb, _BATCH)
+
+        def shrunk(maps: Iterable[np.ndarray], size: tuple[int, int]) -> np.ndarray:
+            return np.stack([at_size(one, size) for one in maps])
 
         return video if network.video else pictures
 

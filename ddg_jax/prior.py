@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from ddg_jax.inverse_depth import normalise
-from ddg_jax.network_prior import NETWORKS, DepthNetworkPrior
+from ddg_jax.network_prior import NETWORKS, DepthNetworkPrior, Pictures
 from ddg_jax.piecewise import piecewise_smooth
 from ddgrasp.config import FILTERED, PIECEWISE, PLANES, DDGConfig
 from ddgrasp.depth import inverse_depth
@@ -49,7 +49,7 @@ class Prior(Protocol):
     def from_recording(
         self,
         depth_m: Float[np.ndarray, "T H W"],
-        rgb: UInt8[np.ndarray, "T h w 3"] | None,
+        rgb: Pictures | None,
         rng: np.random.Generator,
         consecutive: bool = True,
     ) -> Float32[np.ndarray, "T H W"]:
@@ -83,7 +83,7 @@ class InverseDepthPrior:
     def from_recording(
         self,
         depth_m: Float[np.ndarray, "T H W"],
-        rgb: UInt8[np.ndarray, "T h w 3"] | None,
+        rgb: Pictures | None,
         rng: np.random.Generator,
         consecutive: bool = True,
     ) -> Float32[np.ndarray, "T H W"]:

@@ -44,7 +44,7 @@ class ClosingLatch:
 
 
 class WidthChange:
-    """Adds the change of the opening since the call before; call it with the state of every control step."""
+    """Adds the change of the opening in a control period; call it with the state of every control step."""
 
     def __init__(self) -> None:
         self.reset()
@@ -53,9 +53,12 @@ class WidthChange:
         """Start of an episode: the next state has no change."""
         self._before: np.ndarray | None = None
 
-    def __call__(self, state: Float[np.ndarray, "*batch 8"]) -> Float[np.ndarray, "*batch 9"]:
-        """`state` (..., 8) with the change (m) behind it: `layout.POLICY_STATE`."""
+    def __call__(
+        self, state: Float[np.ndarray, "*batch 8"], periods: int = 1
+    ) -> Float[np.ndarray, "*batch 9"]:
+        """`state` (..., 8) with the change (m) behind it: `layout.POLICY_STATE`. `periods` have passed since
+        the call before: more than one where a loop was late."""
         width = state[..., STATE.width]
-        change = np.zeros_like(width) if self._before is None else width - self._before
+        change = np.zeros_like(width) if self._before is None else (width - self._before) / periods
         self._before = np.array(width)
         return np.concatenate([state, change], axis=-1)

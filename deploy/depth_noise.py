@@ -37,7 +37,8 @@ class Reported(NamedTuple):
     predicted_m: Array
     """The generator's own map."""
     mask: Array
-    """Where an artefact was grafted; everywhere else `depth_m` is the simulation's, to the bit of float32."""
+    """Where an artefact was grafted; everywhere else `depth_m` is the simulation's, to the bit of float32
+    unless the generator has a window (`ddg.graft.window_px`), through which it goes first."""
 
 
 class DepthGenerator:

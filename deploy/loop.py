@@ -54,6 +54,7 @@ class ControlLoop:
         self._last_frame_s = -math.inf
         self._held_for = ""
         self._closed = self._touches = self._checked = False
+        self._periods = 1
         self._start_s = self._last_s = 0.0
 
     def run(
@@ -115,9 +116,10 @@ class ControlLoop:
         """The next multiple of the period that is still ahead; skipped ones count as missed."""
         period = self._settings.period_s
         late = self._clock.now() - (deadline + period)
-        if late <= 0:
+        missed = max(0, int(np.ceil(late / period)))
+        self._periods = 1 + missed
+        if not missed:
             return deadline + period
-        missed = int(np.ceil(late / period))
         self._report.timings.missed_deadlines += missed
         self._log("missed", f"{missed} deadline(s), step took {1e3 * (late + period):.0f} ms")
         return deadline + (1 + missed) * period
@@ -143,7 +145,7 @@ class ControlLoop:
         if action is not None:
             target, problem = self._command(state, action, paced=action is own and not state.met)
         if problem:
-            self._hold(problem)
+            self._hold(problem, state)
         else:
             self._recover()
         ended = time.perf_counter()
@@ -156,13 +158,13 @@ class ControlLoop:
     def _act(self, frame: Frame, state: RobotState) -> tuple[np.ndarray, bool]:
         """(8,) the policy's action, or what is left of its last one; whether the network ran for it."""
         if not state.met and (rest := self._pace.rest(state.q_rad)) is not None:
-            self._policy.wait(state.vector())
+            self._policy.wait(state.vector(), self._periods)
             return rest, False
         self._pace.forget()
         if state.met:
             self._policy.replan()
         inferring = self._policy.will_infer
-        return self._policy.act(frame.depth, state.vector()), inferring
+        return self._policy.act(frame.depth, state.vector(), self._periods), inferring
 
     def _or_retry(self, state: RobotState, action: np.ndarray) -> np.ndarray:
         """(8,) `action`, or what a hand does that tries again, after which the policy begins anew."""
@@ -227,11 +229,13 @@ class ControlLoop:
         self._closed = close
         return target, ""
 
-    def _hold(self, reason: str) -> None:
+    def _hold(self, reason: str, state: RobotState) -> None:
         self._robot.hold()
         self._safety.stopped()
         # The arm stands still, so after the gap one frame repeated is what three frames would show.
         self._policy.forget()
+        if np.isfinite(state.width_m):
+            self._policy.wait(state.vector())  # the fingers go on: to the network still ones hold something
         self._pace.forget()
         if self._retry is not None:
             self._retry.held()

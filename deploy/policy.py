@@ -138,10 +138,11 @@ class OnnxPolicy:
             return f"almost all-invalid depth: {100 * share:.2g} % of the pixels are above 0"
         return ""
 
-    def act(self, depth: Depth, state: Float[np.ndarray, " _"]) -> Float32[np.ndarray, "8"]:
+    def act(self, depth: Depth, state: Float[np.ndarray, " _"], periods: int = 1) -> Float32[np.ndarray, "8"]:
         """(8,) action for the newest frame (H, W) and the state (8,).
 
-        Call this or `wait` in every control step.
+        Call this or `wait` in every control step, with the `periods` since the call before: a late loop
+        leaves some out.
 
         UserError for a frame of another size or type, and for a state that is not eight finite numbers, in
         radians and metres; the frames of before stay.
@@ -155,16 +156,16 @@ class OnnxPolicy:
         self._frames.append(depth)
         while len(self._frames) < contract.DEPTH_FRAMES:
             self._frames.append(depth)
-        known = self._width_change(state)
+        known = self._width_change(state, periods)
         if self.watch is not None:
             self.watch(np.stack(self._frames), known)
         if not self._actions:
             self._actions.extend(self._infer(known)[: self.execute_steps])
         return self._latch(self._actions.popleft())
 
-    def wait(self, state: Float[np.ndarray, " _"]) -> None:
+    def wait(self, state: Float[np.ndarray, " _"], periods: int = 1) -> None:
         """A control step in which the policy is not asked: the fingers move all the same."""
-        self._width_change(state)
+        self._width_change(state, periods)
 
     def warm_up(self) -> None:
         """Run the network once, so that the first period does not pay for memory."""

@@ -1,7 +1,7 @@
 """What pictures go through before a network: its input size, resampling, standardisation."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -25,13 +25,15 @@ WIDE_SIDES = 1.777
 
 
 def in_batches(
-    function: Callable[[np.ndarray], AnyArray], rows: Shaped[np.ndarray, "N ..."], size: int
+    function: Callable[[np.ndarray], AnyArray],
+    rows: Shaped[np.ndarray, "N ..."] | Sequence[np.ndarray],
+    size: int,
 ) -> Shaped[np.ndarray, "N ..."]:
     """`function` of all N `rows`, of which it is given `size` at once: one shape, compiled once.
 
     Where too few are left, the last one is repeated; what its copies give is dropped.
     """
-    parts = (rows[at : at + size] for at in range(0, len(rows), size))
+    parts = (np.asarray(rows[at : at + size]) for at in range(0, len(rows), size))
     filled = (np.concatenate([part, np.repeat(part[-1:], size - len(part), 0)]) for part in parts)
     return np.concatenate([np.asarray(function(part)) for part in filled])[: len(rows)]
 

@@ -53,6 +53,7 @@ def test_recordings_and_simulation_on_rgb_see_the_network(weights):
     assert c.shape == (3, 20, 28) and c.std() > 0.1 and abs(np.median(c)) < 0.1
     np.testing.assert_array_equal(prior.from_sim(depth, rgb), c)
     np.testing.assert_array_equal(prior.from_recording(2 * depth, rgb, np.random.default_rng(1)), c)
+    np.testing.assert_array_equal(prior.from_recording(depth, list(rgb), np.random.default_rng(0)), c)
     apart = prior.from_recording(depth, rgb, np.random.default_rng(0), consecutive=False)
     for one, picture in zip(apart, rgb, strict=True):
         np.testing.assert_array_equal(one, prior.from_sim(depth[:1], picture[None])[0])
@@ -178,7 +179,7 @@ def test_monocular_depth_of_a_perfect_network_is_the_measured_one_far_and_near(w
     inverse[:, 9:12, 14:17] = 2.0  # a thing at 0.5 m: many mean deviations from the wall
     assert np.abs(normalise(inverse)).max() == NORMALISED_LIMIT
     monkeypatch.setattr(
-        network_prior.DepthNetworkPrior, "_infer", staticmethod(lambda rgb: 3 * inverse - 0.2)
+        network_prior.DepthNetworkPrior, "_infer", staticmethod(lambda rgb, size: 3 * inverse - 0.2)
     )
     truth_mm, rgb = np.rint(1000 / inverse).astype(np.uint16), np.zeros((1, 24, 32, 3), np.uint8)
     settings = config(weights)

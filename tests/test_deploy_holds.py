@@ -1,5 +1,7 @@
 """After the arm was held, or another acted for the policy: nothing of before goes on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,47 @@ def test_what_was_left_of_an_action_is_not_made(tmp_path, bad, asked):
 def test_what_was_left_of_a_chunk_is_not_played(tmp_path, bad, asked):
     script = [depth_mm(), bad, depth_mm()]
     assert Run(tmp_path, script, QUICK, constant_bias(0.1), 8, execute_steps=4).inferred == asked
+
+
+class Closing(KinematicRobot):
+    """Its fingers come 10 mm nearer in every control period, whatever the arm does; the command of step 2
+    takes as long as `late_s` says."""
+
+    late_s = 0.0
+
+    def read_state(self):
+        state = super().read_state()
+        return replace(state, width_m=0.08 - 0.1 * state.timestamp_s)
+
+    def command(self, q_target_rad, close):
+        super().command(q_target_rad, close)
+        if self.calls.count("command") == 3:
+            self._clock.sleep_until(self._clock.now() + self.late_s)
+
+
+@pytest.mark.parametrize(
+    ("script", "late_s", "told"),
+    [
+        ([depth_mm()] * 6, 0.0, [0.0, -0.01, -0.01, -0.01, -0.01]),
+        ([*[depth_mm()] * 2, VOID, VOID, depth_mm()], 0.0, [0.0, -0.01, -0.01]),
+        ([depth_mm()] * 6, 0.25, [0.0, -0.01, -0.01, -0.01, -0.01]),
+    ],
+    ids=["in time", "held", "late"],
+)
+def test_the_network_is_told_how_fast_the_fingers_go_through_holds_and_late_steps(
+    tmp_path, script, late_s, told
+):
+    """Still fingers are to it what has closed on something, and three periods' way no way that it knows."""
+    clock, described = SimClock(), describe()
+    robot, heard = Closing(clock), []
+    robot.late_s = late_s
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", described, bias=constant_bias(0.0)))
+    policy.watch = lambda depth, state: heard.append(float(state[-1]))
+    safety = SafetyFilter(QUICK, described.action_scale_rad)
+    camera = ScriptedCamera(clock, script)
+    report = ControlLoop(camera, robot, policy, safety, clock, LoopSettings(0.1)).run(5)
+    np.testing.assert_allclose(heard, told, atol=1e-6)
+    assert report.timings.missed_deadlines == (2 if late_s else 0)
 
 
 @pytest.mark.parametrize(("bad", "closes_at"), [(depth_mm(), STILL_STEPS), (VOID, STILL_STEPS + 5)])

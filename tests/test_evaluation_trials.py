@@ -65,9 +65,9 @@ def seen(monkeypatch) -> list[np.ndarray]:
     """Every frame that a policy is given from here on, in this process."""
     frames, act = [], OnnxPolicy.act
 
-    def watched(self, depth, state):
+    def watched(self, depth, *told):
         frames.append(depth.copy())
-        return act(self, depth, state)
+        return act(self, depth, *told)
 
     monkeypatch.setattr(OnnxPolicy, "act", watched)
     return frames

@@ -53,4 +53,7 @@ def test_the_change_of_the_opening_is_the_last_number_of_each_state():
     )
     np.testing.assert_array_equal(told(states[0])[:, :8], states[0])
     told.reset()
+    told(states[0])
+    np.testing.assert_allclose(told(states[2], periods=3)[:, 8], [-0.01 / 3, -0.01], atol=1e-7)
+    told.reset()
     assert told(states[0, 0]).tolist() == [*states[0, 0].tolist(), 0.0]
