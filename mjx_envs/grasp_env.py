@@ -19,6 +19,7 @@ from mujoco_playground import MjxEnv, State
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.config import WorldConfig
+from ddgrasp.errors import UserError
 from ddgrasp.layout import ACTION, QPOS, QVEL, closes
 from mjx_envs import devices, grasp_math, kinematics, randomize, rewards, scene
 from mjx_envs.physics import interface as physics
@@ -75,6 +76,12 @@ class GraspEnv(MjxEnv):
     """Grasp the object and hold it 40 cm up. Observation (40,), action (8,), 10 Hz."""
 
     def __init__(self, config: WorldConfig):
+        """Raises UserError where JAX is told to count in 64 bits, which no physics here does."""
+        if jax.config.read("jax_enable_x64"):
+            raise UserError(
+                "jax_enable_x64 is on: states, physics and pictures are of 32 bits here; leave it off "
+                "(JAX_ENABLE_X64=0)."
+            )
         super().__init__(config_dict.create(ctrl_dt=contract.CONTROL_DT_S, sim_dt=config.sim_dt_s))
         self.config = config
         self.table = randomize.ObjectTable(config.objects)

@@ -34,13 +34,14 @@ _COUNTED_BY_WRAPPERS = ("return", "length")
 
 
 def default_config() -> config_dict.ConfigDict:
-    """`WorldConfig` under Playground's names (`ctrl_dt`, `sim_dt`, `episode_length`, `impl`), on MJX-JAX.
+    """`WorldConfig` under Playground's names (`ctrl_dt`, `sim_dt`, `episode_length`, `impl`), on MJX-JAX, and
+    the `action_repeat` of 1 that Playground asks every environment for.
 
     `impl` is jax, warp (on an NVIDIA GPU) or cpu (MuJoCo's C engine, behind a call of the host).
     """
     world = asdict(WorldConfig(backend="jax"))
     named = {_PLAYGROUND_NAMES.get(name, name): value for name, value in world.items()}
-    return config_dict.create(ctrl_dt=contract.CONTROL_DT_S, **named)
+    return config_dict.create(ctrl_dt=contract.CONTROL_DT_S, action_repeat=1, **named)
 
 
 def world_config(config: config_dict.ConfigDict) -> WorldConfig:
@@ -48,6 +49,8 @@ def world_config(config: config_dict.ConfigDict) -> WorldConfig:
     values: dict[str, Any] = config.to_dict()
     if (ctrl_dt := values.pop("ctrl_dt", contract.CONTROL_DT_S)) != contract.CONTROL_DT_S:
         raise UserError(f"ctrl_dt is {ctrl_dt!r}; expected {contract.CONTROL_DT_S:g}: the task has 10 Hz.")
+    if (repeat := values.pop("action_repeat", 1)) != 1:
+        raise UserError(f"action_repeat is {repeat!r}; expected 1: an action lasts a control step.")
     values = _in_our_names(values)
     for name, section in (("reward", RewardConfig), ("random", RandomConfig)):
         values[name] = section(**_known(section, values.get(name, {})))

@@ -54,7 +54,7 @@ def check(iteration: int, watched: Mapping[str, AnyArray], saved: int | None, di
         )
     raise UserError(
         f"PPO diverged at iteration {iteration}: {first} is {wrong[first]}. {kept}. For a new run, {remedy}; "
-        f"--teacher.start {directory} starts it from the best policy so far."
+        f"--teacher.start {directory} --teacher.critic-warmup 10 starts it from the best policy so far."
     )
 
 

@@ -66,14 +66,15 @@ def _train(
             metrics, watched = jax.device_get(scalars)
             health.check(i, watched, saved.latest, directory)
             counts.add(metrics)
-            if i % LOG_EVERY == 0 or i == total:
+            kept = i % teacher.checkpoint_every == 0 or i == total
+            if kept or i % LOG_EVERY == 0:  # what goes on from a checkpoint knows no counts of before
                 _log(i, metrics | clock.rate(i) | counts.told(progress), progress, task)
             task.advance()
             if i % teacher.eval_every == 0 or i == total:
                 rate = _evaluate(test_env, state, config, i, progress)
                 best.offer(rate, state)
                 state = learner.with_evaluation(state, rate >= teacher.stop_at)
-            if i % teacher.checkpoint_every == 0 or i == total:
+            if kept:
                 saved.save(i, state)
     counts.told(progress)
     return state

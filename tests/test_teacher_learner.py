@@ -326,8 +326,11 @@ def test_exploring_starts_reach_training_alone(tmp_path, monkeypatch):
 
 
 def test_contacts_dropped_and_states_blown_up_are_told_of_every_iteration(tmp_path, monkeypatch):
-    """At the fifth, and after the seventh, which an evaluation makes the last of more."""
-    teacher = dataclasses.replace(TEACHER, total_steps=20 * 8 * 4, eval_every=6, stop_at=0.9)
+    """At the fifth, at the third and sixth, whose checkpoints a resumed run would begin with, and after the
+    seventh, which an evaluation makes the last of more."""
+    teacher = dataclasses.replace(
+        TEACHER, total_steps=20 * 8 * 4, eval_every=6, stop_at=0.9, checkpoint_every=3
+    )
     dropped, blown_up, said = iter([3, 0, 4, 0, 0, 1, 5]), iter([0, 2, 0, 0, 1, 0, 0]), []
 
     def iterate(state):
@@ -345,10 +348,11 @@ def test_contacts_dropped_and_states_blown_up_are_told_of_every_iteration(tmp_pa
         config = dataclasses.replace(CONFIG, teacher=teacher)
         ppo_train._train(config, tmp_path, object.__new__(AutoReset), saved, progress)
     told = [note for note in said if "contacts" in note]
-    assert len(told) == 2
-    assert "7 contacts in 160 control steps" in told[0] and "6 contacts in 64 control steps" in told[1]
+    counts = ("7 contacts in 96 control", "1 contacts in 32 control", "5 contacts in 32 control")
+    assert all(count in note for count, note in zip(counts, told, strict=True))
     curves = read_curves(tmp_path)
-    assert (curves["contacts_dropped"], curves["blown_up"]) == ([(5, 7.0)], [(5, 3.0)])
+    assert curves["contacts_dropped"] == [(3, 7.0), (5, 0.0), (6, 1.0)]
+    assert curves["blown_up"] == [(3, 2.0), (5, 1.0), (6, 0.0)]
 
 
 FROM_NOTHING = dataclasses.replace(TEACHER, target_kl=0.02, learning_rate=2e-5, critic_warmup=2)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from brax import envs
 from mujoco_playground import manipulation, registry, wrapper
+from mujoco_playground.config import manipulation_params
 
 from ddgrasp.config import RandomConfig, WorldConfig
 from ddgrasp.errors import UserError
@@ -49,6 +50,15 @@ def traced(env, keys) -> list[tuple]:
     return [structure(state), structure(jax.eval_shape(env.step, state, action))]
 
 
+def test_numbers_of_64_bits_are_refused():
+    jax.config.update("jax_enable_x64", True)
+    try:
+        with pytest.raises(UserError, match="jax_enable_x64 is on"):
+            playground_env.PickEnv()
+    finally:
+        jax.config.update("jax_enable_x64", False)
+
+
 def test_the_configuration_is_the_worlds_under_playgrounds_names():
     config = registry.get_default_config(playground_env.NAME)
     assert (config.ctrl_dt, config.sim_dt, config.episode_length, config.impl) == (0.1, 0.005, 60, "jax")
@@ -61,6 +71,10 @@ def test_the_configuration_is_the_worlds_under_playgrounds_names():
     assert (env.observation_size, env.action_size, env.dt, env.n_substeps) == (40, 8, 0.1, 20)
     with pytest.raises(UserError, match="ctrl_dt is 0.02"):
         registry.load(playground_env.NAME, config_overrides={"ctrl_dt": 0.02})
+    with pytest.raises(UserError, match="action_repeat is 2; expected 1"):
+        registry.load(playground_env.NAME, config_overrides={"action_repeat": 2})
+    with pytest.raises(ValueError, match="Unsupported env"):  # its own answer, not a missing field's
+        manipulation_params.brax_ppo_config(playground_env.NAME)
     for ours, theirs in playground_env._PLAYGROUND_NAMES.items():
         with pytest.raises(UserError, match=f"'{ours}' has Playground's name here: write '{theirs}'"):
             playground_env.PickEnv(config_overrides={ours: WorldConfig().__dict__[ours]})

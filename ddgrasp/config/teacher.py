@@ -95,7 +95,8 @@ class TeacherConfig(Section, name="teacher"):
     clone_steps: Steps = 500
     """Optimiser steps per such round."""
     critic_warmup: CountOrNone = 10
-    """Iterations in which the critic alone learns, so that it does not mislead a cloned policy."""
+    """Iterations in which the critic alone learns, so that it does not mislead a policy that was cloned or
+    loaded; its own start is random."""
     eval_every: Count = 20
     """Updates between deterministic evaluations; there is one after the last too."""
     checkpoint_every: Count = 20
