@@ -153,6 +153,10 @@ def _merged(preset: Mapping[str, Any], given: Mapping[str, Any], section: str) -
     merged = dict(preset)
     for name, value in given.items():
         place = f"{section}{name}"
+        if name not in preset and isinstance(name, str) and "." in name:
+            *above, last = name.split(".")
+            below = " below ".join(f"{part}:" for part in reversed(above))
+            raise UserError(f"{place} stands in one line: write {last}: indented below {below}")
         if name not in preset:
             known = [f"{section}{other}" for other in preset]
             raise unknown_name("setting", place, known)

@@ -177,8 +177,10 @@ def run(
         about = {"robot": f"rig {series.rig}", "camera": series.camera}
         about |= {"depth": series.depth} if series.depth != RECORDED else {}
         make = RecordedBench(make, out / EPISODES, about)
-    results = run_missing(config, policy, series.plan(), make, header, out, workers, progress, failures)
-    table = tabulate(results, trained_on(header))
+    asked = run_missing(config, policy, series.plan(), make, header, out, workers, progress, failures)
+    as_begun, done = read_log(out / TRIALS_FILE)
+    before = [result for result in done if result not in asked]  # `report` counts them, too
+    table = tabulate([*asked, *before], trained_on(as_begun))
     atomic_write_text(out / TABLE_FILE, json.dumps({"series": asdict(series), **table}, indent=1) + "\n")
     return table
 

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from app.commands.play import _ChosenNoise
+from ddg_jax.prior import make_prior
+from ddg_jax.sample import Generator
+from ddgrasp.config import DDGConfig
 from ddgrasp.errors import UserError
 from deploy.controls import DOWN, ENTER, UP, Controls
 from deploy.interfaces import Frame
@@ -110,6 +113,31 @@ def test_the_policy_sees_the_noise_that_is_chosen_now(tmp_path):
         controls.line(word)
         seen.append(int(camera.read().depth[0, 0]))
     assert seen == [700, 500, 511, 700]
+
+
+def test_every_trial_has_noise_of_its_own_from_its_first_frame_on(tmp_path, monkeypatch):
+    asked = []
+
+    class Source:
+        needs_rgb = False
+
+        def __init__(self, *_): ...
+
+        def frames(self, clean_mm, rgb, episode, frame):
+            asked.append((int(episode[0]), int(frame[0])))
+            return clean_mm
+
+    loaded = Generator(DDGConfig(), {}, make_prior(DDGConfig()))
+    monkeypatch.setattr(Generator, "load", staticmethod(lambda folder: loaded))
+    monkeypatch.setattr("student_jax.depth_source.GeneratorSource", Source)
+    controls = Controls(OBJECTS, "development")
+    noise, camera = _ChosenNoise(controls, tmp_path), _Camera()
+    controls.line("generator")
+    for trial in (7, 9):
+        noise.begin(trial)
+        for _ in range(2):
+            noise.replace(camera.read().depth, camera.clean_mm)
+    assert asked == [(7, 0), (7, 1), (9, 0), (9, 1)]
 
 
 def test_a_camera_that_knows_no_clean_depth_is_refused(tmp_path):

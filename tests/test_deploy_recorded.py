@@ -55,6 +55,7 @@ def test_a_recorded_trial_is_an_episode(tmp_path, policy):
     corner_mm = [float(depth_mm[0, 0]) for depth_mm, _ in episode.pictures()]
     np.testing.assert_allclose(episode.action[:, 1], np.clip(np.multiply(corner_mm, 1e-4), -1, 1), rtol=1e-5)
     assert all(rgb.any() for _, rgb in episode.pictures())
+    assert len(open_source(out).episodes) == 1  # the folder of the trials will do
     assert deployments.verdict(deployments.find(out / rig_trials.EPISODES)).startswith("Success 0.0 % of 1")
 
 

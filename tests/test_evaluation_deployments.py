@@ -76,6 +76,19 @@ def test_a_policy_that_was_exported_again_is_another():
     assert "p.onnx (aaaaaaaa) on sim with stereo: 100.0 % of 1 (" in said and "p.onnx (bbbbbbbb) on" in said
 
 
+def test_a_policy_whose_path_was_typed_otherwise_is_the_same():
+    made = [
+        deployment(True, policy_sha256="a" * 64),
+        deployment(policy="runs/../p.onnx", policy_sha256="a" * 64),
+    ]
+    made.append(deployment(False))  # of before deployments had a hash
+    said = deployments.verdict(made)
+    assert (
+        "p.onnx (aaaaaaaa) on sim with stereo: 100.0 % of 1 (" in said
+        and "p.onnx (hash not noted) on" in said
+    )
+
+
 def test_the_page_says_what_counts(tmp_path):
     folder = tmp_path / "20261128-120000"
     folder.mkdir()

@@ -57,7 +57,8 @@ def test_what_a_policy_was_trained_on_besides_the_papers_objects_can_be_tried(po
     assert list(table["objects"]) == ["stick", "mine", "cube"] and table["other"]["n"] == 2
     more = replace(series, objects=("ring", "stick"))
     table = rig_trials.run(CONFIG, policy, more, tmp_path / "out", 0, QUIET)
-    assert list(table["objects"]) == ["ring", "stick"] and len(read_log(tmp_path / "out" / TRIALS)[1]) == 4
+    assert list(table["objects"]) == ["ring", "stick", "mine", "cube"] and table["all"]["n"] == 4
+    assert len(read_log(tmp_path / "out" / TRIALS)[1]) == 4
 
 
 @pytest.fixture

@@ -124,6 +124,10 @@ def test_a_number_may_be_written_as_on_the_command_line(tmp_path):
             "preset: demo\nworld: {objcts: [cube]}",
             "Unknown setting 'world.objcts'. Did you mean 'world.objects'",
         ),
+        (
+            "preset: demo\nstudent.training.steps: 3",
+            "student.training.steps stands in one line: write steps: indented below training: below student:",
+        ),
         ("preset: demo\nworld: 3", "world is 3; expected its settings, indented below it"),
         ("preset: demo\nworld:", "world is None; expected its settings, indented below it"),
         ("preset: demo\nteacher: {num_envs: 0}", "teacher.num_envs is 0; expected at least 1"),

@@ -150,7 +150,7 @@ def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         shown.add_column(title, overflow="fold")
     for row in rows:
         shown.add_row(*row)
-    tables.console().print(shown)
+    tables.console(width=140).print(shown)
 
 
 @dataclass(frozen=True)

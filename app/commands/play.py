@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from deploy.interfaces import Depth
     from deploy.treatment import CleanDepth
     from deploy.trials import Bench, Trial
-    from deploy.video import NoiseModel
     from deploy.viewers import Viewer
     from evaluation.rig_trials import Series
 
@@ -98,10 +97,10 @@ class Play:
         try:
             rigs.bench(self.rig)
             if self._live:
-                self._play_on(rigs, series.names(), viewer, controls)
+                self._play_on(rigs, series.names(), viewer, noise)
             else:
                 with terminable():  # the file is closed, whatever ends it
-                    lifted = sum(_watched(rigs.bench(self.rig), trial, viewer, controls) for trial in trials)
+                    lifted = sum(_watched(rigs.bench(self.rig), trial, viewer, noise) for trial in trials)
             whole = True
         finally:
             rigs.close()
@@ -131,7 +130,8 @@ class Play:
         if self._film.suffix == ".rrd":
             return Rerun(browser=False, file=self._film)
         if self.viewer == "film":
-            return Video(self._film, noise.generator if self.generator else None)
+            beside = self.generator and self.noise != "generator"  # else it is what the policy sees
+            return Video(self._film, noise.generator if beside else None)
         if self.viewer != "web" and sys.platform == "linux" and not _has_display():
             raise UserError(f"--viewer {self.viewer}: there is no display here: choose web, or film.")
         if self.viewer == "mujoco":
@@ -141,8 +141,9 @@ class Play:
             print(viewer.url, flush=True)
         return viewer
 
-    def _play_on(self, rigs: "_Rigs", names: Sequence[str], viewer: "Viewer", controls: Controls) -> None:
+    def _play_on(self, rigs: "_Rigs", names: Sequence[str], viewer: "Viewer", noise: "_ChosenNoise") -> None:
         """Trials with `names`, then with what is asked for, until Ctrl-C or the window's end."""
+        controls = noise.controls
         controls.listen(sys.stdin, lambda text: print(text, flush=True))
         print(f"{controls.help} {KEYS}." if self.viewer == "mujoco" else controls.help, flush=True)
         planned = itertools.chain.from_iterable([name] * self.trials for name in names)
@@ -155,7 +156,7 @@ class Play:
                     continue
                 series = rigs.series(rig := controls.rig)
                 if name in series.at_hand():
-                    _watched(rigs.bench(rig), series.trial(name, tried[rig, name]), viewer, controls)
+                    _watched(rigs.bench(rig), series.trial(name, tried[rig, name]), viewer, noise)
                     tried[rig, name] += 1
 
 
@@ -201,12 +202,20 @@ class _ChosenNoise:
     """The depth that the policy sees, as `controls` say: see `deploy.treatment.Replacement`."""
 
     def __init__(self, controls: Controls, folder: Path):
-        self.controls, self._folder = controls, folder
+        self.controls, self._folder, self._episode = controls, folder, 0
 
     @cached_property
-    def generator(self) -> "NoiseModel":
+    def generator(self) -> "_Generated":
         """Loaded when it is first asked for."""
-        return _noise_of(self._folder)
+        made = _Generated(self._folder)
+        made.begin(self._episode)
+        return made
+
+    def begin(self, episode: int) -> None:
+        """A trial begins, to which noise of its own belongs."""
+        self._episode = episode
+        if "generator" in vars(self):
+            self.generator.begin(episode)
 
     def replace(self, depth: "Depth", clean_mm: "CleanDepth") -> "Depth":
         """See `Replacement`."""
@@ -215,9 +224,11 @@ class _ChosenNoise:
         return clean_mm() if self.controls.noise == "none" else self.generator(clean_mm())
 
 
-def _watched(bench: "Bench", trial: "Trial", viewer: "Viewer", controls: Controls) -> bool:
+def _watched(bench: "Bench", trial: "Trial", viewer: "Viewer", noise: "_ChosenNoise") -> bool:
     """One trial before `viewer`; whether the object was lifted and held."""
+    controls = noise.controls
     controls.begin(trial.object_name)
+    noise.begin(trial.index % 2**31)
     viewer.begin(f"{trial.object_name}, noise: {controls.noise}")
 
     def look(step, camera) -> bool:
@@ -232,25 +243,33 @@ def _watched(bench: "Bench", trial: "Trial", viewer: "Viewer", controls: Control
     return result.success
 
 
-def _noise_of(generator: Path) -> "NoiseModel":
-    """The generator's depth of one frame after the other of an episode."""
-    import jax
-    import numpy as np
+class _Generated:
+    """A generator's depth of one frame after the other of an episode."""
 
-    from ddg_jax.sample import Generator
-    from student_jax.depth_source import GeneratorSource
+    def __init__(self, generator: Path):
+        import jax
 
-    loaded = Generator.load(generator)
-    one = replace(loaded.config, sampling=replace(loaded.config.sampling, batch_size=1))
-    source = GeneratorSource(replace(loaded, config=one), jax.random.key(0))
-    if source.needs_rgb:
-        raise UserError(f"--generator {generator} looks at colour: play can show one with another prior.")
-    frames = itertools.count()
+        from ddg_jax.sample import Generator
+        from student_jax.depth_source import GeneratorSource
 
-    def noisy(clean_mm: "np.ndarray") -> "np.ndarray":
-        return source.frames(clean_mm[None], None, np.zeros(1, int), np.array([next(frames)]))[0]
+        loaded = Generator.load(generator)
+        one = replace(loaded.config, sampling=replace(loaded.config.sampling, batch_size=1))
+        self._source = GeneratorSource(replace(loaded, config=one), jax.random.key(0))
+        if self._source.needs_rgb:
+            raise UserError(f"--generator {generator} looks at colour: play can show one with another prior.")
+        self._episode = self._frame = 0
 
-    return noisy
+    def begin(self, episode: int) -> None:
+        """Start of an episode; what its frames share is drawn by its number."""
+        self._episode, self._frame = episode, 0
+
+    def __call__(self, clean_mm: "np.ndarray") -> "np.ndarray":
+        """(H, W) uint16 millimetres -> the same as the generator has it."""
+        import numpy as np
+
+        made = self._source.frames(clean_mm[None], None, np.array([self._episode]), np.array([self._frame]))
+        self._frame += 1
+        return made[0]
 
 
 def _chosen(film: bool) -> Literal["film", "mujoco", "web"]:

@@ -203,3 +203,13 @@ def config_of(policy: Path, preset: str | None, file: Path | None = None) -> Con
     if preset is None and artifacts.is_finished(policy.parent):
         return artifacts.config_from_json(artifacts.read_manifest(policy.parent).config)
     return get_preset(preset or DEFAULT_PRESET)
+
+
+def unknown_origin(policy: Path, preset: str | None, file: Path | None) -> str:
+    """What is to be said of a policy beside which nothing says what made it, where nobody else does."""
+    if preset is not None or file is not None or artifacts.is_finished(policy.parent):
+        return ""
+    return (
+        f"no manifest.json beside {policy}: the configuration is that of preset {DEFAULT_PRESET} (--preset), "
+        "and its objects count as those that the policy was trained on"
+    )

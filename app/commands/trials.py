@@ -59,7 +59,7 @@ class DeployTrials:
 
     def run(self) -> None:
         """Runs what is missing and prints the table."""
-        from app.commands.student import config_of
+        from app.commands.student import config_of, unknown_origin
         from ddgrasp.progress import Progress
         from evaluation import rig_trials
 
@@ -82,6 +82,8 @@ class DeployTrials:
         check_folder("--out", self.out)
         config = config_of(self.policy, self.preset, self.config_file)
         progress = Progress(name="deploy trials")
+        if note := unknown_origin(self.policy, self.preset, self.config_file):
+            progress.note(note)
         table = rig_trials.run(
             config, self.policy, series, self.out, self.workers, progress, record=self.record
         )

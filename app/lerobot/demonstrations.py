@@ -50,15 +50,20 @@ def read(folder: Path, objects: Sequence[str] = (), noisy: Path | None = None) -
     if not taken:
         raise UserError(f"{folder} has no episode with {' or '.join(objects)}: choose others of {names}.")
     width, height = config.world.profile.width_px, config.world.profile.height_px
-    noise = f"standard deviation {config.demos.action_noise:g}" if config.demos.noise_share else "none"
+    disturbed = (
+        " In some steps its joint steps were disturbed (standard deviation "
+        f"{config.demos.action_noise:g}); `action` is what it asked for, not the disturbed step, so that "
+        "recoveries are labelled."
+        if config.demos.noise_share and config.demos.action_noise
+        else ""
+    )
     about = {
         "Robot": f"Franka Emika Panda with its hand, simulated in {_ENGINE[config.world.backend]}.",
         "Camera": f"An ideal one with a RealSense D455's view, {width} x {height}, fixed across the table; "
         f"{depth_is}.",
         "How it was made": f"A policy that sees the simulator's state, trained by PPO "
         f"{_begun(config.teacher.start)}, grasped {len(names)} "
-        "objects; episodes that failed were thrown away. In some steps its joint steps were disturbed "
-        f"({noise}); `action` is what it asked for, not the disturbed step, so that recoveries are labelled.",
+        f"objects; episodes that failed were thrown away.{disturbed}",
     }
     poses = store.episodes("T_world_cam")
     read_one = partial(_read, store, depth, names, indices, poses)

@@ -8,6 +8,7 @@ from app.lerobot import demonstrations, deployments
 from app.lerobot.episode import Source
 from ddgrasp.errors import UserError
 from evaluation.report.deployments import find
+from evaluation.rig_trials import EPISODES
 
 
 def open_source(path: Path, objects: Sequence[str] = (), noisy: Path | None = None, most: int = 0) -> Source:
@@ -22,9 +23,9 @@ def open_source(path: Path, objects: Sequence[str] = (), noisy: Path | None = No
         return replace(source, episodes=source.episodes[:most]) if most else source
     if noisy is not None:
         raise UserError(f"--noisy goes with demonstrations, and {path} has none: leave it out.")
-    if found := find(path):
+    if found := find(path) or find(path / EPISODES):  # of trials tried with --record
         return deployments.read(found, objects, most)
     raise UserError(
-        f"{path} has neither demos/episodes.zarr nor deployments: give a run (runs/demo) or a folder of "
-        "deployments (runs/deployments)."
+        f"{path} has neither demos/episodes.zarr nor deployments: give a run (runs/demo), a folder of "
+        "deployments (runs/deployments), or of trials that were tried with --record."
     )

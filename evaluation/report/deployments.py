@@ -10,7 +10,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_text, read_json
 from deploy.record import ENDED, FILM_FILE, REPORT_FILE, STEPS_FILE
 from evaluation import wilson
-from evaluation.report.html import REPORT_HTML, contents, film, heading, page, table
+from evaluation.report.html import REPORT_HTML, contents, film_file, heading, page, table
 
 _HEADER = ("deployment", "policy", "robot", "camera", "ended", "steps", "missed", "holds", "frame to command")
 _NOTE = (
@@ -102,8 +102,14 @@ def verdict(deployments: Sequence[Deployment]) -> str:
     """How many succeeded of those that count, for each policy, robot and camera apart, how many nobody
     judged, what ended by a fault, deadlines missed; without dry runs."""
     driven = [deployment for deployment in deployments if deployment.is_driven]
-    setups = sorted({_setup(deployment) for deployment in driven})
-    rates = [_rate([one for one in driven if _setup(one) == setup]) for setup in setups]
+    alike: dict[tuple[str, ...], list[Deployment]] = {}  # by the file's hash: its path may be typed otherwise
+    for deployment in sorted(driven, key=_setup):
+        policy, robot, camera, sha256 = _setup(deployment)
+        alike.setdefault((sha256 or policy, robot, camera), []).append(
+            deployment
+        )  # a path may be typed otherwise
+    setups = [_setup(some[0]) for some in alike.values()]
+    rates = [_rate(some) for some in alike.values()]
     if len(setups) > 1:  # a rig's trials say nothing of an arm's, nor one policy's of another's
         rates = [f"{_named(setup, setups)}: {rate}" for setup, rate in zip(setups, rates, strict=True)]
     rate = "; ".join(rates) or _rate([])
@@ -126,7 +132,8 @@ def _setup(deployment: Deployment) -> tuple[str, str, str, str]:
 def _named(setup: tuple[str, str, str, str], setups: Collection[tuple[str, str, str, str]]) -> str:
     policy, robot, camera, sha256 = setup
     alike = [other for other in setups if other[:3] == setup[:3]]
-    return f"{policy}{f' ({sha256[:8]})' if len(alike) > 1 else ''} on {robot} with {camera}"
+    which = f" ({sha256[:8] or 'hash not noted'})" if len(alike) > 1 else ""
+    return f"{policy}{which} on {robot} with {camera}"
 
 
 def _rate(driven: Sequence[Deployment]) -> str:
@@ -151,7 +158,7 @@ def _row(deployment: Deployment) -> list[str]:
 def _section(deployment: Deployment) -> list[str]:
     parts = [heading(_title(deployment))]
     if (strip := deployment.folder / FILM_FILE).exists():
-        parts.append(film(strip.read_bytes(), f"film of {deployment.folder.name}"))
+        parts.append(film_file(strip, f"film of {deployment.folder.name}"))
     if events := deployment.report["events"]:
         parts.append("<pre>" + escape("\n".join(events)) + "</pre>")
     return parts

@@ -13,17 +13,13 @@ from deploy.trials import TrialResult
 from evaluation import failure_modes, paired, wilson
 from evaluation.report import success_chart
 from evaluation.report.comparison import COMPARISON_HTML, COMPARISON_PNG
-from evaluation.report.html import REPORT_HTML, contents, film, heading, image, page, table
+from evaluation.report.html import REPORT_HTML, contents, film_file, heading, image, page, table
 from evaluation.rig_trials import TRIALS_FILE, differing, shown, shown_rows, tabulate, trained_on
 from evaluation.treatments import RECORDED
 
 _SECTIONS = ("By object", "Failures", "Successes", "Which trials")
 _KINDS = ("rig", "row")
 """The header of a log has one of them: of `deploy trials`, or of `study causes`."""
-_QUALITY = 75
-"""The films' WebP takes a sixth of the PNG files that they are made from."""
-_WEBP_MOST_PX = 16_383
-"""A side of a WebP picture (RFC 9649: 14 bits)."""
 
 
 @dataclass(frozen=True)
@@ -178,17 +174,5 @@ def _modes(results: Sequence[TrialResult]) -> list[str]:
 
 def _films(folder: Path, outcome: str) -> list[str]:
     strips = sorted(folder.glob(f"*-{outcome}.png"))
-    parts = [f"<h3>{escape(strip.stem)}</h3>{_film(strip)}" for strip in strips]
+    parts = [f"<h3>{escape(strip.stem)}</h3>{film_file(strip, strip.stem)}" for strip in strips]
     return parts or ["<p>No film.</p>"]
-
-
-def _film(strip: Path) -> str:
-    import cv2
-
-    picture = cv2.imread(str(strip))
-    if picture is None:
-        return f"<p>{escape(strip.name)} cannot be shown: it is no whole PNG.</p>"
-    if max(picture.shape) > _WEBP_MOST_PX:
-        return film(strip.read_bytes(), strip.stem)
-    _, data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
-    return film(data.tobytes(), strip.stem, "webp")
