@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -33,6 +33,9 @@ from deploy.setup import loop_settings, safety_filter
 from deploy.timing import SECONDS, Timings
 from deploy.treatment import Replacement, Treatment, treated
 from rig.film import Film
+
+if TYPE_CHECKING:
+    from rig.world import RigWorld
 
 _STREAM = 0x526967
 """Keeps the trials' random numbers apart from every other stage's ("Rig")."""
@@ -131,8 +134,8 @@ Watch = Callable[[Step, Filmed], bool | None]
 """Is called after every step, with the camera of the trial for colour pictures; True ends the trial."""
 
 
-WatchPolicy = Callable[[Depth, np.ndarray, np.ndarray], None]
-"""Is told the frames (3, H, W) and the state (9,) that a policy is given, and what is true then (40,)."""
+WatchPolicy = Callable[[Depth, np.ndarray, "RigWorld"], None]
+"""Is told the frames (3, H, W) and the state (9,) that a policy is given, and the world as it is then."""
 
 
 class Bench(Protocol):
@@ -219,7 +222,7 @@ class Rig:
 
     def watch_policy(self, watch: WatchPolicy) -> None:
         """From now on `watch` is told of everything that the policy is given."""
-        self._policy.watch = lambda depth, state: watch(depth, state, self._world.observation())
+        self._policy.watch = lambda depth, state: watch(depth, state, self._world)
 
     def close(self) -> None:
         """See Bench."""

@@ -23,7 +23,7 @@ from deploy.changes import Change
 from deploy.trials import Rig
 from evaluation.failure_modes import LIFTED_M, MOVED_M
 from evaluation.rig_trials import Series
-from mjx_envs.grasp_math import HAND_DOWN
+from rig.world import RigWorld
 
 if TYPE_CHECKING:
     from student_jax.policy import Aux
@@ -39,6 +39,10 @@ class Seen:
     depth: list[UInt16[np.ndarray, "3 H W"]] = field(default_factory=list)
     state: list[Float[np.ndarray, "9"]] = field(default_factory=list)
     observation: list[Float[np.ndarray, "40"]] = field(default_factory=list)
+    grasped: list[bool] = field(default_factory=list)
+    """Whether both fingers had the object, as training's label has it."""
+    symmetry: int = 2
+    """Yaws in a turn by which the object is grasped alike; 0: any."""
 
 
 def measure(
@@ -76,10 +80,12 @@ def measure(
     return tabulate(parts, outcomes, [trial.object_name for trial in plan])
 
 
-def _keep(seen: Seen, depth: np.ndarray, state: np.ndarray, observation: np.ndarray) -> None:
+def _keep(seen: Seen, depth: np.ndarray, state: np.ndarray, world: RigWorld) -> None:
     seen.depth.append(depth if depth.dtype == np.uint16 else to_millimetres(depth))
     seen.state.append(state)
-    seen.observation.append(observation)
+    seen.observation.append(world.observation())
+    seen.grasped.append(world.grasped())
+    seen.symmetry = world.grasp_symmetry
 
 
 @dataclass(frozen=True)
@@ -89,12 +95,14 @@ class Errors:
     away_m: Float[np.ndarray, "T 3"]
     """Perceived minus true position of the grasp, in the robot's frame."""
     yaw_rad: Float[np.ndarray, " T"]
-    """The grasp's, without sign; NaN where any yaw is as good."""
+    """The grasp's, without sign, from the nearest of those that are as good; NaN where any is."""
     held: Float[np.ndarray, " T"]
     """Perceived probability that the object is in the hand."""
     distance_m: Float[np.ndarray, " T"]
     """From the hand to the grasp."""
     touched: Bool[np.ndarray, " T"]
+    grasped: Bool[np.ndarray, " T"]
+    """What `held` is to be, before the object is carried."""
     carried: Bool[np.ndarray, " T"]
 
 
@@ -111,18 +119,20 @@ def errors(seen: Seen, aux: "Aux") -> Errors:
     to_grasp = observation[:, OBSERVATION.grip_pos] - observation[:, OBSERVATION.grasp_pos]
     return Errors(
         away_m=away,
-        yaw_rad=np.where(_any_yaw(observation), np.nan, np.abs(np.angle(np.exp(1j * turn))) / YAW_MULTIPLE),
+        yaw_rad=_off(turn / YAW_MULTIPLE, seen.symmetry),
         held=1 / (1 + np.exp(-aux.held_logit)),
         distance_m=np.linalg.norm(to_grasp, axis=1),
+        grasped=np.array(seen.grasped),
         touched=np.maximum.accumulate(np.linalg.norm(at - lay, axis=1) > MOVED_M),
         carried=at[:, 2] - lay[2] > LIFTED_M,
     )
 
 
-def _any_yaw(observation: Float[np.ndarray, "N 40"]) -> Bool[np.ndarray, " N"]:
-    """Whether the object is grasped as well from any side: the hand keeps its yaw of 0 then, to the bit
-    (`grasp_math.grasp_pose`), which no other object asks for."""
-    return (observation[:, OBSERVATION.grasp_quat] == np.array(HAND_DOWN)).all(axis=1)
+def _off(turn_rad: Float[np.ndarray, " T"], symmetry: int) -> Float[np.ndarray, " T"]:
+    """How far `turn_rad` is from no turn, or from the nearest by which the object is grasped as well."""
+    if symmetry == 0:
+        return np.full(len(turn_rad), np.nan)
+    return np.abs(np.angle(np.exp(1j * symmetry * turn_rad))) / symmetry
 
 
 def tabulate(parts: Sequence[Errors], success: Sequence[bool], names: Sequence[str]) -> list[dict[str, Any]]:
@@ -144,7 +154,7 @@ def tabulate(parts: Sequence[Errors], success: Sequence[bool], names: Sequence[s
             where = [steps(part) for part in chosen]
             if any(w.any() for w in where) and (hand == "near" or title not in names):
                 row = {"trials": title, "n_trials": sum(bool(w.any()) for w in where), "hand": hand}
-                rows.append(row | _row(chosen, where, hand == "carried"))
+                rows.append(row | _row(chosen, where))
     return rows
 
 
@@ -160,7 +170,7 @@ def _median_deg(yaw_rad: Float[np.ndarray, " N"]) -> float | None:
     return round(float(np.degrees(np.median(told))), 1) if len(told) else None
 
 
-def _row(parts: Sequence[Errors], where: Sequence[np.ndarray], carried: bool) -> dict[str, Any]:
+def _row(parts: Sequence[Errors], where: Sequence[np.ndarray]) -> dict[str, Any]:
     def of(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name)[w] for part, w in zip(parts, where, strict=True)])
 
@@ -174,5 +184,5 @@ def _row(parts: Sequence[Errors], where: Sequence[np.ndarray], carried: bool) ->
         "mean_y_mm": y,
         "mean_z_mm": z,
         "yaw_deg": _median_deg(of("yaw_rad")),
-        "held_wrong": round(float(np.mean((of("held") > 0.5) != carried)), 3),
+        "held_wrong": round(float(np.mean((of("held") > 0.5) != (of("carried") | of("grasped")))), 3),
     }

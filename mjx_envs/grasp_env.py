@@ -26,8 +26,6 @@ from mjx_envs.physics import interface as physics
 from mjx_envs.physics.backends import make_physics
 from mjx_envs.precision import exact
 
-TOUCH_N = 0.3
-"""Pad force from which a pad counts as touching the object."""
 LIFTED_M = 0.03
 OUT_OF_REACH_M = 0.35
 """An object that rolled this far from the workspace's centre, horizontally, ends the episode."""
@@ -158,7 +156,7 @@ class GraspEnv(MjxEnv):
 
         distances = self._distances(new.qpos, episode.variant, episode.branch)
         object_pos = new.qpos[QPOS.object_pos]
-        touching, closing = jnp.all(new.touch > TOUCH_N), closes(action)
+        touching, closing = jnp.all(new.touch > grasp_math.TOUCH_N), closes(action)
         grasped = touching & closing
         rewarded = rewards.grasped(self.config.reward, touching, closing, distances.grip_to_object)
         held = jnp.linalg.norm(object_pos - jnp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M

@@ -15,6 +15,8 @@ HAND_DOWN = (0.0, 1.0, 0.0, 0.0)
 """Hand orientation with the fingers down and opening along world y."""
 MIN_GRIP_HEIGHT_M = 0.02
 """The pads reach 12 mm beyond the grip site: keep them off the table."""
+TOUCH_N = 0.3
+"""Pad force from which a pad counts as touching the object."""
 SATURATED = 0.95
 """An action component beyond this share of its range counts as saturated."""
 
@@ -103,3 +105,11 @@ def controls(
     target = xp.clip(target, xp.asarray(contract.JOINT_LOWER_RAD), xp.asarray(contract.JOINT_UPPER_RAD))
     finger = xp.where(closes(action)[..., None], 0.0, contract.GRIPPER_MAX_WIDTH_M / 2)
     return xp.concatenate([target, finger, finger], axis=-1)
+
+
+def touch_from_sensors(
+    sensordata: Float[AnyArray, "*batch forces"], xp: ModuleType
+) -> Float[AnyArray, "*batch 2"]:
+    """(..., 2) contact force (N) on the left and right pad from the scene's contact sensors (..., 6 S)."""
+    forces = sensordata.reshape(sensordata.shape[:-1] + (2, -1, 3))
+    return xp.sqrt(xp.sum(forces**2, axis=-1)).sum(axis=-1)

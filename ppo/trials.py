@@ -13,7 +13,8 @@ from mujoco_playground import State
 
 from ddgrasp.contract import counted
 from ddgrasp.progress import Progress
-from mjx_envs.grasp_env import TOUCH_N, GraspEnv
+from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.grasp_math import TOUCH_N
 from mjx_envs.physics.interface import ModelParams
 from ppo.evaluate import motion_of
 from ppo.motion import motion_metrics

@@ -84,6 +84,16 @@ class RigWorld:
             np.log(self._spec.category_id), offset_m=np.asarray(self._spec.grasp_offset_m),
         )  # fmt: skip
 
+    def grasped(self) -> bool:
+        """Whether both pads press on the object while the hand is told to close: "held" in training."""
+        touch_n = grasp_math.touch_from_sensors(self.data.sensordata, np)
+        return bool((touch_n > grasp_math.TOUCH_N).all() and not self.data.ctrl[CONTROLS.fingers].any())
+
+    @property
+    def grasp_symmetry(self) -> int:
+        """Yaws in a turn by which the object is grasped alike; 0: any."""
+        return self._spec.grasp_symmetry
+
     def success(self) -> bool:
         """Whether the object has been at the lift target for the last HOLD_STEPS control steps."""
         return self._hold_steps >= contract.HOLD_STEPS

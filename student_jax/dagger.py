@@ -63,15 +63,17 @@ class Trainer:
         self.params: dict = {}
 
     def run(self, demos: EpisodeStore) -> None:
-        """Every phase that is not finished; `params` is then the student."""
+        """Every phase that is not finished; `params` is then the student. Demos get their depth only where
+        something is trained on it."""
         check_demos(self._source, demos)
         self._restore()
         if _LAST_PHASE in self._done:  # stopped after that: what it was trained on may be gone
             return
         self._phase("poses", self._fit_on_poses)
-        frames_io.add_noisy_demos(
-            demos, self._store, self._source, self._config, self._progress, self._window
-        )
+        if self._student.training.steps or self._student.dagger.rounds or self._student.head.train_steps:
+            frames_io.add_noisy_demos(
+                demos, self._store, self._source, self._config, self._progress, self._window
+            )
         self._phase("demos", lambda: self._fit("demos", self._student.training.steps))
         for i in range(1, self._student.dagger.rounds + 1):
             self._phase(f"dagger-{i}", lambda i=i: self._dagger(i, len(demos)))

@@ -42,6 +42,7 @@ def _seen(hand_m: list, lifted_m: list) -> perception.Seen:
         observation[OBSERVATION.grip_pos] = at + [0, 0, 0.01 + hand]
         observation[OBSERVATION.grasp_quat] = [0, np.cos(0.1), np.sin(0.1), 0]
         seen.observation.append(observation)
+        seen.grasped.append(False)
     return seen
 
 
@@ -75,8 +76,7 @@ def test_every_part_of_a_trial_has_its_errors():
 
 def test_what_is_round_has_no_error_of_yaw():
     seen = _seen([0.3, 0.05], [0, 0])
-    for observation in seen.observation:
-        observation[OBSERVATION.grasp_quat] = [0, 1, 0, 0]
+    seen.symmetry = 0
     reported = _reported(seen, np.zeros(3), 0.7, [False, False])
     apart = perception.errors(seen, reported)
     (row, *_) = perception.tabulate([apart], [True], ["apple"])
@@ -87,6 +87,25 @@ def test_what_is_round_has_no_error_of_yaw():
     )  # fmt: skip
     assert [row["n_trials"] for row in both if row["trials"] == "all"] == [2, 1], "far in two, near in one"
     assert both[0]["yaw_deg"] == pytest.approx(np.degrees(0.2), abs=0.1)
+
+
+def test_an_angle_is_off_from_the_nearest_that_grasps_as_well():
+    """A quarter turn of a cube is none; half a turn of anything is none."""
+    for symmetry, turn_deg, off_deg in ((2, 80, 80), (2, 100, 80), (4, 80, 10), (4, 50, 40), (4, -100, 10)):
+        seen = _seen([0.3], [0])
+        seen.symmetry = symmetry
+        made = perception.errors(seen, _reported(seen, np.zeros(3), np.radians(turn_deg), [False]))
+        assert np.degrees(made.yaw_rad) == pytest.approx(off_deg, abs=0.1)
+
+
+def test_what_both_fingers_have_is_held_before_it_is_lifted():
+    seen = _seen([0.05, 0.05], [0, 0])
+    seen.grasped = [False, True]
+    for said, wrong in (([False, True], 0.0), ([False, False], 0.5), ([True, False], 1.0)):
+        (row, *_) = perception.tabulate(
+            [perception.errors(seen, _reported(seen, np.zeros(3), 0.0, said))], [True], ["cube"]
+        )
+        assert (row["hand"], row["held_wrong"]) == ("near", wrong)
 
 
 def test_rows_stay_until_the_student_is_made_anew(tmp_path):

@@ -380,6 +380,23 @@ def test_a_round_interrupted_after_its_episodes_keeps_their_success(tmp_path):
     assert trainer._dagger(2, 0) == {}
 
 
+def test_a_student_that_learns_nothing_more_has_no_depth_drawn(tmp_path, monkeypatch):
+    """It may be a generator's: minutes for the demos of a preset."""
+    monkeypatch.setattr("student_jax.frames_io.add_noisy_demos", None)
+    student = dataclasses.replace(
+        CONFIG, depth_source="ideal", poses=dataclasses.replace(CONFIG.poses, rounds=0),
+        training=dataclasses.replace(CONFIG.training, steps=0),
+        dagger=dataclasses.replace(CONFIG.dagger, rounds=0),
+        head=dataclasses.replace(CONFIG.head, train_steps=0),
+    )  # fmt: skip
+    config = Config("test", student=student)
+    source, demos = make_source(config, tmp_path), EpisodeStore(tmp_path / "demos", create=True)
+    trainer = Trainer(config, cast(Any, None), source, tmp_path, Progress(quiet=True))
+    trainer.run(demos)
+    assert trainer.frame_count == 0 and (tmp_path / PARAMS_FILE).exists()
+    assert [phase["phase"] for phase in trainer.history] == ["poses", "demos", "head"]
+
+
 def test_a_student_stopped_after_its_last_phase_needs_its_frames_no_more(tmp_path):
     """Its stage deletes them before the manifest that says it is finished."""
     config = Config("test", student=dataclasses.replace(CONFIG, depth_source="ideal"))

@@ -25,7 +25,9 @@ MEANINGS: dict[str, Meaning] = {
     "student_rig": Meaning("exported student on the simulated rig"),
     "seen": Meaning("objects that it was trained on", SHARE),
     "unseen": Meaning("objects that it was not trained on", SHARE),
-    "realtime_trials": Meaning("trials on the real clock, in which time is measured"),
+    "realtime_trials": Meaning(
+        "trials on the real clock, as long as an episode of training, in which time is measured"
+    ),
     # teacher
     "saturated_actions": Meaning("joint actions at the end of their range", SHARE),
     "acceleration_p99": Meaning("1 of 100 steps has more, relative to Franka's limit", "of limit"),

@@ -11,8 +11,9 @@ from mujoco.batch import Batch
 
 from ddgrasp import machine
 from mjx_envs import devices, scene
+from mjx_envs.grasp_math import touch_from_sensors
 from mjx_envs.object_spec import SlotLayout
-from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
+from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState
 
 
 class CpuPhysics:

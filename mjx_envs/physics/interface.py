@@ -102,14 +102,6 @@ def dropped_warning(dropped: float, control_steps: float) -> str | None:
     )
 
 
-def touch_from_sensors(
-    sensordata: Float[AnyArray, "*batch forces"], xp: ModuleType
-) -> Float[AnyArray, "*batch 2"]:
-    """(..., 2) contact force (N) on the left and right pad from the scene's contact sensors (..., 6 S)."""
-    forces = sensordata.reshape(sensordata.shape[:-1] + (2, -1, 3))
-    return xp.sqrt(xp.sum(forces**2, axis=-1)).sum(axis=-1)
-
-
 class ModelIndex:
     """Where the fields of `ModelParams` live in the compiled model."""
 

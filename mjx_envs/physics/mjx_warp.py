@@ -7,8 +7,9 @@ from mujoco import mjx
 
 from ddgrasp.errors import UserError
 from mjx_envs import scene
+from mjx_envs.grasp_math import touch_from_sensors
 from mjx_envs.object_spec import SlotLayout
-from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState, touch_from_sensors
+from mjx_envs.physics.interface import ModelIndex, ModelParams, PhysicsState
 
 CONTACTS_PER_ENV = 40
 """Room per environment in the batch's common buffer: nine slots against table, hand and two pads, all near
