@@ -212,6 +212,8 @@ def _read_all(
                 sizes.add(size)
                 _tell_of_crop(recording, config, progress)
             frames, rgb, left_out, consecutive = _read(recording, count, config, prior, progress)
+            rng = np.random.default_rng((seed, number))
+            c = prior.from_recording(frames, rgb, rng, consecutive)  # reads colour as it goes
         except UserError as error:
             if len(folders) == 1:
                 raise
@@ -219,8 +221,7 @@ def _read_all(
             progress.note(f"left out: {error}")
             continue
         skipped += left_out
-        rng = np.random.default_rng((seed, number))
-        priors.append(prior.from_recording(frames, rgb, rng, consecutive).astype(np.float16))
+        priors.append(c.astype(np.float16))
         depth[number] = frames
         if not consecutive:
             apart.add(number)

@@ -234,7 +234,7 @@ class ControlLoop:
         self._safety.stopped()
         # The arm stands still, so after the gap one frame repeated is what three frames would show.
         self._policy.forget()
-        if np.isfinite(state.width_m):
+        if not _state_problem(state):
             self._policy.wait(state.vector())  # the fingers go on: to the network still ones hold something
         self._pace.forget()
         if self._retry is not None:

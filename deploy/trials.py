@@ -125,9 +125,11 @@ RULES: dict[str, Any] = {"rules": 5, "ends": "with success, as judged then"}
 The number goes up with every change of loop, driver or rig that a trial can tell. Before 2026-11-27 there was
 none; with 1 a hand on the FR3 rig began as wide as the trial before had left it; with 2 the safety filter did
 not know the fingers; with 3 a hand might close and open again in one place without end; with 4 what a hand
-held by its end hung beside its place for good. `ends`: trials of before 2026-11-25 were judged when their
-time was over; until a day later, those that success had ended were judged again on the development rig a
-control period later."""
+held by its end hung beside its place for good. Not for what late and held steps told the network until
+2026-11-30 (docs/test_rig.md): the development rig has none, the FR3 rig one in a thousand.
+
+`ends`: trials of before 2026-11-25 were judged when their time was over; until a day later, those that
+success had ended were judged again on the development rig a control period later."""
 
 
 Watch = Callable[[Step, Filmed], bool | None]

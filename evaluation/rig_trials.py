@@ -180,8 +180,10 @@ def run(
     asked = run_missing(config, policy, series.plan(), make, header, out, workers, progress, failures)
     as_begun, done = read_log(out / TRIALS_FILE)
     before = [result for result in done if result not in asked]  # `report` counts them, too
+    if before:
+        progress.note(f"{len(before)} trials that {out} has besides are counted as well")
     table = tabulate([*asked, *before], trained_on(as_begun))
-    atomic_write_text(out / TABLE_FILE, json.dumps({"series": asdict(series), **table}, indent=1) + "\n")
+    atomic_write_text(out / TABLE_FILE, json.dumps({"asked": asdict(series), **table}, indent=1) + "\n")
     return table
 
 

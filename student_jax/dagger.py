@@ -28,7 +28,7 @@ from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
 from student_jax import device_frames, frames_io, head, pretrained_encoder, start, train
 from student_jax.act import SourceCamera, StudentActor
-from student_jax.data import CACHE, Frames, Window
+from student_jax.data import CACHE, Frames, Window, learns_from_pictures
 from student_jax.depth_source import DepthSource, check_demos
 from student_jax.policy import PARAMS_FILE, init_params
 
@@ -70,7 +70,7 @@ class Trainer:
         if _LAST_PHASE in self._done:  # stopped after that: what it was trained on may be gone
             return
         self._phase("poses", self._fit_on_poses)
-        if self._student.training.steps or self._student.dagger.rounds or self._student.head.train_steps:
+        if learns_from_pictures(self._student):
             frames_io.add_noisy_demos(
                 demos, self._store, self._source, self._config, self._progress, self._window
             )

@@ -27,6 +27,11 @@ def kept_of_a_demo(student: StudentConfig, length: int) -> int:
     return min(length, steps + LEAD_IN + student.head.chunk - 1) if steps else length
 
 
+def learns_from_pictures(student: StudentConfig) -> bool:
+    """Whether anything is trained on frames: else none are drawn."""
+    return bool(student.training.steps or student.dagger.rounds or student.head.train_steps)
+
+
 @runtime_checkable
 class DepthRows(Protocol):
     """N depth pictures, wherever they lie."""

@@ -8,7 +8,7 @@ from demos.memory import drawing_bytes
 from learning.memory import Need, traced_bytes
 from learning.prefetch import AHEAD
 from student_jax import programs
-from student_jax.data import CACHE, Window, kept_of_a_demo
+from student_jax.data import CACHE, Window, kept_of_a_demo, learns_from_pictures
 from student_jax.source_check import needs_rgb
 
 _ROW_BYTES = 4 * (9 + 8 + 40 + 1) + 17
@@ -20,7 +20,7 @@ def need(config: Config) -> Need:
     accelerator if it has room for it besides."""
     student, profile = config.student, config.world.profile
     length = config.world.episode_steps
-    frames = config.demos.episodes * kept_of_a_demo(student, length)
+    frames = config.demos.episodes * kept_of_a_demo(student, length) * learns_from_pictures(student)
     frames += student.dagger.rounds * student.dagger.episodes * length
     acting = _acting(
         config, max(student.dagger.episodes * bool(student.dagger.rounds), config.evaluation.student_trials)

@@ -1,5 +1,6 @@
 """The built-in prior and the loading of recordings, by value on small pictures."""
 
+import shutil
 import tracemalloc
 from dataclasses import replace
 from functools import partial
@@ -364,6 +365,11 @@ def test_colours_are_those_of_the_frames_that_can_be_used(tmp_path):
     coloured = Coloured(0.0)
     data.load_frames(tmp_path, WIDE, coloured, 0, Progress(quiet=True))
     np.testing.assert_allclose(coloured.seen, [0, 120, 180], atol=5)
+    broken = tmp_path / "b"  # whole to look at: a picture that a power cut left
+    shutil.copytree(tmp_path / "a", broken)
+    (broken / "color" / "000002.jpg").write_bytes(b"\xff\xd8" + bytes(200) + b"\xff\xd9")
+    frames = data.load_frames(tmp_path, WIDE, coloured, 0, Progress(quiet=True))
+    assert frames.refused_recordings == 1 and set(frames.recording) == {0}
 
 
 def test_no_frame_behind_the_first_ones_is_read_for_those_that_cannot_be_used(tmp_path):

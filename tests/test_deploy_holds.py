@@ -86,17 +86,19 @@ def test_what_was_left_of_a_chunk_is_not_played(tmp_path, bad, asked):
 
 class Closing(KinematicRobot):
     """Its fingers come 10 mm nearer in every control period, whatever the arm does; the command of step 2
-    takes as long as `late_s` says."""
+    takes as long as `late_s` says, or, below 0, a joint is missing in it."""
 
     late_s = 0.0
 
     def read_state(self):
         state = super().read_state()
+        if self.late_s < 0 and self.calls.count("command") == 2 and "hold" not in self.calls:
+            state = replace(state, q_rad=state.q_rad[:6])
         return replace(state, width_m=0.08 - 0.1 * state.timestamp_s)
 
     def command(self, q_target_rad, close):
         super().command(q_target_rad, close)
-        if self.calls.count("command") == 3:
+        if self.calls.count("command") == 3 and self.late_s > 0:
             self._clock.sleep_until(self._clock.now() + self.late_s)
 
 
@@ -106,8 +108,9 @@ class Closing(KinematicRobot):
         ([depth_mm()] * 6, 0.0, [0.0, -0.01, -0.01, -0.01, -0.01]),
         ([*[depth_mm()] * 2, VOID, VOID, depth_mm()], 0.0, [0.0, -0.01, -0.01]),
         ([depth_mm()] * 6, 0.25, [0.0, -0.01, -0.01, -0.01, -0.01]),
+        ([depth_mm()] * 6, -1.0, [0.0, -0.01, 0.0, -0.01]),
     ],
-    ids=["in time", "held", "late"],
+    ids=["in time", "held", "late", "no joints"],
 )
 def test_the_network_is_told_how_fast_the_fingers_go_through_holds_and_late_steps(
     tmp_path, script, late_s, told
@@ -122,7 +125,7 @@ def test_the_network_is_told_how_fast_the_fingers_go_through_holds_and_late_step
     camera = ScriptedCamera(clock, script)
     report = ControlLoop(camera, robot, policy, safety, clock, LoopSettings(0.1)).run(5)
     np.testing.assert_allclose(heard, told, atol=1e-6)
-    assert report.timings.missed_deadlines == (2 if late_s else 0)
+    assert report.timings.missed_deadlines == (2 if late_s > 0 else 0)
 
 
 @pytest.mark.parametrize(("bad", "closes_at"), [(depth_mm(), STILL_STEPS), (VOID, STILL_STEPS + 5)])

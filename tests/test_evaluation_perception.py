@@ -7,17 +7,22 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from app import cli
 from ddgrasp import artifacts
-from ddgrasp.layout import OBSERVATION
+from ddgrasp.config import RandomConfig
+from ddgrasp.contract import GRIPPER_MAX_WIDTH_M, HOME_RAD
+from ddgrasp.layout import OBSERVATION, QPOS
 from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.presets import PRESETS
+from deploy.calibration.poses import reach
+from deploy.safety import SafetyLimits
 from deploy.trials import drawn
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import perception, perception_table, rig_trials
 from learning.params import save_params
-from rig.world import make_world
+from rig.world import RigWorld, make_world
 from student_jax.data import YAW_MULTIPLE, aux_targets
 from student_jax.policy import (
     AUX_BESIDE,
@@ -106,6 +111,28 @@ def test_what_both_fingers_have_is_held_before_it_is_lifted():
             [perception.errors(seen, _reported(seen, np.zeros(3), 0.0, said))], [True], ["cube"]
         )
         assert (row["hand"], row["held_wrong"]) == ("near", wrong)
+
+
+def test_the_rig_says_what_both_fingers_have_and_how_an_object_may_be_turned():
+    world = RigWorld(("cube", "apple"), random=RandomConfig(**dict.fromkeys(("size", "object_mass"), 0.0)))
+    world.reset(0, "apple")
+    depth, state = np.zeros((3, 4, 6), np.uint16), np.zeros(9)
+    round_one, seen = perception.Seen(), perception.Seen()
+    perception._keep(round_one, depth, state, world)
+    world.reset(0, "cube")
+    grasp = np.eye(4)
+    w, x, y, z = world.observation()[OBSERVATION.grasp_quat]
+    grasp[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    grasp[:3, 3] = world.observation()[OBSERVATION.grasp_pos]
+    q = reach(grasp, np.array(HOME_RAD), SafetyLimits())
+    assert q is not None
+    world.data.qpos[QPOS.arm], world.data.qpos[QPOS.fingers] = q, GRIPPER_MAX_WIDTH_M / 2
+    for close in (False, True, False):
+        world.command(q, close)
+        world.step(1.0)
+        perception._keep(seen, depth, state, world)
+    assert seen.grasped == [False, True, False] and round_one.grasped == [False]
+    assert (round_one.symmetry, seen.symmetry) == (0, 4)
 
 
 def test_rows_stay_until_the_student_is_made_anew(tmp_path):

@@ -120,7 +120,7 @@ def test_other_tables_by_configuration_are_the_same_ones_and_other_trials(tmp_pa
     assert rig_trials.differing(configured, asked, ("camera",)) == []
     assert rig_trials.differing(configured, own, ("camera",)) == ["camera is other_tables, not stereo"]
     assert (
-        json.loads((tmp_path / "configured" / "table.json").read_text())["series"]["camera"] == "other_tables"
+        json.loads((tmp_path / "configured" / "table.json").read_text())["asked"]["camera"] == "other_tables"
     )
     with pytest.raises(UserError, match="begun otherwise"):
         rig_trials.check_place(CONFIG, policy, SERIES, tmp_path / "configured")

@@ -336,7 +336,6 @@ def test_undeclared_unit_is_refused(tmp_path, value):
         {"baseline_m": True},
         {"consecutive_frames": "false"},
         {"hz": 0},
-        {"frames": "6"},
     ],
 )
 def test_fields_of_another_kind_are_refused(tmp_path, fields):

@@ -17,6 +17,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.presets import get_preset
 from ddgrasp.shipped import NAME, shipped
+from ddgrasp.trained import policy_objects
 
 DEFAULT_POLICY = Path("runs") / DEFAULT_PRESET / "export" / POLICY_FILE
 
@@ -209,7 +210,8 @@ def unknown_origin(policy: Path, preset: str | None, file: Path | None) -> str:
     """What is to be said of a policy beside which nothing says what made it, where nobody else does."""
     if preset is not None or file is not None or artifacts.is_finished(policy.parent):
         return ""
+    seen = ", ".join(policy_objects(policy, get_preset(DEFAULT_PRESET)))
     return (
         f"no manifest.json beside {policy}: the configuration is that of preset {DEFAULT_PRESET} (--preset), "
-        "and its objects count as those that the policy was trained on"
+        f"and {seen} count as what the policy was trained on"
     )

@@ -290,7 +290,7 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
             yield RawFrame(file.name, _read_depth(file), None if color is None else _read_rgb(color))
 
     kept = {name: own[name] for name in KEPT_META if name in own}
-    certain = bool(kept.pop(UNIT_IS_CERTAIN, False)) and depth_unit_m == own["depth_unit_m"]
+    certain = bool(kept.pop(UNIT_IS_CERTAIN, False)) and depth_unit_m == own.get("depth_unit_m")
     return Source(folder, frames, depth_unit_m, {**kept, **meta}, unit_is_certain=certain, note=note)
 
 

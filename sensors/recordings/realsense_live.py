@@ -134,6 +134,8 @@ def record(options: LiveOptions, path: Path, progress: Progress) -> tuple[Import
 
     Raises:
         UserError: pyrealsense2 or the camera is missing, has no such streams, or gives no usable frame.
+        Trouble: the camera does not answer, or what it gave could not be ended: says where its frames are.
+        OSError: not even the first frame could be written.
         KeyboardInterrupt: stopped before the first frame.
     """
     rs = load_pyrealsense2()

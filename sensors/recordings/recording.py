@@ -140,7 +140,8 @@ class Recording:
         none taken away of as many as meta.json counts."""
         first, last = in_time(self.depth_files[0]), in_time(self.depth_files[-1])
         gaps = any(first < in_time(frame.file) < last for frame in self.skipped)
-        gaps |= len(self) + len(self.skipped) < (self.meta.get("frames") or 0)
+        counted = self.meta.get("frames")
+        gaps |= isinstance(counted, int) and len(self) + len(self.skipped) < counted
         return bool(self.meta.get("consecutive_frames", False)) and not gaps
 
     @property
@@ -293,8 +294,6 @@ def check_fields(file: Path, meta: Mapping[str, Any]) -> None:
     for name in ("consecutive_frames", "color_aligned_to_depth", UNIT_IS_CERTAIN):
         if not isinstance(value := meta.get(name), bool | None):
             raise UserError(f"{file}: {name} is {value!r}; expected true or false, or null.")
-    if not isinstance(value := meta.get("frames"), int | None):
-        raise UserError(f"{file}: frames is {value!r}; expected how many there are, or null.")
 
 
 def _is_positive(value: Any) -> bool:

@@ -1,5 +1,6 @@
 """Writing a recording (`sensors.recordings.recording`) whole or not at all."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -32,11 +33,12 @@ class RecordingWriter:
 
     Use as a context manager: frames go to a hidden folder beside the target, `meta.json` is
     written last, then the folder is renamed. Leaving by an exception (or Ctrl-C), or failing at the end,
-    removes the hidden folder; a previous recording of that name stays as it was. Pictures are on the disk
-    before `meta.json` is: a power cut leaves no recording that says it is whole and is not.
+    removes the hidden folder, unless it is to keep; a previous recording of that name stays as it was.
+    Pictures are on the disk before `meta.json` is: a power cut leaves no recording that says it is whole and
+    is not.
 
     With `keep`, for frames that come but once, the hidden folder stays if it has any, but where they are
-    refused (UserError): leaving raises Trouble then, which says where they are.
+    refused (UserError). Leaving by an error raises Trouble then, which says where they are.
 
     Raises UserError on entering if another one is at work under that name.
     """
@@ -76,7 +78,10 @@ class RecordingWriter:
     def _leave(self, error: BaseException) -> None:
         if not self._keep or not self._frames or isinstance(error, UserError):
             shutil.rmtree(self._temporary, ignore_errors=True)
-        elif isinstance(error, Exception):  # Ctrl-C says what it is
+            return
+        with contextlib.suppress(OSError):  # half of it may be there: BEGUN_FILE says what is known
+            (self._temporary / META_FILE).unlink(missing_ok=True)
+        if isinstance(error, Exception):  # Ctrl-C says what it is
             raise Trouble(
                 f"{self.path} could not be ended ({error}): its {self._frames} frames are in "
                 f"{self._temporary}; once that is mended, `ddgrasp record import {self._temporary}`."
