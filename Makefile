@@ -10,6 +10,7 @@ PYTHON := $(shell for p in python3.13 python3.12 python3.11 python3 python; do \
 else  # an environment of another version than the one that is named is made anew
 OTHER := $(shell [ ! -x $(BIN)/python ] || [ "$$($(BIN)/python $(VERSION))" = "$$($(PYTHON) $(VERSION))" ] || echo other)
 endif
+NEW_ENOUGH = [ -n "$(PYTHON)" ] && $(PYTHON) -c 'import sys, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
 STAMP := $(VENV)/.installed
 OUT ?= runs/demo
 WORKERS ?= 2
@@ -25,10 +26,11 @@ help:  ## list the targets
 setup: $(STAMP)  ## create .venv and install the locked dependencies
 
 $(STAMP): requirements.lock pyproject.toml $(OTHER)
-	@test -n "$(PYTHON)" || { echo "No Python >= 3.11 with venv found: install one, or name it: make setup PYTHON=/path/to/python3" >&2; exit 2; }
+	@$(NEW_ENOUGH) || { echo "No Python >= 3.11 with venv found: install one, or name it: make setup PYTHON=/path/to/python3" >&2; exit 2; }
 	@{ [ -z "$(OTHER)" ] && $(BIN)/python -c ''; } 2>/dev/null || { echo "$(PYTHON) -> $(VENV)"; $(PYTHON) -m venv --clear $(VENV); }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	-@$(BIN)/python -m pip --disable-pip-version-check check >/dev/null || echo "What was installed beside the lock no longer fits it: install your extras again ($(BIN)/python -m pip check)." >&2
 	@touch $@
 
 .PHONY: other
@@ -38,9 +40,10 @@ LOCK := uv pip compile --universal --python-version 3.11 --fork-strategy require
 	--no-annotate --no-header --upgrade
 
 lock:  ## resolve requirements.lock and requirements-docs.lock anew (needs uv on PATH)
+	@$(NEW_ENOUGH) || { echo "No Python >= 3.11 found: make lock PYTHON=/path/to/python3" >&2; exit 2; }
 	$(LOCK) --extra dev pyproject.toml --output-file requirements.lock
-	$(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' \
-		| $(LOCK) - --output-file requirements-docs.lock
+	$(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' > .docs.in
+	$(LOCK) .docs.in --output-file requirements-docs.lock; made=$$?; rm .docs.in; exit $$made
 
 test: setup  ## run the tests (trains the debug preset end to end); with ARGS those tests alone
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
@@ -86,7 +89,7 @@ format: setup  ## rewrite the files as `make check` wants them
 	$(BIN)/ruff format .
 
 $(DOCS)/.installed: requirements-docs.lock
-	@test -n "$(PYTHON)" || { echo "No Python >= 3.11 with venv found: install one, or name it: make docs PYTHON=/path/to/python3" >&2; exit 2; }
+	@$(NEW_ENOUGH) || { echo "No Python >= 3.11 with venv found: install one, or name it: make docs PYTHON=/path/to/python3" >&2; exit 2; }
 	$(PYTHON) -m venv --clear $(DOCS)
 	$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements-docs.lock
 	@touch $@

@@ -10,6 +10,7 @@ machine changes less than frames/s.
 """
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -86,7 +87,7 @@ _PAIR = ("sensed_mm", "clean_mm")
 
 def camera_model(sense: Sense) -> Noise:
     """One of sensors/models/, compiled."""
-    compiled, keys = jax.jit(sense), iter(jax.random.split(jax.random.key(0), 1000))
+    compiled, keys = jax.jit(sense), map(jax.random.key, itertools.count())
     return lambda depth_m: np.asarray(compiled(next(keys), depth_m, None))
 
 

@@ -39,8 +39,8 @@ class SafetyLimits:
     braking_reserve_rad_s: tuple[float, ...] = (0.0,) * 7
     workspace_lower_m: tuple[float, float, float] = (0.15, -0.45, 0.012)
     workspace_upper_m: tuple[float, float, float] = (0.80, 0.45, 0.80)
-    """Box for the point between the finger pads, robot base frame; 12 mm = an upright hand's
-    fingertips on the table."""
+    """Box for the point between the finger pads, robot base frame; at 12 mm an
+    upright hand's fingertips touch the table, the rig's; a Franka Hand's are 3 mm above it."""
     arm_lower_m: tuple[float, float, float] = (-0.55, -0.80, 0.0)
     arm_upper_m: tuple[float, float, float] = (0.95, 0.80, 1.30)
     """Box that elbow, forearm, wrist, hand and open fingers stay inside: table and walls."""
@@ -184,27 +184,34 @@ class SafetyFilter:
         return {"workspace": self._outside_m(q_rad), "arm": self._arm_outside_m(q_rad)}
 
     def _limit_workspace(self, q_rad: np.ndarray, step: np.ndarray, causes: list[str]) -> np.ndarray:
-        """(7,) `step`, changed so that the grip point ends in the box, or no further outside than it is."""
-        allowed = self._outside_m(q_rad)
-        if self._outside_m(q_rad + step) <= allowed:
+        """(7,) `step`, changed so that the grip point ends in the box, or no further outside than it is, of
+        the whole and of every face: who is outside of one wall may not go through the table instead."""
+        allowed, faces = self._outside_m(q_rad), np.abs(self._overshoot_m(q_rad))
+
+        def inside(part: np.ndarray, tolerance_m: float = 0.0) -> bool:
+            there = self._overshoot_m(q_rad + part)
+            whole = float(np.linalg.norm(there)) <= max(allowed, tolerance_m)
+            return whole and bool((np.abs(there) <= np.maximum(faces, tolerance_m)).all())
+
+        if inside(step):
             return step
         causes.append("workspace")
         slid = self._gently_down(q_rad, self._slide(q_rad, step))
-        if self._outside_m(q_rad + slid) <= max(allowed, _SLIDE_TOLERANCE_M):
-            return slid
-        return _shorten(step, lambda part: self._outside_m(q_rad + part) <= allowed)
+        return slid if inside(slid, _SLIDE_TOLERANCE_M) else _shorten(step, inside)
 
     def _limit_arm(self, q_rad: np.ndarray, step: np.ndarray, causes: list[str]) -> np.ndarray:
-        """(7,) `step`, shortened so that no part of the arm ends outside its box, or further than it is."""
-        allowed = self._arm_outside_m(q_rad)
-        if self._arm_outside_m(q_rad + step) <= allowed:
+        """(7,) `step`, shortened so that no part of the arm ends outside its box, or any face of it further
+        than one is."""
+        allowed = self._arm_over_m(q_rad)
+        if (self._arm_over_m(q_rad + step) <= allowed).all():
             return step
         causes.append("arm")
         grip = max(self._outside_m(q_rad), _SLIDE_TOLERANCE_M)
         return _shorten(
             step,
             lambda part: (
-                self._arm_outside_m(q_rad + part) <= allowed and self._outside_m(q_rad + part) <= grip
+                bool((self._arm_over_m(q_rad + part) <= allowed).all())
+                and self._outside_m(q_rad + part) <= grip
             ),
         )
 
@@ -228,10 +235,14 @@ class SafetyFilter:
 
     def _arm_outside_m(self, q_rad: np.ndarray) -> float:
         """How far the part that reaches furthest is outside the arm's box, 0 with all inside."""
+        return float(self._arm_over_m(q_rad).max())
+
+    def _arm_over_m(self, q_rad: np.ndarray) -> np.ndarray:
+        """(2, 3) the same of each face by itself: the lower ones, the upper ones."""
         centers, radii = kinematics.part_centers(q_rad), kinematics.PART_RADII_M[:, None]
         below = np.array(self.limits.arm_lower_m) - (centers - radii)
         above = (centers + radii) - np.array(self.limits.arm_upper_m)
-        return float(max(below.max(), above.max(), 0.0))
+        return np.maximum([below.max(axis=0), above.max(axis=0)], 0.0)
 
     @staticmethod
     def _noted(limited: np.ndarray, wanted: np.ndarray, cause: str, causes: list[str]) -> np.ndarray:

@@ -17,6 +17,8 @@ import numpy as np
 DIRECTORY = Path(
     os.environ.get("PARITY_DIR") or Path(__file__).resolve().parents[1].parent / "shared/parity/public"
 )
+if os.environ.get("PARITY_DIR") and not any(DIRECTORY.glob("*.npz")):
+    raise FileNotFoundError(f"PARITY_DIR is {DIRECTORY}, which has no *.npz: nothing would be compared")
 ABSENT = f"no parity fixtures in {DIRECTORY} (set PARITY_DIR)"
 FLOOR = 2e-5
 """Errors up to this are always accepted."""

@@ -225,6 +225,23 @@ def called_off(errors) -> tuple[FrankaHand, SlowGripper]:
     return hand, gripper
 
 
+def test_fingers_that_are_stuck_and_say_so_are_told_again_and_then_an_error():
+    """libfranka returns false for it and raises nothing: the loop would take the hand for open."""
+    for answers, opened in (([False, True], 2), ([False, False], 2), ([True], 1)):
+        told = iter(answers)
+        gripper = SimpleNamespace(width=0.04, open=lambda speed, told=told: next(told), stop=lambda: None)
+        hand = FrankaHand(gripper, (KeyError,), 20.0)
+        hand.set(False)
+        time.sleep(0.1)
+        if answers[-1]:
+            assert hand.width_m() == 0.04
+        else:
+            with pytest.raises(HandError, match="told to open, twice, the hand stands at 40 mm"):
+                hand.width_m()
+        hand.stop()
+        assert len(answers) - len(list(told)) == opened
+
+
 def test_a_stop_that_comes_late_does_not_meet_the_next_command():
     hand, gripper = called_off((RuntimeError,))
     time.sleep(0.03)

@@ -394,7 +394,7 @@ def test_limits_are_the_fr3_s_and_the_filter_keeps_them_before_the_arm_would(tmp
         robot.stop()
 
 
-@pytest.mark.flaky(reruns=2)  # a busy machine may take 5 of the 100 ms to hand the command over
+@pytest.mark.flaky(reruns=2, only_rerun=["in the time that it was given", "UDP receive: Timeout"])
 def test_an_arm_that_gets_no_further_command_brakes_by_itself(rig):
     config = config_for(HOST)  # other tests left the arm elsewhere: half a minute away at a start's pace
     quick = replace(config, franka=replace(config.franka, start_dynamics=0.3))
@@ -405,7 +405,8 @@ def test_an_arm_that_gets_no_further_command_brakes_by_itself(rig):
     robot.command(before + step, close=False)
     clock.sleep_until(clock.now() + 0.1)
     made = np.array(rig.channel.ask("state")["q_rad"]) - before
-    assert 0.5 * step[0] < made[0] < 1.1 * step[0]  # from rest; training's arm makes 0.92 of it
+    # From rest; training's arm makes 0.92 of it. A busy machine may take 5 of the 100 ms to hand it over.
+    assert 0.5 * step[0] < made[0] < 1.1 * step[0], f"made {made[0]} in the time that it was given"
     clock.sleep_until(clock.now() + 0.5)
     after = np.array(rig.channel.ask("state")["q_rad"])
     assert stands(rig, in_motion=True) and (after - before)[0] < 2.5 * step[0]

@@ -532,7 +532,7 @@ def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
     missed = sum(report["missed_deadlines"] for report in reports)
     assert "Success 100.0 % of 1" in said and f"Missed deadlines: {missed} in 10 steps." in said
     text = (judged.parent / "report.html").read_text()
-    assert text.count("data:image/png;base64,") == 2
+    assert text.count("data:image/webp;base64,") == 2
     for words in (f"{judged.name}: lifted and held", f"{other.name}: not judged", "width=device-width"):
         assert words in text
     assert find_recordings(judged.parent), "the page beside them does not disturb a fit"

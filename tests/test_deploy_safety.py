@@ -171,6 +171,29 @@ def test_no_action_leads_out_of_the_workspace():
     assert filter_.counts.by_cause["workspace"] > 0, "the walk never met a wall: the test says nothing"
 
 
+@pytest.mark.parametrize("arm", [False, True], ids=["grip", "arm"])
+def test_who_is_outside_of_one_wall_does_not_go_through_the_table_instead(arm):
+    """Pushed aside by a person, 8 cm beyond a wall and low: back and down at once is less far outside."""
+    free = {"acceleration_rad_s2": (1e6,) * 7}
+    if arm:
+        free |= {"workspace_lower_m": (0.15, -0.45, -0.3), "arm_upper_m": (0.95, 0.34, 1.3)}
+    else:
+        free |= {"workspace_upper_m": (0.8, 0.3, 0.8), "arm_lower_m": (-0.55, -0.8, -0.3)}
+    there = kinematics.grip_pose(HOME).copy()
+    there[:3, 3] = 0.45, 0.38, 0.03
+    q = reach(there, HOME, SafetyLimits(acceleration_rad_s2=(1e6,) * 7))
+    assert q is not None
+    filter_ = SafetyFilter(SafetyLimits(**free), 0.1)
+    causes: list[str] = []
+    for _ in range(20):
+        way = np.linalg.pinv(kinematics.grip_jacobian(q)) @ (0.0, -0.02, -0.01, 0.0, 0.0, 0.0)
+        q, _, why = filter_.target(q, action(*(way / 0.1)))
+        causes += why
+        lowest = (kinematics.part_centers(q)[:, 2] - kinematics.PART_RADII_M).min()
+        assert lowest >= -1e-6 if arm else kinematics.grip_position(q)[2] >= 0.012 - 2e-4
+    assert ("arm" if arm else "workspace") in causes
+
+
 def test_the_hand_s_side_stays_off_the_table_though_the_grip_point_may_go_there():
     low = HOME + np.array([0, 0.45, 0, 0, 0, 0.45, 0])
     limits = SafetyLimits(acceleration_rad_s2=(1e6,) * 7, workspace_lower_m=(0.15, -0.45, -0.3))

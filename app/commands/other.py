@@ -1,6 +1,7 @@
 """ddgrasp weights, objects, report."""
 
 import itertools
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -150,7 +151,7 @@ def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         shown.add_column(title, overflow="fold")
     for row in rows:
         shown.add_row(*row)
-    tables.console(width=140).print(shown)
+    tables.console(width=None if "COLUMNS" in os.environ else 140).print(shown)
 
 
 @dataclass(frozen=True)

@@ -92,8 +92,8 @@ class DeployConfig(Section, name="deploy"):
     """Largest change between two steps, relative to Franka's acceleration limit. Targets lead the arm, so
     they may change faster than the arm itself; from 2.8 on, a full reversal of any joint passes."""
     workspace_lower_m: _Corner = (0.15, -0.45, 0.012)
-    """Where the point between the finger pads may go, robot base frame; 12 mm = fingertips on the table,
-    those of an upright hand."""
+    """Where the point between the finger pads may go, robot base frame; at 12 mm an upright hand's
+    fingertips touch the table, the rig's; a Franka Hand's are 3 mm above it."""
     workspace_upper_m: _Corner = (0.80, 0.45, 0.80)
     """The box's other corner."""
     arm_lower_m: _Corner = (-0.55, -0.80, 0.0)

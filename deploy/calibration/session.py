@@ -34,7 +34,7 @@ HOPELESS = 4
 """So many pictures without a glimpse of the board end the run."""
 MOVED_RAD = 1e-3
 """An arm that moved by more while the picture was taken spoils the view."""
-MUCH_RMS_PX, MOST_RMS_PX = 1.0, 3.0
+MUCH_RMS_PX, MOST_RMS_PX = 1.0, 1.5
 """Reprojection error of a calibration that is warned of, and of one that is refused. Squares 3 % smaller than
 said give 2 px, and move the camera by 6 mm."""
 

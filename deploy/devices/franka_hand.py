@@ -113,14 +113,18 @@ class FrankaHand:
                 self._gripper.grasp(
                     0.0, contract.GRIPPER_SPEED_M_S, self._force_n, epsilon_outer=GRASP_ANY_WIDTH_M
                 )
-            else:
-                self._gripper.open(contract.GRIPPER_SPEED_M_S)
+            elif not (self._opened() or self._changed.is_set() or self._opened() or self._changed.is_set()):
+                raise RuntimeError(f"told to open, twice, the hand stands at {1e3 * self._width_m:.0f} mm")
         except self._errors:
             if not self._changed.is_set():  # not stopped by `set`: the gripper's own trouble
                 raise
         finally:
             with self._lock:
                 self._busy = False
+
+    def _opened(self) -> bool:
+        """Whether the gripper, told to open, says that it has: fingers that are stuck raise nothing."""
+        return self._gripper.open(contract.GRIPPER_SPEED_M_S) is not False
 
     def _await_abort(self) -> None:
         """A late `stop` must not meet the next command. Raises RuntimeError if it never ends."""
