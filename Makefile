@@ -30,7 +30,7 @@ $(STAMP): requirements.lock pyproject.toml $(OTHER)
 	@{ [ -z "$(OTHER)" ] && $(BIN)/python -c ''; } 2>/dev/null || { echo "$(PYTHON) -> $(VENV)"; $(PYTHON) -m venv --clear $(VENV); }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
-	-@$(BIN)/python -m pip --disable-pip-version-check check >/dev/null || echo "What was installed beside the lock no longer fits it: install your extras again ($(BIN)/python -m pip check)." >&2
+	@$(BIN)/python -m pip --disable-pip-version-check check >/dev/null || echo "What was installed beside the lock no longer fits it: install your extras again ($(BIN)/python -m pip check)." >&2
 	@touch $@
 
 .PHONY: other

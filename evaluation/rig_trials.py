@@ -179,7 +179,8 @@ def run(
         make = RecordedBench(make, out / EPISODES, about)
     asked = run_missing(config, policy, series.plan(), make, header, out, workers, progress, failures)
     as_begun, done = read_log(out / TRIALS_FILE)
-    before = [result for result in done if result not in asked]  # `report` counts them, too
+    numbers = {result.index for result in asked}
+    before = [result for result in done if result.index not in numbers]  # `report` counts them, too
     if before:
         progress.note(f"{len(before)} trials that {out} has besides are counted as well")
     table = tabulate([*asked, *before], trained_on(as_begun))

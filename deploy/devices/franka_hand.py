@@ -113,7 +113,7 @@ class FrankaHand:
                 self._gripper.grasp(
                     0.0, contract.GRIPPER_SPEED_M_S, self._force_n, epsilon_outer=GRASP_ANY_WIDTH_M
                 )
-            elif not (self._opened() or self._changed.is_set() or self._opened() or self._changed.is_set()):
+            elif not any(self._opened() or self._changed.is_set() for _ in range(2)):
                 raise RuntimeError(f"told to open, twice, the hand stands at {1e3 * self._width_m:.0f} mm")
         except self._errors:
             if not self._changed.is_set():  # not stopped by `set`: the gripper's own trouble
