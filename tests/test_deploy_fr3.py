@@ -414,6 +414,21 @@ def test_an_arm_that_gets_no_further_command_brakes_by_itself(rig):
     assert stands(rig)
 
 
+def test_a_hand_that_carries_what_the_arm_does_not_know_of_stays_where_it_stops(rig):
+    """Told of a kilogram that is not there it rose by 38 cm: the same as sinking, and no object to hold."""
+    config = config_for(HOST)
+    config = replace(config, franka=replace(config.franka, load_kg=1.0, start_dynamics=0.3))
+    robot, clock = connect(config, lambda question: None)
+    robot.start()
+    robot.command(robot.read_state().q_rad + np.array([0, 0, 0, -0.05, 0, 0, 0]), close=False)
+    clock.sleep_until(clock.now() + 0.1)
+    before_m = grip_position(np.array(rig.channel.ask("state")["q_rad"]))
+    robot.stop()
+    assert stands(rig)
+    after_m = grip_position(np.array(rig.channel.ask("state")["q_rad"]))
+    assert np.linalg.norm(after_m - before_m) < 0.02
+
+
 def test_start_asks_first_then_homes_and_moves_slowly_to_the_start_pose():
     away = HOME_RAD + np.array([0.03, 0, 0, 0, 0, 0, 0])
     with Fr3Rig("127.0.0.15", primitive("cube"), q_rad=away.tolist()) as rig:

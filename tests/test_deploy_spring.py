@@ -32,6 +32,7 @@ class Motion:
 FRANKY = SimpleNamespace(
     JointImpedanceTrackingMotion=Motion,
     JointImpedanceGains=lambda stiffness, damping: (stiffness, damping),
+    TorqueStopMotion=SimpleNamespace,
     JointReference=lambda q_rad, speed_rad_s: (q_rad, speed_rad_s),
     Exception=type("FrankyException", (Exception,), {}),
 )
@@ -42,6 +43,7 @@ class Arm:
 
     def __init__(self):
         self.touches, self.lost, self.moved = 0.0, threading.Event(), None
+        self.brakes = iter(())
 
     @property
     def state(self):
@@ -49,7 +51,8 @@ class Arm:
             raise RuntimeError("UDP receive: Timeout")
         force = self.touches * np.array([3.0, 0.0, 16.0, 0.0, 1.0, 0.0])
         return SimpleNamespace(
-            q=np.zeros(7), time=SimpleNamespace(to_sec=time.monotonic), O_F_ext_hat_K=force,
+            q=np.zeros(7), dq=np.full(7, next(self.brakes, 0.0)), O_F_ext_hat_K=force,
+            time=SimpleNamespace(to_sec=time.monotonic),
             joint_contact=np.zeros(7), cartesian_contact=(np.abs(force) > 15.0).astype(float),
             tau_ext_hat_filtered=np.array([0.0, -6.0, 0, 2.0, 0, 0, 0]) * self.touches,
         )  # fmt: skip
@@ -178,6 +181,17 @@ def test_it_stands_with_all_of_its_strength(spring, arm, stops):
     assert strength(arm.moved) == pytest.approx(SOFT)
     stops(spring)
     assert braked(arm.moved) and strength(arm.moved) == 1.0 and spring.felt()[0] == ""
+
+
+def test_it_lets_go_of_an_arm_that_stands_for_as_short_as_may_be(arm):
+    spring = FrankaSpring(FRANKY, arm, STIFFNESS)
+    motion = arm.moved
+    spring.follow(STEP)
+    arm.brakes = iter([0.5, -0.1] * 10)
+    spring.stop()
+    assert braked(motion) and next(arm.brakes, "stood") == "stood"
+    np.testing.assert_allclose(arm.moved.damping, DAMPING_S * STIFFNESS * WEIGHTS)
+    assert arm.moved.max_duration <= 0.2
 
 
 def test_the_watch_ends_with_the_connection(spring, arm):
