@@ -15,28 +15,38 @@ GRIP_D_M = 0.1034
 """From the hand's mounting face to the middle of the finger pads."""
 
 _PARTS = (
-    (3, (0.0, 0.0, 0.0), 0.07),
-    (4, (0.0, 0.0, -0.25), 0.052),
-    (4, (0.0, 0.03, -0.12), 0.052),
-    (4, (0.0, 0.06, -0.1), 0.045),
-    (4, (0.0, 0.02, 0.0), 0.045),
-    (5, (0.0, 0.0, -0.03), 0.047),
-    (5, (0.07, 0.0, 0.0), 0.047),
-    (6, (0.0, 0.0, FLANGE_D_M), 0.042),
+    (2, (0.0, 0.0, -0.085), 0.067),
+    (2, (0.081, 0.043, 0.0), 0.07),
+    (3, (0.0, 0.0, 0.043), 0.069),
+    (3, (-0.082, 0.084, 0.0), 0.067),
+    (4, (0.0, 0.0, -0.224), 0.066),
+    (4, (0.0, 0.045, -0.18), 0.05),
+    (4, (0.0, 0.044, 0.0), 0.056),
+    (4, (0.0, 0.079, 0.0), 0.058),
+    (5, (0.0, 0.0, 0.008), 0.054),
+    (5, (0.08, 0.039, 0.0), 0.051),
+    (5, (0.088, -0.022, 0.0), 0.054),
+    (6, (-0.004, -0.004, 0.075), 0.048),
+    (6, (0.042, 0.042, 0.083), 0.039),
+    (7, (0.0, 0.072, 0.0), 0.033),
+    (7, (0.0, -0.072, 0.0), 0.033),
     (7, (0.0, 0.0, 0.045), 0.033),
     (7, (0.0, 0.07, 0.045), 0.033),
     (7, (0.0, -0.07, 0.045), 0.033),
     (7, (0.0, 0.045, 0.1054), 0.008),
     (7, (0.0, -0.045, 0.1054), 0.008),
 )
-"""Spheres around what can hit a table or a wall: elbow, forearm, wrist, flange, hand, tips of open fingers.
-(joint counted from 0, point in its frame, radius; metres), 7 being the hand. Sizes: mjx_envs/scene.py. The
-tips' end 2 mm before the tips do, so that an upright hand may touch the table (2 degrees off upright too)."""
+"""Spheres around what can hit a table or a wall: upper arm, elbow, forearm, wrist, flange, hand, tips of open
+fingers. (joint counted from 0, point in its frame, radius; metres), 7 being the hand. Fitted to the FR3's
+meshes: up to 5 mm of those stand outside of them, they up to 3 cm outside of its links. The tips' end 2 mm
+before the tips do, so that an upright hand may touch the table (2 degrees off upright too)."""
+LINKS = slice(0, sum(i < 6 for i, *_ in _PARTS))
+"""Which of them are neither flange nor hand."""
 PART_RADII_M = np.array([radius for *_, radius in _PARTS])
 
 
-def part_centers(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "13 3"]:
-    """(13, 3) centres of the spheres of `PART_RADII_M` in the robot's base frame, metres."""
+def part_centers(q_rad: Float[np.ndarray, "7"]) -> Float64[np.ndarray, "20 3"]:
+    """(20, 3) centres of the spheres of `PART_RADII_M` in the robot's base frame, metres."""
     frames = _frames(q_rad)
     return np.array([frames[i][:3, :3] @ point + frames[i][:3, 3] for i, point, _ in _PARTS])
 

@@ -65,6 +65,36 @@ def test_spheres_reach_as_far_as_the_arm_s_own_geoms():
         lowest = (ends[..., 2] - model.geom_size[capsules, 0]).min()
         box = data.geom("hand_box")
         lowest = min(lowest, box.xpos[2] - np.abs(box.xmat.reshape(3, 3)[2]) @ model.geom("hand_box").size)
-        parts = kinematics.part_centers(q)[1:, 2] - kinematics.PART_RADII_M[1:]
+        parts = (kinematics.part_centers(q)[:, 2] - kinematics.PART_RADII_M)[4:]  # from the forearm on
         gaps.append(parts.min() - lowest)
     assert max(gaps) < 0.016, "something of the arm hangs lower than every sphere"
+
+
+def test_spheres_leave_out_at_most_half_a_centimetre_of_an_fr3():
+    """Of its meshes, in each direction in which a wall may stand, the fingers open."""
+    pytest.importorskip("franky_sim", reason="needs pip install -e '.[fr3]'")
+    from franky_sim.mujoco_simulator import MujocoSimulator
+
+    with MujocoSimulator() as sim:
+        sim.add_robot(initial_q=list(contract.HOME_RAD), initial_hand_width=0.08)
+        sim.start()
+        model, data = sim.model, sim.data
+        links = [f"robot0_fr3_link{i}" for i in range(3, 8)] + ["robot0_hand"]
+        links += ["robot0_left_finger", "robot0_right_finger"]
+        bodies = [model.body(name).id for name in links]
+        is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+        geoms = np.flatnonzero(is_mesh & np.isin(model.geom_bodyid, bodies))
+        for q_rad in np.random.default_rng(2).uniform(LOWER, UPPER, (50, 7)):
+            data.qpos[:7] = q_rad
+            mujoco.mj_kinematics(model, data)
+            places_m = np.concatenate([_corners_m(model, data, g) for g in geoms])
+            centers_m, radii_m = kinematics.part_centers(q_rad), kinematics.PART_RADII_M[:, None]
+            assert ((centers_m - radii_m).min(axis=0) - places_m.min(axis=0)).max() < 0.005
+            assert (places_m.max(axis=0) - (centers_m + radii_m).max(axis=0)).max() < 0.005
+
+
+def _corners_m(model, data, geom: int) -> np.ndarray:
+    mesh = model.geom_dataid[geom]
+    first = model.mesh_vertadr[mesh]
+    own_m = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+    return own_m @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]

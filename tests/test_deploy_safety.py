@@ -204,7 +204,9 @@ def test_the_hand_s_side_stays_off_the_table_though_the_grip_point_may_go_there(
         causes += why
         lowest = kinematics.part_centers(q)[:, 2] - kinematics.PART_RADII_M
         assert lowest.min() >= -1e-9
-    assert "arm" in causes and np.argmin(lowest) >= 7, "no part of the hand met the table: this says nothing"
+    assert "arm" in causes and np.argmin(lowest) >= kinematics.LINKS.stop, (
+        "no part of the hand met the table: this says nothing"
+    )
 
 
 @pytest.mark.parametrize("tilt_deg", [20.0, 30.0])

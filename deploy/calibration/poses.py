@@ -29,8 +29,6 @@ _TRIES = 15
 _ROUNDS = 4
 _VIEW_TRIES = 2000
 """Random views drawn for one with the whole pattern in the picture."""
-_LINKS = slice(0, 7)
-"""Those of the arm's spheres that the board could touch; hand and flange hold it."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,8 @@ def is_free(bench: Bench, q_rad: Float[np.ndarray, "7"]) -> bool:
     if (centers - radii < limits.arm_lower_m).any() or (centers + radii > limits.arm_upper_m).any():
         return False
     points = _sheet_m(bench.board, T_base_grip)
-    apart = np.linalg.norm(points[:, None] - centers[None, _LINKS], axis=-1) - radii[None, _LINKS, 0]
+    links = kinematics.LINKS  # what the board could touch; hand and flange hold it
+    apart = np.linalg.norm(points[:, None] - centers[None, links], axis=-1) - radii[None, links, 0]
     return bool(apart.min() > LINK_GAP_M)
 
 
