@@ -8,7 +8,7 @@ import copy
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-VERSION = 17
+VERSION = 18
 """Format of the fields this code writes. 1: flat sections ddg, student, deploy; without a number. 2: teachers
 that start from `init_from`, else from the guide after `clone_rounds` of cloning, else from nothing. 3: the
 generator knows no window. 4: a student's closing is not latched. 5: training knows no noise at
@@ -17,7 +17,7 @@ generator does not know where in the picture it is. 9: the policy alone acts in 
 comes down at any speed; what was made then comes down slowly too, since no run has an arm. 11: a Franka
 gives way to nothing before it stops itself; the same. 12: formulas have one strength. 13: what comes behind
 a teacher's time limit counts. 14: a window is a Gaussian. 15: the rig has one table.
-16: no ellipses are dropped."""
+16: no ellipses are dropped. 17: formulas move nothing along normals."""
 
 VERSION_FIELD = "manifest_version"
 
@@ -126,6 +126,7 @@ _ADDED_AFTER: dict[int, dict[str, Any]] = {
     14: {"ddg.graft.window_shape": "gaussian"},
     15: {"record.other_tables": False},
     16: {"student.ellipse_dropout": 0.0, "student.ellipse_half_axis_px": 25.0},
+    17: {"student.dextrah_normal_m": 0.0},
 }
 """Version -> the fields that it lacked and the next one has, with what it did (10, 11: what is done now)."""
 

@@ -244,7 +244,8 @@ def _named_source(config: Config, ddg: Path) -> DepthSource:
         return MonocularSource(MonocularDepth(config.ddg))
     if name == "rig":
         return RigSource(config)
-    formulas = DextrahConfig().scaled(config.student.dextrah_scale)
+    student = config.student
+    formulas = DextrahConfig(normal_m=student.dextrah_normal_m).scaled(student.dextrah_scale)
     sensor = SensorConfig(name=name, stereo=config.record.stereo, dextrah=formulas)
     return SenseSource(make_sensor(sensor, config.world.profile), key, name in BY_COLOUR)
 

@@ -237,6 +237,27 @@ def test_without_noise_the_procedural_models_change_nothing():
     )
 
 
+@pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 60.0])
+def test_noise_along_normals_is_less_deep_on_what_is_tilted(tilt_deg):
+    quiet = DextrahConfig(shift_px=0, disparity_px=0, dropout=0.0, random_value=0.0, stick=0.0, normal_m=0.01)
+    across = (np.arange(SIZE[1]) - PROFILE.cx_px) / PROFILE.fx_px
+    slope = np.tan(np.radians(tilt_deg))
+    clean = np.broadcast_to(1.0 / (1.0 - slope * across), SIZE).astype(np.float32)  # z = 1 + slope x
+    near = (slice(40, 80), slice(int(PROFILE.cx_px) - 20, int(PROFILE.cx_px) + 20))
+    off = (np.asarray(procedural.dextrah(quiet, PROFILE)(jax.random.key(0), clean, None)) - clean)[near]
+    assert off.std() == pytest.approx(0.01 * np.cos(np.radians(tilt_deg)), rel=0.06)
+    assert abs(np.corrcoef(off[:, 1:].ravel(), off[:, :-1].ravel())[0, 1]) < 0.1
+
+
+def test_noise_along_normals_leaves_holes_and_what_is_beside_them():
+    clean = np.full(SIZE, 0.7, np.float32)
+    clean[20, 30] = 0.0
+    noise = np.full(SIZE, 0.01, np.float32)
+    moved = np.asarray(procedural.along_normals(clean, noise, PROFILE))
+    assert moved[20, 30] == 0.0 and moved[20, 29] == moved[19, 30] == np.float32(0.7)
+    assert np.isclose(moved, 0.71).sum() == (SIZE[0] - 1) * (SIZE[1] - 1) - 3
+
+
 def test_dextrah_frays_edges_by_its_shift_and_mixes_no_depths():
     off = DextrahConfig(shift_px=1.5, disparity_px=0, dropout=0.0, random_value=0.0, stick=0.0)
     clean = np.full(SIZE, 1.2, np.float32)

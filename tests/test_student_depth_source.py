@@ -201,6 +201,8 @@ def test_a_student_s_formulas_take_its_scale(demos):
     once = with_source("dextrah")
     twice = replace(once, student=replace(once.student, dextrah_scale=2.0))
     assert deviation(twice) == pytest.approx(2 * deviation(once), rel=0.2)
+    normal = replace(once, student=replace(once.student, dextrah_normal_m=0.01))
+    assert deviation(normal) ** 2 - deviation(once) ** 2 > 5.0**2  # 10 mm times the table's share
 
 
 def with_ellipses(settings: Config, number: float = 4.0) -> Config:

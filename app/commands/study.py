@@ -34,8 +34,8 @@ class StudyTable2(FromPreset):
     rows: tuple[str, ...] | None = None
     """Rows by name instead of the whole tables of --table, made in the order in which they are given: sim_gt,
     rand_noise, inpaint, monocular, ddg_no_graft, ddg, upper_bound, sim_gt_ripple, rand_noise_ripple,
-    ddg_ripple, sim_gt_filled, rand_noise_filled, ddg_filled, rand_noise_double, sim_gt_ellipses,
-    rand_noise_ellipses, ddg_ellipses, sim_gt_ripple_filled, sim_gt_ellipses_filled,
+    ddg_ripple, sim_gt_filled, rand_noise_filled, ddg_filled, rand_noise_double, rand_noise_normal,
+    sim_gt_ellipses, rand_noise_ellipses, ddg_ellipses, sim_gt_ripple_filled, sim_gt_ellipses_filled,
     rand_noise_ellipses_filled, paper_ddg_no_graft, paper_ddg."""
     table: tuple[str, ...] = ("main",)
     """main (hand-made noise off), ripple (off and on), filled (holes as recorded and filled by the student;

@@ -100,7 +100,7 @@ class StereoConfig(Section, name="record.stereo"):
 @dataclass(frozen=True)
 class DextrahConfig(Section, name="sensor.dextrah"):
     """Depth noise with the numbers that DextrAH-G trains with, there in pixels of 160 x 120 pictures, here in
-    those of whatever picture is given."""
+    those of whatever picture is given; what else differs from its published code: docs/sensors.md."""
 
     shift_px: Annotated[float, Range(0, 100)] = 0.5
     """Standard deviation of the field by which pixels look up their depth beside themselves (sigma_s)."""
@@ -108,6 +108,9 @@ class DextrahConfig(Section, name="sensor.dextrah"):
     """Standard deviation of disparity noise (sigma_d, a sixth of a step of 1/8 px)."""
     correlation_px: Annotated[float, Range(0, 1000, above=True)] = 2.0
     """Distance over which both fields vary."""
+    normal_m: Annotated[float, Range(0, 1)] = 0.0
+    """Standard deviation by which every pixel by itself is moved along its surface's normal; 0.01 in
+    DextrAH-G's published code (sigma_theta)."""
     dropout: Share = 0.0125 / 4
     """Probability that a pixel becomes invalid."""
     random_value: Share = 0.0125 / 4

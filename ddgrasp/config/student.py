@@ -260,6 +260,9 @@ class StudentConfig(Section, name="student"):
     dextrah_scale: Annotated[float, Range(0.125, 8)] = 1.0
     """Size of the formulas' pixel in training, in pixels of the picture, where depth_source is dextrah: their
     numbers are of pictures 160 wide; 2 makes one of 320 as noisy as those, 1 half as noisy in depth."""
+    dextrah_normal_m: Annotated[float, Range(0, 1)] = 0.0
+    """Standard deviation by which the formulas move each pixel along its surface's normal, where depth_source
+    is dextrah; DextrAH-G's published code has 0.01."""
     ellipse_dropout: Annotated[float, Range(0, 100)] = 0.0
     """Elliptic holes in training depth besides what depth_source gives it: how many are expected in a
     picture, drawn anew in every frame; their half axes are an eighth of ellipse_half_axis_px to all of it.

@@ -46,6 +46,8 @@ class Row:
     """Whether its student fills holes by itself (`student.picture.fill_holes`), in training as on the rig."""
     dextrah_scale: float = 1.0
     """Size of the formulas' pixel (`student.dextrah_scale`)."""
+    dextrah_normal_m: float = 0.0
+    """How far the formulas move pixels along normals (`student.dextrah_normal_m`)."""
     ellipses: bool = False
     """Whether training depth has holes cut by hand (`student.ellipse_dropout`): `ELLIPSES` in a picture,
     whatever number the configuration has, of its sizes; other rows have none."""
@@ -59,6 +61,7 @@ class Row:
             "ripple" * self.ripple,
             "filled" * self.filled,
             f"x{self.dextrah_scale:g}" * (self.dextrah_scale != 1),
+            "normal" * (self.dextrah_normal_m != 0),
             "ellipses" * self.ellipses,
         )
         return "_".join(part for part in parts if part)
@@ -89,6 +92,7 @@ ROWS: dict[str, Row] = {
     "rand_noise_filled": Row("Rand Noise, holes filled", "dextrah", filled=True),
     "ddg_filled": Row("DDG, holes filled", "learned", filled=True),
     "rand_noise_double": Row("Rand Noise, twice as strong", "dextrah", dextrah_scale=2.0),
+    "rand_noise_normal": Row("Rand Noise, along normals as well", "dextrah", dextrah_normal_m=0.01),
     "sim_gt_ellipses": Row("Sim GT, holes cut by hand", "ideal", ellipses=True),
     "rand_noise_ellipses": Row("Rand Noise, holes cut by hand", "dextrah", ellipses=True),
     "ddg_ellipses": Row("DDG, holes cut by hand", "learned", ellipses=True),
@@ -131,9 +135,9 @@ TABLES: dict[str, Table] = {
         ),
     ),
     "formulas": Table(
-        "Formulas in pixels of the picture, and of one half as wide",
+        "Formulas in pixels of the picture, of one half as wide, and along normals as well",
         "ddg",
-        ("rand_noise", "rand_noise_double", "ddg"),
+        ("rand_noise", "rand_noise_double", "rand_noise_normal", "ddg"),
     ),
     "ellipses": Table(
         "Holes cut by hand, off and on",
@@ -216,6 +220,7 @@ def row_config(shared: Config, row: Row, paper_from: str = "") -> Config:
         shared.student,
         depth_source=row.source,
         dextrah_scale=row.dextrah_scale,
+        dextrah_normal_m=row.dextrah_normal_m,
         ellipse_dropout=ELLIPSES if row.ellipses else 0.0,
         training=training,
         picture=picture,

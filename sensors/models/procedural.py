@@ -2,7 +2,7 @@
 
 `dextrah`: the model that DextrAH-G trains with (Lum et al. 2024, "DextrAH-G: Pixels-to-Action Dexterous
 Arm-Hand Grasping with Geometric Fabrics"; strengths from its published code): correlated noise in disparity,
-pixel dropout, random values, sticks.
+noise along normals where asked for, pixel dropout, random values, sticks.
 `kinect`: the model of Handa et al. 2014 ("A benchmark for RGB-D visual odometry, 3D reconstruction and SLAM",
 after Barron and Malik 2013) with the axial noise that Khoshelham and Elberink 2012 measured.
 `ellipse_dropout`: elliptic holes anywhere, alone (random erasing, Zhong et al. 2020, by ellipses).
@@ -26,14 +26,15 @@ MOST_SHAPES = 4.0
 """Room for this many deviations more sticks or ellipses than are expected in a picture."""
 SHORTEST_HALF_AXIS = 1 / 8
 """An ellipse's shortest possible half axis, in parts of the longest."""
-_DROPOUT_STREAM = 6
-"""Keeps ellipses apart from DextrAH-G's noise of the same key, which is split into 0 to 5."""
+_DROPOUT_STREAM, _NORMAL_STREAM = 6, 7
+"""Keep ellipses and noise along normals apart from DextrAH-G's other noise of the same key, which is split
+into 0 to 5."""
 
 
 def dextrah(config: DextrahConfig, profile: CameraProfile) -> Sense:
     """DextrAH-G's depth noise. `profile` gives focal length times baseline; strengths in pixels are of the
     picture that is given, whatever its size: in one twice as wide they are half as much depth."""
-    return batched(partial(_dextrah_frame, config, profile.fx_px * profile.baseline_m))
+    return batched(partial(_dextrah_frame, config, profile))
 
 
 def kinect(config: KinectConfig, profile: CameraProfile) -> Sense:
@@ -52,13 +53,16 @@ def ellipse_dropout(expected: float, half_axis_px: float) -> Sense:
 
 
 def _dextrah_frame(
-    config: DextrahConfig, fb_px_m: float, key: Array, depth_m: Array, rgb: Array | None
+    config: DextrahConfig, profile: CameraProfile, key: Array, depth_m: Array, rgb: Array | None
 ) -> Array:
     shift_key, noise_key, replace_key, value_key, drop_key, stick_key = jax.random.split(key, 6)
     shape = (depth_m.shape[0], depth_m.shape[1])
     shift = config.shift_px * smooth_field(shift_key, (2, *shape), config.correlation_px)
     noise = config.disparity_px * smooth_field(noise_key, shape, config.correlation_px)
-    noisy = add_disparity(shifted(depth_m, shift), noise, fb_px_m)
+    noisy = add_disparity(shifted(depth_m, shift), noise, profile.fx_px * profile.baseline_m)
+    if config.normal_m:
+        normal_key = jax.random.fold_in(key, _NORMAL_STREAM)
+        noisy = along_normals(noisy, config.normal_m * jax.random.normal(normal_key, shape), profile)
     near, far = config.random_near_m, config.random_far_m
     values = jax.random.uniform(value_key, shape, minval=near, maxval=far)
     noisy = jnp.where(jax.random.bernoulli(replace_key, float(config.random_value), shape), values, noisy)
@@ -99,6 +103,25 @@ def add_disparity(
     """z' = f B / (f B / z + noise); 0 stays 0."""
     disparity = fb_px_m / jnp.maximum(depth_m, NEAREST_M) + noise_px
     return jnp.where(depth_m > 0, fb_px_m / jnp.clip(disparity, 1e-3, fb_px_m / NEAREST_M), 0.0)
+
+
+def along_normals(
+    depth_m: Float[Array, "H W"], noise_m: Float[Array, "H W"], profile: CameraProfile
+) -> Float[Array, "H W"]:
+    """z'(v, u) = z + noise n_z: each pixel's point moved along the normal that it and its neighbours to the
+    right and below have (DextrAH-G's published code). (H, W) each; holes and what is beside one stay.
+    """
+    height, width = depth_m.shape
+    u = (jnp.arange(width)[None, :] - profile.cx_px) / profile.fx_px
+    v = (jnp.arange(height)[:, None] - profile.cy_px) / profile.fy_px
+    point = depth_m[..., None] * jnp.stack(jnp.broadcast_arrays(u, v, 1.0), axis=-1)
+    right, below = (jnp.roll(point, -1, axis) - point for axis in (1, 0))
+    normal = jnp.cross(right, below)
+    share = normal[..., 2] / jnp.maximum(jnp.linalg.norm(normal, axis=-1), 1e-12)
+    there = (depth_m > 0) & (jnp.roll(depth_m, -1, 1) > 0) & (jnp.roll(depth_m, -1, 0) > 0)
+    inside = (jnp.arange(height)[:, None] < height - 1) & (jnp.arange(width)[None, :] < width - 1)
+    moved = jnp.maximum(depth_m + noise_m * share, NEAREST_M)
+    return jnp.where(there & inside, moved, depth_m)
 
 
 def shifted(depth_m: Float[Array, "H W"], shift_px: Float[Array, "2 H W"]) -> Float[Array, "H W"]:
