@@ -253,7 +253,7 @@ def test_noise_along_normals_leaves_holes_and_what_is_beside_them():
     clean = np.full(SIZE, 0.7, np.float32)
     clean[20, 30] = 0.0
     noise = np.full(SIZE, 0.01, np.float32)
-    moved = np.asarray(procedural.along_normals(clean, noise, PROFILE))
+    moved = np.asarray(procedural.along_normals(jnp.asarray(clean), jnp.asarray(noise), PROFILE))
     assert moved[20, 30] == 0.0 and moved[20, 29] == moved[19, 30] == np.float32(0.7)
     assert np.isclose(moved, 0.71).sum() == (SIZE[0] - 1) * (SIZE[1] - 1) - 3
 
