@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 def graft(
     d_sim_m: Float[ArrayLike, "*x"], d_pred_m: Float[ArrayLike, "*x"], mask: Bool[ArrayLike, "*x"]
 ) -> Float[Array, "*x"]:
-    """d_final = d_sim (1 - M) + d_pred M (paper eq. 5), by selection: M = 0 pixels keep d_sim's bits.
+    """d_final = d_sim (1 - M) + d_pred M (paper eq. 9), by selection: M = 0 pixels keep d_sim's bits.
 
     Metres, 0 = hole; mask M: ddg_jax/representation.py says what an artefact is.
     """

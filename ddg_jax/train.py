@@ -2,7 +2,7 @@
 
 What the network's first channel is depends on `ddg.training.hole_loss`:
 
-squared, the paper's equation 4: the clean value, trained by its squared error like every other channel.
+squared, the paper's equation 8: the clean value, trained by its squared error like every other channel.
 
 cross_entropy, for representation deviation, whose first channel is -1 (hole) or +1 (valid): log odds. A
 pixel's own noisy value says something exact about them (`valid_log_odds`), so the network need not carry
@@ -160,7 +160,7 @@ def noise_loss(
     step: Int[AnyArray, " B"],
     eps: Float[AnyArray, "B H W C"],
 ) -> Float[Array, ""]:
-    """mean w_k |eps - eps_theta(d_k (+) c, k)|^2 (paper eq. 4; w_k: `loss_weight`). x_0, eps (B, H, W, C);
+    """mean w_k |eps - eps_theta(d_k (+) c, k)|^2 (paper eq. 8; w_k: `loss_weight`). x_0, eps (B, H, W, C);
     c (B, H, W); step (B,) int.
 
     |eps - eps_theta|^2 is SNR times the squared error in x_0. With `hole_loss` cross_entropy twice the

@@ -249,13 +249,18 @@ camera: 640 x 360, half of its 1280 x 720 per side, in which the crop window of 
     resamples nothing.
 hand: a Franka Hand, where the paper's arm has a UMI gripper; the teacher sees the grasp as a pose
     (7 numbers), where the paper lists a position (3).
-demos: of a teacher that is perturbed in a sixth of the steps (--demos.noise-share 0 for none).
+demos: of a teacher that is perturbed in a sixth of the steps (--demos.noise-share 0 for none), without colour
+    (--demos.rgb); 8 of 80 recordings are held out from the generator's fit (--ddg.training.holdout-fraction).
 generator: at 320 x 180 (the paper does not say), drawing holes and deviations from the surface instead of
     depth itself (the paper's: --ddg.depth.representation depth --ddg.graft.noise-threshold -0.2
     --ddg.training.loss-weight uniform; docs/generator.md compares them).
 prior: inverse depth, holes filled, where the paper has Video Depth Anything: its weights are not part of this
-    repository (--ddg.prior.source video_depth_anything, once they are converted).
-sampler: DDIM with 10 evaluations, where the paper goes through all K steps: 100 times the time.
+    repository (--ddg.prior.source video_depth_anything, once they are converted). It is disturbed, in
+    training and in sampling, where the paper's is fixed (--ddg.prior.noise 0 --ddg.prior.jitter 0
+    --ddg.prior.blur-px 0 --ddg.prior.decoy-holes 0).
+sampler: DDIM with 10 evaluations, where the paper goes through all K steps: 100 times the time. Frames of
+    an episode share part of their noise (--ddg.sampling.frame-correlation 0
+    --ddg.sampling.deviation-correlation 0: none).
 bumps: deviations are counted from planes, and the network knows where in the picture it is: what a student's
     success was chosen by (docs/table2.md); the paper says nothing of either.
 encoder: ResNet-18 from random numbers, where the paper's starts from ImageNet's weights, for the same reason
@@ -265,9 +270,11 @@ student: sees relief over the table instead of depth, its holes filled from arou
     privileged losses, pose rounds and DAgger, which the paper has not: perception to 5 mm is what decides
     whether it grasps (docs/student_log.md). Besides the generator's noise it trains with ripple made by hand
     and a fifth of clean samples (--student.training.disparity-noise-px 0 --student.training.clean-share 0),
-    gives two actions at a time, whose diffusion starts from zeros (--deploy.noise normal: from noise), sees
-    how the hand's width changes, has a closing that lasts (--student.head.closing-steps 0), and its loop has
-    the rules of deploy.retry.
+    gives two actions at a time, whose diffusion starts from zeros (--deploy.noise normal: from noise), and
+    sees how the hand's width changes. Of a demo it sees 20 steps after the grasp, held ones less often
+    (--student.training.held-weight 1 --student.training.demo-held-steps 10000). Its head is trained on by
+    itself, on perceived and on noisy true poses (--student.head.train-steps), has a closing that lasts
+    (--student.head.closing-steps 0), and its loop has the rules of deploy.retry.
 crops: shifted by up to 12 pixels around the window's place, since the camera's place is known here.
 teacher: networks, number of environments and steps are not in the paper; ours for its 95 %. A fifth of the
     episodes begin with the object in the hand and half of the others above it, and the reward is ours; the

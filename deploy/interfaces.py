@@ -21,11 +21,13 @@ class Frame:
     """One raw depth picture as the camera gave it."""
 
     depth: Depth
-    """(H, W) planar depth: uint16 millimetres or float32 metres; 0 = invalid."""
+    """(H, W) planar depth: uint16 millimetres, or float32 metres for a policy that takes those; 0 = invalid.
+    Size, focal length and principal point are those of the policy's profile: `ddgrasp.depth.at_profile`
+    brings a camera's own there."""
     timestamp_s: float
     """When it was exposed, on the loop's clock."""
     rgb: UInt8[np.ndarray, "h w 3"] | None = None
-    """Colour of the same moment, where the camera gives it anyway."""
+    """Colour of the same moment, where the camera gives it anyway; without it no frame is recorded."""
 
 
 @dataclass(frozen=True)

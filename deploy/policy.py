@@ -58,7 +58,7 @@ class OnnxPolicy:
                 file's own.
 
         Raises:
-            UserError: no such file, a folder, not ONNX, not ours, or of another contract.
+            UserError: no such file, a folder, not ONNX, not ours, of another contract, or it does not run.
         """
         if noise not in START_NOISES:
             raise UserError(f"noise is {noise!r}; expected one of {', '.join(START_NOISES)}.")
@@ -79,7 +79,16 @@ class OnnxPolicy:
         self._noise_kind = noise
         self.watch: Callable[[Depth, np.ndarray], None] | None = None
         """Is told the frames (3, H, W) and the state (9,) that the network gets in every call of `act`."""
+        self._try(seed)
+
+    def _try(self, seed: int) -> None:
+        """`reset`, after a run on blank frames: names and shapes may fit, and a type or a batch may not."""
         self.reset(seed)
+        try:
+            self.warm_up()
+        except Exception as error:  # onnxruntime raises classes of its own, without a common base
+            reason = str(error).splitlines()[0]
+            raise UserError(f"{self.path}: it does not run ({reason}); {_remedy(self.path)}.") from error
 
     def reset(self, seed: int) -> None:
         """Start of an episode: forget all frames, draw noise from `seed`."""

@@ -34,6 +34,8 @@ ENDED = {True: "lifted and held", False: "failed", None: "not judged"}
 """How a deployment ended, in words, by its success."""
 FILM_COLUMNS = 12
 """Most pictures of the film strip: what comes later is thinned out evenly."""
+FITTED = "brought to the policy's picture"
+"""What a recording says of a camera whose own picture is another."""
 _Frame = tuple[UInt8[np.ndarray, "h w 3"], UInt16[np.ndarray, "H W"]]
 _GAP_S = 1.5 * contract.CONTROL_DT_S
 """Two frames further apart do not follow each other: the camera had none, or a step came late."""
@@ -43,20 +45,28 @@ class DeploymentRecord:
     """Collects what the loop did; the disk is a thread's, so that a step does not wait for it."""
 
     def __init__(
-        self, camera: Camera | Filmed, profile: contract.CameraProfile, sensor: str, film_every: int
+        self,
+        camera: Camera | Filmed,
+        profile: contract.CameraProfile,
+        sensor: str,
+        film_every: int,
+        is_profile_s: bool = True,
     ):
-        """`profile` is the policy's picture; `film_every` as in `DeployConfig`."""
+        """`profile` is the policy's picture, `film_every` as in `DeployConfig`; `is_profile_s`: whether the
+        camera is a simulated one of that profile, and has its baseline."""
         self._camera, self._picture_every, self._film_every = camera, film_every, film_every
         self._meta: dict[str, Any] = {
-            "sensor": sensor, "fx_px": profile.fx_px, "baseline_m": profile.baseline_m,
+            "sensor": sensor, "fx_px": profile.fx_px,
             "color_aligned_to_depth": isinstance(camera, Filmed),  # a camera's own is of another lens
         }  # fmt: skip
+        if is_profile_s:
+            self._meta["baseline_m"] = profile.baseline_m
         self._newest_s, self._kept_s = -math.inf, math.inf
         self._rows: list[dict[str, Any]] = []
         self._queue: queue.Queue[tuple[dict[str, Any], _Frame | None] | None] = queue.Queue()
         self._film: list[tuple[int, UInt8[np.ndarray, "h w 3"], np.ndarray]] = []
         self._queued = self._written = 0
-        self._trouble = ""
+        self._trouble = self._without = ""
 
     @contextmanager
     def into(self, folder: Path) -> Iterator[None]:
@@ -105,7 +115,7 @@ class DeploymentRecord:
             apart = self._picture_every if rgb is None else 1
             self._meta |= {"hz": contract.CONTROL_HZ / apart, "consecutive_frames": apart == 1}
             if isinstance(self._camera, Device) and (name := self._camera.device_name()):
-                self._meta["sensor"] = f"{name}, brought to the policy's picture"
+                self._meta["sensor"] = f"{name}, {FITTED}"
                 self._meta.pop("baseline_m", None)  # known by the name
             if isinstance(self._camera, Replayed):
                 told = self._meta | self._camera.recorded_as()
@@ -115,7 +125,9 @@ class DeploymentRecord:
         self._newest_s = step.frame.timestamp_s
         if rgb is None and step.index % self._picture_every == 0 and isinstance(self._camera, Filmed):
             rgb = self._camera.picture()
-        if rgb is None:
+        if rgb is None or (rgb.dtype, rgb.shape[2:]) != (np.uint8, (3,)):
+            wrong = "no colour" if rgb is None else f"colour of type {rgb.dtype} and shape {rgb.shape}"
+            self._without = self._without or wrong
             return None
         depth = step.frame.depth
         depth_mm = depth.copy() if depth.dtype == np.uint16 else to_millimetres(depth)
@@ -125,6 +137,13 @@ class DeploymentRecord:
             self._meta["repeated_frames"] = self._meta.get("repeated_frames", 0) + 1
         self._kept_s = step.frame.timestamp_s
         return rgb.copy(), depth_mm
+
+    @property
+    def lost(self) -> str:
+        """Why frames are missing of what `finish` left, empty if none is."""
+        if self._trouble or self._written or not self._without:
+            return self._trouble
+        return f"the camera gives {self._without}; a recording's is (h, w, 3) uint8"
 
     def finish(
         self, folder: Path, report: Mapping[str, Any], success: bool | None, about: Mapping[str, Any]
@@ -136,8 +155,8 @@ class DeploymentRecord:
                 row.pop("frame", None)
         atomic_write_text(folder / STEPS_FILE, "".join(map(_line, self._rows)))
         values = {**about, "success": success, "frames": self._written, **report}
-        if self._trouble:
-            values["frames_lost"] = self._trouble
+        if self.lost:
+            values["frames_lost"] = self.lost
         atomic_write_text(folder / REPORT_FILE, json.dumps(to_json(values), indent=1) + "\n")
         if self._film:
             steps, rgb, depth_mm = zip(*self._film, strict=True)

@@ -28,7 +28,7 @@ from deploy.interrupts import note, terminable, unbroken
 from deploy.loop import ControlLoop
 from deploy.loop_report import LoopReport
 from deploy.policy import OnnxPolicy
-from deploy.record import ENDED, REPORT_FILE, DeploymentRecord, verdict
+from deploy.record import ENDED, FITTED, REPORT_FILE, DeploymentRecord, verdict
 from deploy.setup import check_start, loop_settings, safety_filter, space_notice, speed_notice
 
 _LONGEST_S = 1e9
@@ -66,11 +66,11 @@ def _run(
         raise UserError(
             f"robot {options.robot!r} asks before it moves, and nobody can be asked here: give --yes."
         )
-    place = standing(config, options)
+    place = standing(config, options, policy.info.camera)
     if place.line:
         say(place.line)
     clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
-    confirm = _agreed if options.yes else ask_person
+    confirm = _unmoved if options.dry_run else _agreed if options.yes else ask_person
     robot, camera = make_devices(Setup(config, options, policy.info, clock, confirm, say))
     keep_time_of(robot, clock, options)
     safety = safety_filter(config.deploy, policy.info, options.robot)
@@ -85,7 +85,9 @@ def _run(
     steps = round(options.seconds * policy.info.control_hz) if math.isfinite(options.seconds) else None
     folder = _new_folder(options.out)
     seen_by = _camera_name(config, options)
-    kept = DeploymentRecord(camera, policy.info.profile, f"{seen_by}, D455 profile", config.deploy.film_every)
+    simulated = options.camera in ("stereo", *RIG_CAMERAS)
+    sensor = f"{seen_by}, {'D455 profile' if simulated else FITTED}"
+    kept = DeploymentRecord(camera, policy.info.profile, sensor, config.deploy.film_every, simulated)
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": seen_by}
     about["policy_sha256"] = hashlib.sha256(policy_path.read_bytes()).hexdigest()
     name = options.object_name or (config.world.objects[0] if options.camera == "stereo" else "")
@@ -119,6 +121,8 @@ def _run(
             say(f"verdict: {ENDED[success]}")
         kept.finish(folder, report.as_dict(), success, about | _object(camera, name))
     say(f"report: {folder / REPORT_FILE}")
+    if kept.lost:
+        say(f"frames are missing: {kept.lost}")
     if isinstance(driven, DryRun):
         path = folder / "dry-run.png"
         atomic_write_bytes(path, dry_run.draw(driven.sent, safety.limits, 1.0 / policy.info.control_hz))
@@ -190,6 +194,11 @@ def _typed(question: str) -> str:
 
 def _agreed(question: str) -> None:
     """`--yes`."""
+
+
+def _unmoved(question: str) -> None:
+    """A dry run's answer to a driver that would move by itself. Raises UserError."""
+    raise UserError("a dry run moves nothing, and this robot's driver would: see its make.")
 
 
 def for_devices(config: Config, options: SessionOptions) -> Config:

@@ -51,13 +51,21 @@ class Buffers(NamedTuple):
     """(H, W, 3) float32 outward unit normal in the world frame, zero where nothing is hit."""
 
 
+_VERTICAL = 1e-9
+"""Sine of the angle to the vertical below which a view has no level axis of its own."""
+
+
 def look_at(position_m: Point, target_m: Point) -> Float64[np.ndarray, "4 4"]:
-    """(4, 4) T_world_cam of a camera at `position_m` that faces `target_m`, image x axis level."""
+    """(4, 4) T_world_cam of a camera at `position_m` that faces `target_m`, image x axis level.
+
+    Straight up or down it points to -y, as that of a camera would that faces along x and is tilted so far.
+    """
     position = np.asarray(position_m, float)
     forward = np.asarray(target_m, float) - position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
+    level = np.linalg.norm(right)
+    right = right / level if level > _VERTICAL else np.array([0.0, -1.0, 0.0])
     down = np.cross(forward, right)
     T_world_cam = np.eye(4)
     T_world_cam[:3, :3] = np.stack([right, down, forward], axis=1)

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.errors import UserError
 
@@ -211,7 +212,18 @@ class ObjectSpec:
     """Where size, mass and friction come from."""
 
     def __post_init__(self):
-        """UserError for a symmetry that a parallel hand does not have, or a part beyond what collides."""
+        """UserError for what cannot lie there or be grasped: without a part that collides, mass or friction,
+        wider than the hand opens, of a symmetry that a parallel hand has not, or too long to collide."""
+        if self.box is None and not self.capsules:
+            raise UserError(f"{self.name}: nothing of it collides: give it a box or capsules.")
+        for what, value in (("mass_kg", self.mass_kg), ("friction", self.friction)):
+            if not value > 0.0:
+                raise UserError(f"{self.name}: {what} is {value:g}; expected more than 0.")
+        if (wide_m := 2.0 * self.half_width_m()) > contract.GRIPPER_MAX_WIDTH_M:
+            raise UserError(
+                f"{self.name}: {wide_m:.3g} m wide where the fingers close; a hand opens by "
+                f"{contract.GRIPPER_MAX_WIDTH_M:g} m."
+            )
         check_symmetry(self.name, self.grasp_symmetry)
         if self.other_pose is not None:
             check_symmetry(self.name, self.other_pose.grasp_symmetry)

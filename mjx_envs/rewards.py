@@ -116,7 +116,7 @@ def succeeds(weights: RewardConfig, held: Bool[Array, ""], grasped: Bool[Array, 
 
 
 def terms(weights: RewardConfig, t: Transition) -> dict[str, Float[Array, ""]]:
-    """Weighted reward terms, by name; their sum is the reward (paper Eq. 2)."""
+    """Weighted reward terms, by name; their sum is the reward (paper eq. 2)."""
     grasped, lifted = t.grasped.astype(jnp.float32), t.lifted.astype(jnp.float32)
     approaching = 1 - grasped if weights.grasp_switch == "touch" else 1.0
     count = jnp.minimum(t.bonus_count, weights.bonus_max_count)

@@ -95,7 +95,7 @@ class GeneratorSource:
     generator: Generator
     key: Key[jax.Array, ""]
     grafting: bool = True
-    """Off: the generator's own map, as in the paper's ablation (IV-C)."""
+    """Off: the generator's own map, as in the paper's ablation (IV-D)."""
     needs_views: bool = False
 
     @property

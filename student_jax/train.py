@@ -113,7 +113,7 @@ def diffusion_loss(
     action: Float[Array, "B chunk 8"],
     key: Key[Array, ""],
 ) -> Float[Array, ""]:
-    """mean |eps - eps_theta(a_k, k, s)|^2 (paper Eq. 6) over `noise_draws` noises for each sample."""
+    """mean |eps - eps_theta(a_k, k, s)|^2 (paper eq. 10) over `noise_draws` noises for each sample."""
     known: Any = policy.apply({"params": params}, seen, state, method="condition")
     draws = config.training.noise_draws
     cond, action = (jnp.repeat(x, draws, axis=0) for x in (known, action))

@@ -39,7 +39,7 @@ from deploy.setup import safety_filter
 from deploy_support import HOME_RAD, KinematicRobot
 from mjx_envs import draws
 from mjx_envs import kinematics as quaternions
-from mjx_envs.camera import nominal_pose
+from mjx_envs.camera import look_at, nominal_pose
 from rig.fr3.board import held_pose
 from sensors.charuco_board import CharucoBoard
 
@@ -478,6 +478,31 @@ def test_without_a_calibration_deploy_says_what_it_assumes(tmp_path, monkeypatch
     )
     assert standing.standing(CONFIG, SessionOptions("mine", "realsense")) == place  # by another driver
     assert place.as_dict() is None and standing.standing(CONFIG, SessionOptions()).line == ""
+
+
+def test_a_policy_of_another_place_is_told_where_it_was_trained(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    trained = {"position": [0.5, 0.7, 0.9], "look_at": [0.5, 0.0, 0.0]}
+    place = standing.standing(CONFIG, SessionOptions("franka", "realsense"), trained)
+    assert (
+        "assumes the camera at (0.50, 0.70, 0.90) m in the robot's base frame, looking at (0.50, "
+        in place.line
+    )
+    made = standing.Calibration(
+        "2026-11-23T10:00:00", "realsense", CONFIG.deploy.franka.host, look_at(*trained.values()), 0.1
+    )
+    standing.save(standing.DEFAULT_FILE, made)
+    place = standing.standing(CONFIG, SessionOptions("franka", "realsense"), trained)
+    assert place.offset is not None and place.offset.distance_m == pytest.approx(0.0) and place.trained_for
+
+
+@pytest.mark.parametrize("up", [-1.0, 1.0])
+def test_a_camera_that_looks_straight_up_or_down_has_a_pose(up):
+    T_base_cam = look_at((0.5, 0.0, 0.9), (0.5, 0.0, 0.9 + up))
+    np.testing.assert_allclose(T_base_cam[:3, 2], (0.0, 0.0, up))
+    np.testing.assert_allclose(np.linalg.det(T_base_cam[:3, :3]), 1.0)
+    tilted = look_at((0.5, 0.0, 0.9), (0.5 + 1e-6, 0.0, 0.9 + up))
+    np.testing.assert_allclose(T_base_cam[:3, :3], tilted[:3, :3], atol=1e-5)
 
 
 def test_a_calibration_of_another_robot_is_not_taken(tmp_path, monkeypatch):

@@ -6,7 +6,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto, helper
 
 from ddgrasp import contract
 from ddgrasp.errors import UserError
@@ -215,6 +217,19 @@ def test_graph_that_contradicts_its_metadata_is_refused(tmp_path):
     lying = describe("float32_m").to_json()
     with pytest.raises(UserError, match=r"tensor\(uint16\).*float32_m"):
         OnnxPolicy(write_policy(tmp_path / "p.onnx", properties={"ddgrasp": lying}))
+
+
+def test_a_file_that_fits_by_its_shapes_and_does_not_run_is_refused(tmp_path):
+    path = write_policy(tmp_path / "p.onnx")
+    model = onnx.load(path)
+    state = next(node for node in model.graph.input if node.name == "state")
+    state.type.tensor_type.elem_type = TensorProto.DOUBLE
+    for node in model.graph.node:
+        node.input[:] = ["narrow" if name == "state" else name for name in node.input]
+    model.graph.node.insert(0, helper.make_node("Cast", ["state"], ["narrow"], to=TensorProto.FLOAT))
+    onnx.save(model, path)
+    with pytest.raises(UserError, match="p.onnx: it does not run .*double"):
+        OnnxPolicy(path)
 
 
 def test_warm_up_leaves_no_trace(tmp_path):

@@ -313,6 +313,47 @@ def test_a_dry_run_shows_what_the_policy_would_do_with_a_hand_that_is_shut(run, 
     assert rows == {True: ["policy"] * 8, False: ["policy"] + ["retry"] * 7}
 
 
+@pytest.mark.parametrize(
+    ("colour", "words"),
+    [
+        (None, "no colour"),
+        (np.zeros((480, 848, 3), np.float32), "colour of type float32 and shape (480, 848, 3)"),
+        (np.zeros((480, 848, 4), np.uint8), "colour of type uint8 and shape (480, 848, 4)"),
+    ],
+)
+def test_a_camera_of_one_s_own_without_colour_that_can_be_kept_is_told_so(run, colour, words):
+    class Own(ColourCamera):
+        def read(self):
+            return replace(super().read(), rgb=colour)
+
+    said = []
+    report, folder = run(Own, said.append)
+    lost = f"the camera gives {words}; a recording's is (h, w, 3) uint8"
+    assert report.steps == 5 and f"frames are missing: {lost}" in said
+    kept = json.loads((folder / "report.json").read_text())
+    assert (kept["frames"], kept["frames_lost"]) == (0, lost)
+
+
+def test_a_driver_that_moves_by_itself_is_refused_in_a_dry_run(run, monkeypatch, tmp_path):
+    class Moving(KinematicRobot):
+        def __init__(self, setup):
+            super().__init__(setup.clock)
+            setup.confirm("This arm will move. Is the way clear?")
+
+    made = []
+    run(seconds=0.1)
+
+    def make(setup):
+        made.append(setup)
+        return Moving(setup), ColourCamera(setup.clock)
+
+    monkeypatch.setattr(session, "make_devices", make)
+    options = SessionOptions(camera="stereo", seconds=0.1, out=tmp_path / "dry", dry_run=True, yes=True)
+    with pytest.raises(UserError, match="a dry run moves nothing, and this robot's driver would"):
+        session.deploy(CONFIG, tmp_path / "p.onnx", options)
+    assert len(made) == 1
+
+
 def test_a_camera_that_fills_its_buffers_again_is_recorded_frame_by_frame(run, monkeypatch):
     class Reusing(ColourCamera):
         """Hands out the same two arrays again and again, as a driver may that copies nothing."""
@@ -463,7 +504,11 @@ def test_a_simulated_camera_before_other_tables_is_called_another(run, camera, e
     many = replace(config, record=replace(config.record, other_tables=True))
     _, folder = run(config=many, camera_name=camera)
     assert json.loads((folder / "report.json").read_text())["camera"] == expected
-    assert Recording.open(folder).meta["sensor"] == f"{expected}, D455 profile"
+    meta = Recording.open(folder).meta
+    if camera == "stereo":
+        assert (meta["sensor"], meta["baseline_m"]) == (f"{expected}, D455 profile", contract.D455.baseline_m)
+    else:  # whose driver does not say what it is: no baseline is taken for it
+        assert meta["sensor"] == f"{expected}, brought to the policy's picture" and "baseline_m" not in meta
 
 
 def test_a_rig_knows_what_lies_there(run):

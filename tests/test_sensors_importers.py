@@ -162,6 +162,37 @@ def test_float_depth_is_metres_unless_its_size_says_otherwise(tmp_path):
     np.testing.assert_array_equal(Recording.open(tmp_path / "right" / "desk").depth_mm(1), depth_mm(1))
 
 
+@pytest.mark.parametrize(("factor", "dtype", "unit"), [(0.1, np.float32, "0.01"), (10, np.uint16, "0.0001")])
+def test_the_unit_that_is_advised_is_the_right_one(tmp_path, factor, dtype, unit):
+    root = make_folder(tmp_path / "desk")
+    for i, file in enumerate(sorted((root / "depth").iterdir())):
+        np.save(file.with_suffix(".npy"), (depth_mm(i) * factor).astype(dtype))
+        file.unlink()
+    with pytest.raises(UserError, match=f"perhaps --depth-unit-m {unit}\\."):
+        run(root, "--out", tmp_path / "wrong")
+    run(root, "--out", tmp_path / "right", "--depth-unit-m", unit)
+    median_mm = np.median(Recording.open(tmp_path / "right" / "desk").depth_mm(1))
+    assert median_mm == pytest.approx(np.median(depth_mm(1)), abs=1)
+
+
+def test_frames_with_one_between_them_that_is_not_there_are_not_called_consecutive(tmp_path):
+    root = make_folder(tmp_path / "desk", frames=5)
+    run(root, "--out", tmp_path / "whole", "--consecutive")
+    whole = tmp_path / "whole" / "desk"
+    assert Recording.open(whole).consecutive
+    for folder in ("depth", "color"):  # as a person may who looks through a recording
+        next(file for file in (whole / folder).iterdir() if file.stem == "000002").unlink()
+    run(whole, "--out", tmp_path / "again")
+    assert not Recording.open(tmp_path / "again" / "desk").consecutive
+    (root / "depth" / "0002_depth.png").unlink()
+    run(root, "--out", tmp_path / "gap", "--consecutive")
+    assert not Recording.open(tmp_path / "gap" / "desk").consecutive
+    (root / "depth" / "0004_depth.png").unlink()
+    (root / "rgb" / "0002_rgb.png").unlink()
+    run(root, "--out", tmp_path / "begun", "--consecutive")  # colour goes on after the last: no gap
+    assert Recording.open(tmp_path / "begun" / "desk").consecutive
+
+
 @pytest.mark.parametrize("unit_m", [1.0, 0.001])
 def test_what_is_lost_of_floating_point_depth_is_said_once(tmp_path, capsys, unit_m):
     root = make_folder(tmp_path / "desk")
@@ -239,7 +270,7 @@ def test_a_recording_imported_again_says_the_same_of_its_camera(tmp_path):
     root = make_folder(tmp_path / "desk", color="color")
     known = {"depth_unit_m": 0.0005, "sensor": "D435", "fx_px": 380.0, "hz": 15, "consecutive_frames": True}
     known |= {"licence": "CC BY 4.0", "source": "a kitchen"}
-    (root / "meta.json").write_text(json.dumps({**known, "contract_version": -1, "frames": 99}))
+    (root / "meta.json").write_text(json.dumps({**known, "contract_version": -1, "frames": 3}))
     run(root, "--out", tmp_path / "out")
     again = Recording.open(tmp_path / "out" / "desk")
     assert again.meta["contract_version"] == CONTRACT_VERSION and again.meta["frames"] == 4

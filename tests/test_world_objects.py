@@ -17,7 +17,16 @@ from evaluation import object_sheet
 from mjx_envs import grasp_math, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import GraspEnv
-from mjx_envs.object_spec import DEFAULT_SLOTS, Box, Capsule, ObjectSpec, RestPose, SlotLayout, slot_layout
+from mjx_envs.object_spec import (
+    DEFAULT_SLOTS,
+    Box,
+    Capsule,
+    Cylinder,
+    ObjectSpec,
+    RestPose,
+    SlotLayout,
+    slot_layout,
+)
 from mjx_envs.objects import OBJECTS, SHAPES, get_object
 from mjx_envs.randomize import ObjectTable, sample_params
 from mjx_envs.render import raycast_numpy
@@ -243,6 +252,10 @@ def test_the_round_end_of_what_begins_beside_the_pads_counts():
         ({"other_pose": RestPose("y", 0.02, grasp_symmetry=3)}, "grasp_symmetry is 3; expected 0 or an even"),
         ({"capsules": (Capsule((-0.19, 0, 0), (0.19, 0, 0), 0.01),)}, "a part reaches 0.2 m from its middle"),
         ({"box": Box((0.145, 0.02, 0.02))}, "a part reaches 0.145 m from its middle"),
+        ({"box": None, "cylinders": (Cylinder(0.02, 0.02),)}, "nothing of it collides: give it a box"),
+        ({"box": Box((0.02, 0.041, 0.02))}, "0.082 m wide where the fingers close; a hand opens by 0.08 m"),
+        ({"mass_kg": -1.0}, "mass_kg is -1; expected more than 0"),
+        ({"friction": 0.0}, "friction is 0; expected more than 0"),
     ],
 )
 def test_what_no_hand_grasps_or_no_engine_sees_is_refused(change, message):

@@ -1,6 +1,7 @@
 """Where the camera stands beside where the policy was trained to see from: what deploy says and records."""
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from ddgrasp.config import Config, RandomConfig
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json, read_json
 from deploy.devices.options import SessionOptions
-from mjx_envs.camera import nominal_pose
+from mjx_envs.camera import look_at
 
 DEFAULT_FILE = Path("runs/calibration/calibration.json")
 """Where `ddgrasp calibrate` writes and `ddgrasp deploy` looks."""
@@ -95,22 +96,25 @@ def offset(T_base_cam: Float[np.ndarray, "4 4"], T_reference: Float[np.ndarray, 
     return Offset(np.asarray(T_base_cam[:3, 3] - T_reference[:3, 3], float), np.asarray(turn, float))
 
 
-def standing(config: Config, options: SessionOptions) -> Standing:
-    """What deploy says of its camera. Raises UserError for a file that is named and does not fit."""
+def standing(config: Config, options: SessionOptions, trained: Mapping[str, Any] | None = None) -> Standing:
+    """What deploy says of its camera. `trained`: the policy file's camera (`PolicyMetadata.camera`).
+
+    Raises UserError for a file that is named and does not fit.
+    """
     if not options.real:
         return Standing()
-    spread = config.world.random
+    spread, place = config.world.random, _place(trained or {})
     path = options.calibration or DEFAULT_FILE
     if options.calibration is None and not path.exists():
-        return Standing(_assumed("not calibrated", spread))
+        return Standing(_assumed("not calibrated", place, spread))
     found, host = load(path), config.deploy.franka.host
     camera = "rig" if options.camera == "rig-ideal" else options.camera
     if (found.camera, found.host) != (camera, host):
         unlike = f"{path} is of camera {found.camera!r} and the robot at {found.host}"
         if options.calibration is not None:
             raise UserError(f"{unlike}, not of {camera!r} at {host}: `ddgrasp calibrate`, or another file.")
-        return Standing(_assumed(f"not calibrated ({unlike})", spread))
-    away = offset(found.T_base_cam, nominal_pose())
+        return Standing(_assumed(f"not calibrated ({unlike})", place, spread))
+    away = offset(found.T_base_cam, look_at(*place))
     text = f"calibrated {found.created[:10]}: {describe(away, spread)}"
     return Standing(text, found, away, is_trained_for(away, spread))
 
@@ -193,11 +197,15 @@ def now() -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%S%z")
 
 
-def _assumed(why: str, spread: RandomConfig) -> str:
-    place, aim = (
-        ", ".join(f"{value:.2f}" for value in point)
-        for point in (contract.CAMERA_POSITION_M, contract.CAMERA_LOOK_AT_M)
-    )
+def _place(trained: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[float]]:
+    """Where the policy's camera stood in training and what it looked at; what it does not say, the contract
+    does."""
+    position_m = trained.get("position", contract.CAMERA_POSITION_M)
+    return position_m, trained.get("look_at", contract.CAMERA_LOOK_AT_M)
+
+
+def _assumed(why: str, stands: tuple[Sequence[float], Sequence[float]], spread: RandomConfig) -> str:
+    place, aim = (", ".join(f"{value:.2f}" for value in point) for point in stands)
     return (
         f"{why}: assumes the camera at ({place}) m in the robot's base frame, looking at ({aim}), within "
         f"{_spread(spread)}; `ddgrasp calibrate` measures it"

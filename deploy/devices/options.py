@@ -59,6 +59,7 @@ class Setup:
     """The policy's: rate, picture size, depth type."""
     clock: Clock
     confirm: Callable[[str], None] = lambda question: None
-    """Called with a question before a device moves by itself; raises UserError if a person says no."""
+    """Called with a question before a device moves by itself; raises UserError if a person says no, and in a
+    dry run, in which nothing may move."""
     say: Callable[[str], None] = lambda text: None
     """Told what a device does before the loop begins."""

@@ -79,7 +79,8 @@ def episode_sums(
 ) -> Sums:
     """Hole sums of maps (T, H, W) in time order over the clean geometry they show.
 
-    `places` is the `geometry` of each frame. Counts are taken where the clean geometry has a surface.
+    `places` is the `geometry` of each frame. Errors and rates by place are counted
+    where the clean geometry has a surface, holes, their sizes and how they change over the whole picture.
     """
     holes, surface = depth_m <= 0, clean_m > 0
     both = ~holes & surface

@@ -84,7 +84,7 @@ def import_recording(source: Source, path: Path) -> Imported:
     """
     if path.exists():
         raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
-    skipped, medians_m, size, frames, gaps, last = [], [], None, 0, False, False
+    skipped, medians_m, size, frames, gaps, last = [], [], None, 0, source.has_gaps, False
     loss, marked, unlike = "", 0, ""
     certain = {UNIT_IS_CERTAIN: True} if source.unit_is_certain else {}
     with RecordingWriter(path, source.meta | certain, keep=source.cut_short is not None) as writer:
@@ -203,7 +203,7 @@ def _usable(frame: RawFrame, unit_m: float, size: tuple[int, ...] | None) -> tup
     if not _is_depth(depth):
         return None, f"depth is {depth.dtype} {depth.shape}, expected one channel of 16 bits or floats"
     if frame.rgb is None:
-        return None, "colour is missing or cannot be read"
+        return None, f"colour is missing or cannot be read (a {', '.join(COLOR_SUFFIXES)} of its name)"
     if size is not None and depth.shape != size:
         return None, f"depth is {depth.shape[1]}x{depth.shape[0]}, the frames before it {size[1]}x{size[0]}"
     millimetres = from_counts(depth, unit_m)
@@ -228,7 +228,7 @@ def _check_unit(source: Source, medians_m: list[float]) -> None:
     if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
         return
     far = median_m > FARTHEST_MEDIAN_M
-    unit_m = source.depth_unit_m * (DEPTH_UNIT_M if far else 1.0 / DEPTH_UNIT_M)
+    unit_m = source.depth_unit_m / 10.0 ** round(np.log10(median_m))  # a scene's is about a metre
     remedy = f"give its unit, perhaps --depth-unit-m {unit_m:g}"
     if source.unit_is_certain:
         remedy = f"point the camera at something {'nearer' if far else 'farther'}"
@@ -281,8 +281,9 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
         first = next((d for d in map(_read_depth, files) if d is not None and _is_depth(d)), None)
         floats = first is not None and np.issubdtype(first.dtype, np.floating)
         depth_unit_m = 1.0 if floats else DEPTH_UNIT_M
-    colors = (p for p in _color_folder(folder).iterdir() if p.suffix.lower() in COLOR_SUFFIXES)
-    pairs, note = paired(files, sorted(colors))
+    colors = sorted(p for p in _color_folder(folder).iterdir() if p.suffix.lower() in COLOR_SUFFIXES)
+    pairs, note = paired(files, colors)
+    gaps = own.get("frames", 0) > len(files) or _alone_between(colors, list(pairs.values()))
 
     def frames() -> Iterator[RawFrame]:
         for file in files:
@@ -291,7 +292,13 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
 
     kept = {name: own[name] for name in KEPT_META if name in own}
     certain = bool(kept.pop(UNIT_IS_CERTAIN, False)) and depth_unit_m == own.get("depth_unit_m")
-    return Source(folder, frames, depth_unit_m, {**kept, **meta}, unit_is_certain=certain, note=note)
+    return Source(folder, frames, depth_unit_m, {**kept, **meta}, certain, has_gaps=gaps, note=note)
+
+
+def _alone_between(colors: Sequence[Path], taken: Sequence[Path]) -> bool:
+    """Whether a colour picture lies without depth between others that have some."""
+    places = [place for place, file in enumerate(sorted(colors, key=in_time)) if file in set(taken)]
+    return len(places) > 0 and places[-1] - places[0] + 1 > len(places)
 
 
 def _own_meta(file: Path) -> dict[str, Any]:

@@ -45,6 +45,8 @@ class Source:
     """Whether depths that cannot be a D4xx's are the scene's fault, not the unit's."""
     closing_meta: Callable[[], dict[str, Any]] = dict
     """Fields of meta.json that are known after the last frame alone."""
+    has_gaps: bool = False
+    """Whether frames were left out, taken away or lost between those there are."""
     note: str = ""
     """What people ought to know of its frames, if anything."""
     cut_short: Callable[[OSError], None] | None = None
