@@ -253,13 +253,24 @@ def test_what_cannot_be_used_is_refused_and_the_next_frame_goes_on(tmp_path):
         policy.act(depth_mm(), STATE)
 
 
+def test_the_page_s_first_lines_run(monkeypatch):
+    (lines,) = (block for block in code("../data.md") if "target_rad = state" in block)
+    monkeypatch.chdir(Path(__file__).parents[1])
+    made: dict = {}
+    exec(lines, made)
+    info = OnnxPolicy("pretrained/student/policy.onnx").info
+    assert (info.execute_steps, info.action_scale_rad) == (1, 0.1)
+    assert (round(info.camera["fx"], 1), info.camera["position"]) == (168.6, [0.94, 0.0, 0.56])
+    assert np.isfinite(made["target_rad"]).all() and made["action"].shape == (1, info.chunk, 8)
+
+
 def test_the_page_s_lines_do_what_the_policy_class_does(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     gain, state_gain = rng.normal(0, 1e-3, (3, 4, 8)), rng.normal(0, 1, (9, 4, 8))
     info = describe(execute_steps=2, closing_steps=3)
     path = write_policy(tmp_path / "policy.onnx", info, depth_gain=gain, state_gain=state_gain)
     monkeypatch.chdir(tmp_path)
-    (lines,) = (block for block in code("../data.md") if "InferenceSession" in block)
+    (lines,) = (block for block in code("../data.md") if "def act" in block)
     page: dict = {}
     exec(lines, page)
     policy, closed, depth = OnnxPolicy(path), [], depth_mm()
