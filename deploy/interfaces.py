@@ -220,6 +220,15 @@ class Device(Protocol):
 
 
 @runtime_checkable
+class Numbered(Protocol):
+    """A camera that can be told from another of its kind."""
+
+    def serial(self) -> str:
+        """Its serial number, once it has started."""
+        ...
+
+
+@runtime_checkable
 class Replayed(Protocol):
     """A camera that shows what another has recorded."""
 

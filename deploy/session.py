@@ -69,6 +69,9 @@ def _run(
     place = standing(config, options, policy.info.camera)
     if place.line:
         say(place.line)
+    if place.calibration is not None and place.calibration.serial:  # and no other that is plugged in
+        realsense = replace(config.deploy.realsense, serial=place.calibration.serial)
+        config = replace(config, deploy=replace(config.deploy, realsense=realsense))
     clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
     confirm = _unmoved if options.dry_run else _agreed if options.yes else ask_person
     robot, camera = make_devices(Setup(config, options, policy.info, clock, confirm, say))

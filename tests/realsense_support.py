@@ -195,7 +195,8 @@ class ScriptedLibrary:
             supports=lambda what: True, get_option=lambda what: -BASELINE_MM, set_option=self._set_option,
             get_depth_scale=lambda: self._unit_m,
         )  # fmt: skip
-        device = SimpleNamespace(get_info=lambda what: NAME, first_depth_sensor=lambda: sensor)
+        told = {self.camera_info.name: NAME, self.camera_info.serial_number: self._serials[0]}
+        device = SimpleNamespace(get_info=told.__getitem__, first_depth_sensor=lambda: sensor)
         stream = SimpleNamespace(fps=lambda: 30, get_intrinsics=lambda: self.intrinsics)
         video = SimpleNamespace(as_video_stream_profile=lambda: stream)
         return SimpleNamespace(get_device=lambda: device, get_stream=lambda *kind: video)

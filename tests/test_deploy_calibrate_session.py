@@ -23,6 +23,7 @@ from ddgrasp.config import RandomConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from deploy import clock, kinematics
+from deploy import session as deploy_session
 from deploy.calibration import poses, session, standing
 from deploy.calibration.drive import Driver
 from deploy.calibration.hand_eye import invert, project, rotation_spread_rad
@@ -494,6 +495,42 @@ def test_a_policy_of_another_place_is_told_where_it_was_trained(tmp_path, monkey
     standing.save(standing.DEFAULT_FILE, made)
     place = standing.standing(CONFIG, SessionOptions("franka", "realsense"), trained)
     assert place.offset is not None and place.offset.distance_m == pytest.approx(0.0) and place.trained_for
+
+
+def with_serial(serial: str):
+    realsense = replace(CONFIG.deploy.realsense, serial=serial)
+    return replace(CONFIG, deploy=replace(CONFIG.deploy, realsense=realsense))
+
+
+def test_a_calibration_is_of_the_camera_that_it_measured(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    host, options = CONFIG.deploy.franka.host, SessionOptions("franka", "realsense")
+    made = standing.Calibration("2026-11-23T10:00:00", "realsense", host, nominal_pose(), 0.1, "0123")
+    standing.save(standing.DEFAULT_FILE, made)
+    for same in ("", "0123"):
+        place = standing.standing(with_serial(same), options)
+        assert place.calibration is not None and place.calibration.serial == "0123" and place.trained_for
+    other = standing.standing(with_serial("4567"), options)
+    assert other.calibration is None
+    assert "is of camera 'realsense' with serial number 0123 and the robot at" in other.line
+    with pytest.raises(UserError, match="not of 'realsense' with serial number 4567 at "):
+        standing.standing(with_serial("4567"), replace(options, calibration=standing.DEFAULT_FILE))
+    opened = []
+
+    def make_devices(setup):
+        opened.append(setup.config.deploy.realsense.serial)
+        raise UserError("enough")
+
+    monkeypatch.setattr(deploy_session, "make_devices", make_devices)
+    policy = Path(__file__).parents[1] / "pretrained/student/policy.onnx"
+    options = replace(options, yes=True, out=tmp_path / "runs")
+    for serial in ("", "4567"):
+        with pytest.raises(UserError, match="enough"):
+            policy = Path(__file__).parents[1] / "pretrained/student/policy.onnx"
+            deploy_session.deploy(
+                with_serial(serial), policy, replace(options, yes=True, out=tmp_path / "runs")
+            )
+    assert opened == ["0123", "4567"]
 
 
 @pytest.mark.parametrize("up", [-1.0, 1.0])

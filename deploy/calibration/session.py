@@ -23,7 +23,7 @@ from deploy.calibration.standing import Calibration
 from deploy.clock import RealClock, RobotClock
 from deploy.devices.options import SessionOptions, Setup
 from deploy.devices.registry import IMAGERS, ROBOTS
-from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, Robot, RobotError
+from deploy.interfaces import CameraError, Clock, Imager, KnowsItsPlace, Lens, Numbered, Robot, RobotError
 from deploy.interrupts import note, terminable, unbroken
 from deploy.session import ask_person, for_devices, keep_time_of, survived
 from deploy.setup import check_start, safety_filter, space_notice
@@ -119,7 +119,7 @@ def run(
             return None
         taken = _take(driver, imager, bench, ways, options, give, say)
         try:  # before a person touches the arm, which may fail: it costs none of the views
-            found = _solved(taken, bench.lens, options, config, _truth(imager), say)
+            found = _solved(taken, imager, options, config, say)
         except (UserError, OSError):
             _give_back(driver, options, say)
             raise
@@ -261,18 +261,20 @@ def _look_once(
 
 def _solved(
     taken: Taken,
-    lens: Lens,
+    imager: Imager,
     options: CalibrationOptions,
     config: Config,
-    truth: np.ndarray | None,
     say: Callable[[str], None],
 ) -> Calibration:
+    lens, truth = imager.lens(), _truth(imager)
     found = calibrate(taken.views, lens, options.board)
     for line in describe(found, truth):
         say(line)
     details = _details(taken, found, lens, options.board, truth)
     host = config.deploy.franka.host
-    result = Calibration(standing.now(), options.camera, host, found.T_base_cam, found.rms_px, details)
+    serial = imager.serial() if isinstance(imager, Numbered) else ""
+    measured = found.T_base_cam, found.rms_px
+    result = Calibration(standing.now(), options.camera, host, *measured, serial=serial, details=details)
     sheet = options.file.with_suffix(".png")
     if found.rms_px <= MOST_RMS_PX:  # before the picture, which takes more room
         standing.save(options.file, result)

@@ -43,6 +43,8 @@ class Calibration:
     """(4, 4) pose of the camera that measures depth (left imager) in the robot's base frame, metres."""
     rms_px: float
     """Reprojection error."""
+    serial: str = ""
+    """The camera's, where it has one; empty of files of before 2026-11-30."""
     details: dict[str, Any] = field(default_factory=dict)
     """Board, views, standard errors; for people and for a later look."""
 
@@ -109,10 +111,12 @@ def standing(config: Config, options: SessionOptions, trained: Mapping[str, Any]
         return Standing(_assumed("not calibrated", place, spread))
     found, host = load(path), config.deploy.franka.host
     camera = "rig" if options.camera == "rig-ideal" else options.camera
-    if (found.camera, found.host) != (camera, host):
-        unlike = f"{path} is of camera {found.camera!r} and the robot at {found.host}"
+    serial = config.deploy.realsense.serial or found.serial
+    if (found.camera, found.host, found.serial or serial) != (camera, host, serial):
+        unlike = f"{path} is of camera {_numbered(found.camera, found.serial)} and the robot at {found.host}"
         if options.calibration is not None:
-            raise UserError(f"{unlike}, not of {camera!r} at {host}: `ddgrasp calibrate`, or another file.")
+            asked = f"{_numbered(camera, serial)} at {host}"
+            raise UserError(f"{unlike}, not of {asked}: `ddgrasp calibrate`, or another file.")
         return Standing(_assumed(f"not calibrated ({unlike})", place, spread))
     away = offset(found.T_base_cam, look_at(*place))
     text = f"calibrated {found.created[:10]}: {describe(away, spread)}"
@@ -149,7 +153,7 @@ def save(path: Path, calibration: Calibration) -> None:
     values = {
         "version": VERSION, "created": calibration.created, "camera": calibration.camera,
         "host": calibration.host, "T_base_cam": calibration.T_base_cam.tolist(),
-        "rms_px": calibration.rms_px, **calibration.details,
+        "rms_px": calibration.rms_px, "serial": calibration.serial, **calibration.details,
     }  # fmt: skip
     atomic_write_json(path, values)
 
@@ -166,7 +170,7 @@ def load(path: Path) -> Calibration:
         if not _is_rigid(T):
             raise ValueError("T_base_cam is no rigid transform")
         created, camera, host = (str(values[name]) for name in ("created", "camera", "host"))
-        return Calibration(created, camera, host, T, float(values["rms_px"]))
+        return Calibration(created, camera, host, T, float(values["rms_px"]), str(values.get("serial", "")))
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is no calibration ({error}): `ddgrasp calibrate` writes one.") from None
 
@@ -195,6 +199,10 @@ def check_own(path: Path, camera: str, host: str) -> None:
 def now() -> str:
     """ISO 8601, local time, seconds."""
     return time.strftime("%Y-%m-%dT%H:%M:%S%z")
+
+
+def _numbered(camera: str, serial: str) -> str:
+    return f"{camera!r} with serial number {serial}" if serial else repr(camera)
 
 
 def _place(trained: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[float]]:

@@ -60,6 +60,7 @@ class RealSenseImager:
             project(rs, active, on=False)  # its dots would lie on the board
             stream = active.get_stream(rs.stream.infrared, LEFT).as_video_stream_profile()
             self._lens = lens_of(stream.get_intrinsics())
+            self._serial = active.get_device().get_info(rs.camera_info.serial_number)
         except RuntimeError as error:
             self.stop()
             raise UserError(
@@ -70,6 +71,10 @@ class RealSenseImager:
         """The imager's own."""
         assert self._lens is not None
         return self._lens
+
+    def serial(self) -> str:
+        """See Numbered."""
+        return self._serial
 
     def picture(self) -> UInt8[np.ndarray, "H W"]:
         """(720, 1280), exposed after the call. Raises CameraError."""
