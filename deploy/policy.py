@@ -87,7 +87,7 @@ class OnnxPolicy:
         try:
             self.warm_up()
         except Exception as error:  # onnxruntime raises classes of its own, without a common base
-            reason = str(error).splitlines()[0]
+            reason = (str(error) or repr(error)).splitlines()[0]
             raise UserError(f"{self.path}: it does not run ({reason}); {_remedy(self.path)}.") from error
 
     def reset(self, seed: int) -> None:

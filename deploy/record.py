@@ -126,8 +126,9 @@ class DeploymentRecord:
         if rgb is None and step.index % self._picture_every == 0 and isinstance(self._camera, Filmed):
             rgb = self._camera.picture()
         if rgb is None or (rgb.dtype, rgb.shape[2:]) != (np.uint8, (3,)):
-            wrong = "no colour" if rgb is None else f"colour of type {rgb.dtype} and shape {rgb.shape}"
-            self._without = self._without or wrong
+            if not isinstance(self._camera, Filmed):  # which has one now and then
+                wrong = "no colour" if rgb is None else f"colour of type {rgb.dtype} and shape {rgb.shape}"
+                self._without = self._without or wrong
             return None
         depth = step.frame.depth
         depth_mm = depth.copy() if depth.dtype == np.uint16 else to_millimetres(depth)

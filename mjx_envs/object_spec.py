@@ -226,7 +226,10 @@ class ObjectSpec:
             )
         check_symmetry(self.name, self.grasp_symmetry)
         if self.other_pose is not None:
-            check_symmetry(self.name, self.other_pose.grasp_symmetry)
+            try:
+                self.in_other_pose()
+            except UserError as error:
+                raise UserError(f"{error} (Its other pose.)") from None
         reach_m = max(map(_reach_m, (*self.capsules, *((self.box,) if self.box else ()))), default=0.0)
         if reach_m > MOST_REACH_M:
             raise UserError(

@@ -531,6 +531,13 @@ def test_a_calibration_is_of_the_camera_that_it_measured(tmp_path, monkeypatch):
                 with_serial(serial), policy, replace(options, yes=True, out=tmp_path / "runs")
             )
     assert opened == ["0123", "4567"]
+    for serial in ("", "0123"):
+        standing.check_own(standing.DEFAULT_FILE, "realsense", host, serial)
+    with pytest.raises(UserError, match="of camera 'realsense' with serial number 0123 and .*another"):
+        standing.check_own(standing.DEFAULT_FILE, "realsense", host, "4567")
+    rig = replace(options, camera="rig", calibration=standing.DEFAULT_FILE, host=host)
+    with pytest.raises(UserError, match="serial number 0123 and the robot at .*, not of 'rig' at"):
+        standing.standing(with_serial("4567"), rig)
 
 
 @pytest.mark.parametrize("up", [-1.0, 1.0])

@@ -155,24 +155,32 @@ def test_float_depth_is_metres_unless_its_size_says_otherwise(tmp_path):
     np.testing.assert_array_equal(Recording.open(tmp_path / "out" / "desk").depth_mm(1), depth_mm(1))
     for i, file in enumerate(sorted((root / "depth").iterdir())):
         np.save(file, depth_mm(i).astype(np.float32))
-    with pytest.raises(UserError, match="perhaps --depth-unit-m 0.001"):
+    with pytest.raises(UserError, match="perhaps --depth-unit-m 0.001 or 0.0001"):
         run(root, "--out", tmp_path / "wrong")
     assert not (tmp_path / "wrong" / "desk").exists()
     run(root, "--out", tmp_path / "right", "--depth-unit-m", "0.001")
     np.testing.assert_array_equal(Recording.open(tmp_path / "right" / "desk").depth_mm(1), depth_mm(1))
 
 
-@pytest.mark.parametrize(("factor", "dtype", "unit"), [(0.1, np.float32, "0.01"), (10, np.uint16, "0.0001")])
+@pytest.mark.parametrize(
+    ("factor", "dtype", "unit"),
+    [
+        (0.1, np.float32, "0.01"),
+        (10, np.uint16, "0.0001"),
+        (4.0, np.float32, "0.001"),
+        (0.3, np.float32, "0.001"),
+    ],
+)
 def test_the_unit_that_is_advised_is_the_right_one(tmp_path, factor, dtype, unit):
     root = make_folder(tmp_path / "desk")
     for i, file in enumerate(sorted((root / "depth").iterdir())):
         np.save(file.with_suffix(".npy"), (depth_mm(i) * factor).astype(dtype))
         file.unlink()
-    with pytest.raises(UserError, match=f"perhaps --depth-unit-m {unit}\\."):
+    with pytest.raises(UserError, match=f"perhaps --depth-unit-m (.* or )?{unit}( or .*)?\\.$"):
         run(root, "--out", tmp_path / "wrong")
     run(root, "--out", tmp_path / "right", "--depth-unit-m", unit)
     median_mm = np.median(Recording.open(tmp_path / "right" / "desk").depth_mm(1))
-    assert median_mm == pytest.approx(np.median(depth_mm(1)), abs=1)
+    assert median_mm == pytest.approx(1000 * float(unit) * factor * np.median(depth_mm(1)), abs=1)
 
 
 def test_frames_with_one_between_them_that_is_not_there_are_not_called_consecutive(tmp_path):

@@ -92,7 +92,8 @@ def run(
     if options.camera not in IMAGERS:
         raise unknown_name("camera", options.camera, IMAGERS)
     config = for_devices(config, session)
-    _check_out(options, config.deploy.franka.host)
+    realsense = config.deploy.realsense.serial if options.camera == "realsense" else ""
+    _check_out(options, config.deploy.franka.host, realsense)
     info = policy_metadata.describe(config.student, config.export, config.world.profile)
     clock: Clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
     confirm = (lambda question: None) if options.yes else ask_person
@@ -109,6 +110,7 @@ def run(
     driver = Driver(robot, safety, clock, min(options.speed_rad_s, *config.deploy.franka.speed_rad_s))
     with terminable(), _started(imager, robot, say) as start_robot:
         bench = poses.Bench(safety.limits, imager.lens(), nominal_pose(), options.board)
+        _check_out(options, config.deploy.franka.host, _serial(imager))
         check_start(safety)
         say(space_notice(config.deploy))
         say(f"looking for: {options.board.describe()}")
@@ -272,9 +274,8 @@ def _solved(
         say(line)
     details = _details(taken, found, lens, options.board, truth)
     host = config.deploy.franka.host
-    serial = imager.serial() if isinstance(imager, Numbered) else ""
-    measured = found.T_base_cam, found.rms_px
-    result = Calibration(standing.now(), options.camera, host, *measured, serial=serial, details=details)
+    measured = found.T_base_cam, found.rms_px, _serial(imager)
+    result = Calibration(standing.now(), options.camera, host, *measured, details)
     sheet = options.file.with_suffix(".png")
     if found.rms_px <= MOST_RMS_PX:  # before the picture, which takes more room
         standing.save(options.file, result)
@@ -328,11 +329,15 @@ def _truth(imager: Imager) -> np.ndarray | None:
     return np.asarray(imager.truth(), float) if isinstance(imager, KnowsItsPlace) else None
 
 
-def _check_out(options: CalibrationOptions, host: str) -> None:
+def _serial(imager: Imager) -> str:
+    return imager.serial() if isinstance(imager, Numbered) else ""
+
+
+def _check_out(options: CalibrationOptions, host: str, serial: str) -> None:
     """UserError, before anything moves, unless a calibration and a picture beside it can be written, over
     none of another camera or robot."""
     if options.out is None:
-        standing.check_own(standing.DEFAULT_FILE, options.camera, host)
+        standing.check_own(standing.DEFAULT_FILE, options.camera, host, serial)
     out = options.file
     if out.is_dir() or out.suffix == ".png":
         raise UserError(f"--out is {out}; expected the name of a file, for example calibration.json.")

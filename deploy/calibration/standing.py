@@ -111,15 +111,17 @@ def standing(config: Config, options: SessionOptions, trained: Mapping[str, Any]
         return Standing(_assumed("not calibrated", place, spread))
     found, host = load(path), config.deploy.franka.host
     camera = "rig" if options.camera == "rig-ideal" else options.camera
-    serial = config.deploy.realsense.serial or found.serial
-    if (found.camera, found.host, found.serial or serial) != (camera, host, serial):
+    serial = config.deploy.realsense.serial if camera == "realsense" else ""
+    other = found.serial and serial and found.serial != serial
+    if (found.camera, found.host) != (camera, host) or other:
         unlike = f"{path} is of camera {_numbered(found.camera, found.serial)} and the robot at {found.host}"
         if options.calibration is not None:
             asked = f"{_numbered(camera, serial)} at {host}"
             raise UserError(f"{unlike}, not of {asked}: `ddgrasp calibrate`, or another file.")
         return Standing(_assumed(f"not calibrated ({unlike})", place, spread))
     away = offset(found.T_base_cam, look_at(*place))
-    text = f"calibrated {found.created[:10]}: {describe(away, spread)}"
+    which = f" (camera {found.serial}, {path})" if found.serial else ""
+    text = f"calibrated {found.created[:10]}{which}: {describe(away, spread)}"
     return Standing(text, found, away, is_trained_for(away, spread))
 
 
@@ -170,7 +172,7 @@ def load(path: Path) -> Calibration:
         if not _is_rigid(T):
             raise ValueError("T_base_cam is no rigid transform")
         created, camera, host = (str(values[name]) for name in ("created", "camera", "host"))
-        return Calibration(created, camera, host, T, float(values["rms_px"]), str(values.get("serial", "")))
+        return Calibration(created, camera, host, T, float(values["rms_px"]), str(values.get("serial") or ""))
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is no calibration ({error}): `ddgrasp calibrate` writes one.") from None
 
@@ -183,16 +185,20 @@ def _is_rigid(T: np.ndarray) -> bool:
     return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0.0)
 
 
-def check_own(path: Path, camera: str, host: str) -> None:
-    """UserError if `path` is of another camera or robot, whose calibration is not to be lost."""
+def check_own(path: Path, camera: str, host: str, serial: str = "") -> None:
+    """UserError if `path` is of another camera or robot, whose calibration is not to be lost; `serial` may be
+    empty, not known."""
     try:
         there = load(path) if path.exists() else None
     except UserError:
         return
-    if there is not None and (there.camera, there.host) != (camera, host):
+    if there is None:
+        return
+    if (there.camera, there.host) != (camera, host) or (there.serial and serial and there.serial != serial):
+        own = f"{_numbered(there.camera, there.serial)} and the robot at {there.host!r}"
         raise UserError(
-            f"{path} is of camera {there.camera!r} and the robot at {there.host!r}: name another file for "
-            f"{camera!r} and {host!r}, --out FILE, and give it to deploy as --calibration."
+            f"{path} is of camera {own}: name another file for {_numbered(camera, serial)} and {host!r}, "
+            "--out FILE, and give it to deploy as --calibration."
         )
 
 

@@ -27,7 +27,7 @@ from sensors.recordings.recording import (
     UNIT_IS_CERTAIN,
     check_fields,
 )
-from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, in_time, paired
+from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, has_alone_between, in_time, paired
 from sensors.recordings.writer import BEGUN_FILE, RecordingWriter
 
 MARKER = 2**16 - 1
@@ -228,8 +228,11 @@ def _check_unit(source: Source, medians_m: list[float]) -> None:
     if NEAREST_MEDIAN_M <= median_m <= FARTHEST_MEDIAN_M:
         return
     far = median_m > FARTHEST_MEDIAN_M
-    unit_m = source.depth_unit_m / 10.0 ** round(np.log10(median_m))  # a scene's is about a metre
-    remedy = f"give its unit, perhaps --depth-unit-m {unit_m:g}"
+    tens = (10.0**-power for power in range(-9, 10))
+    fit = [
+        ten * source.depth_unit_m for ten in tens if NEAREST_MEDIAN_M <= ten * median_m <= FARTHEST_MEDIAN_M
+    ]
+    remedy = f"give its unit, perhaps --depth-unit-m {' or '.join(f'{unit_m:g}' for unit_m in fit)}"
     if source.unit_is_certain:
         remedy = f"point the camera at something {'nearer' if far else 'farther'}"
     raise UserError(
@@ -283,7 +286,8 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
         depth_unit_m = 1.0 if floats else DEPTH_UNIT_M
     colors = sorted(p for p in _color_folder(folder).iterdir() if p.suffix.lower() in COLOR_SUFFIXES)
     pairs, note = paired(files, colors)
-    gaps = own.get("frames", 0) > len(files) or _alone_between(colors, list(pairs.values()))
+    by_name = not note  # by time, a faster colour stream has pictures of its own
+    gaps = (own.get("frames") or 0) > len(files) or (by_name and has_alone_between(colors, pairs.values()))
 
     def frames() -> Iterator[RawFrame]:
         for file in files:
@@ -293,12 +297,6 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
     kept = {name: own[name] for name in KEPT_META if name in own}
     certain = bool(kept.pop(UNIT_IS_CERTAIN, False)) and depth_unit_m == own.get("depth_unit_m")
     return Source(folder, frames, depth_unit_m, {**kept, **meta}, certain, has_gaps=gaps, note=note)
-
-
-def _alone_between(colors: Sequence[Path], taken: Sequence[Path]) -> bool:
-    """Whether a colour picture lies without depth between others that have some."""
-    places = [place for place, file in enumerate(sorted(colors, key=in_time)) if file in set(taken)]
-    return len(places) > 0 and places[-1] - places[0] + 1 > len(places)
 
 
 def _own_meta(file: Path) -> dict[str, Any]:

@@ -291,6 +291,8 @@ def check_fields(file: Path, meta: Mapping[str, Any]) -> None:
     for name in ("fx_px", "baseline_m", "hz"):
         if (value := meta.get(name)) is not None and not _is_positive(value):
             raise UserError(f"{file}: {name} is {value!r}; expected a number above 0, or null.")
+    if (frames := meta.get("frames")) is not None and not (_is_positive(frames) and isinstance(frames, int)):
+        raise UserError(f"{file}: frames is {frames!r}; expected how many there are, or null.")
     for name in ("consecutive_frames", "color_aligned_to_depth", UNIT_IS_CERTAIN):
         if not isinstance(value := meta.get(name), bool | None):
             raise UserError(f"{file}: {name} is {value!r}; expected true or false, or null.")

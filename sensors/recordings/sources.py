@@ -2,7 +2,7 @@
 
 import re
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from itertools import pairwise
@@ -88,6 +88,13 @@ def paired(depth: Sequence[Path], color: Sequence[Path]) -> tuple[dict[Path, Pat
     count = len(apart) - 1
     said = f"colour of {count} frames is the nearest by the times in their names, up to {max(apart)} away"
     return pairs, said if count else ""
+
+
+def has_alone_between(colors: Sequence[Path], taken: Iterable[Path]) -> bool:
+    """Whether a colour picture lies without depth between others that have some."""
+    with_depth = set(taken)
+    places = [place for place, file in enumerate(sorted(colors, key=in_time)) if file in with_depth]
+    return len(places) > 0 and places[-1] - places[0] + 1 > len(places)
 
 
 def _key(file: Path) -> str:
