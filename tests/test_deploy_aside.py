@@ -357,3 +357,31 @@ def test_a_hand_that_stands_with_its_palm_on_something_closes():
     assert [retry(state, True, felt_nm) for _ in range(STILL_STEPS)] == [None] * STILL_STEPS
     actions = [retry(state, True, felt_nm) for _ in range(CLOSING_STEPS)]
     assert all(action is not None and closes(action) for action in actions)
+
+
+def test_who_has_lifted_something_may_step_aside_at_the_next():
+    retry, felt_nm, begun = Retry(), pressed(LOW, (0.0, RIM_M, 0.0)), []
+    lifted = HIGH + np.array([0, 0.09, 0, 0.53, 0, -0.58, 0])
+    for q_rad, width_m, steps in ((LOW, OPEN, 500), (lifted, HOLDING, 100), (LOW, OPEN, 500)):
+        for _ in range(steps):
+            retry(np.append(q_rad, width_m), False, felt_nm if width_m == OPEN else None)
+            begun.append(retry.begun)
+    assert begun.count(LIFTED) == 1 and begun.count(STEPS_ASIDE) == 2 * ASIDES
+
+
+def test_an_arm_that_does_not_move_does_not_try_for_ever():
+    aside = Aside(LOW, AT_RIM, grip_position(LOW))
+    for _ in range(30):
+        if not (aside.ended or aside.failed):
+            aside(LOW, False, False, NOWHERE)
+    assert aside.failed
+
+
+def test_a_soft_arm_that_slid_away_steps_aside_from_where_it_was_to_be():
+    aside, along = Aside(LOW, AT_RIM, grip_position(LOW)), grip_pose(LOW)[:3, 1]
+    slid_m = np.append(0.012 * along, np.zeros(3))
+    slid_rad = under_way(aside, 0.01)
+    slid_rad = slid_rad + np.linalg.pinv(grip_jacobian(slid_rad)) @ slid_m
+    aside(slid_rad, True, False, AT_RIM)
+    gone_m = grip_position(flown(aside, slid_rad, lambda grip_m: False)) - grip_position(LOW)
+    assert aside.tries == 2 and gone_m @ along == pytest.approx(2 * ASIDE_M, abs=NEAR_M)

@@ -35,6 +35,7 @@ from deploy.devices.fr3_imager import Fr3Imager, nominal_lens
 from deploy.devices.options import SessionOptions
 from deploy.devices.realsense_imager import lens_of
 from deploy.interfaces import CameraError, RobotError
+from deploy.safety import SafetyLimits
 from deploy.session import for_devices
 from deploy.setup import safety_filter
 from deploy_support import HOME_RAD, KinematicRobot
@@ -635,3 +636,47 @@ def test_the_board_command_writes_a_page_and_refuses_other_files(tmp_path, capsy
     assert main(["calibrate", "board", "--out", str(tmp_path / "b.docx")]) == 2
     assert main(["calibrate", "board", "--board.square-mm", "90"]) == 2
     assert "fits no page of A4, A3" in capsys.readouterr().err
+
+
+def test_the_calibration_of_another_robot_s_camera_is_not_taken(tmp_path):
+    path = tmp_path / "cal.json"
+    standing.save(path, standing.Calibration("2026-11-23", "realsense", "10.0.0.7", nominal_pose(), 0.1))
+    named = SessionOptions("franka", "realsense", calibration=path)
+    with pytest.raises(UserError, match=r"the robot at 10\.0\.0\.7, not of 'realsense' at 172\.16\.0\.2"):
+        standing.standing(CONFIG, named)
+
+
+WIDE = SafetyLimits(
+    workspace_lower_m=(-1.0,) * 3, workspace_upper_m=(1.0,) * 3, arm_lower_m=(-2.0,) * 3,
+    arm_upper_m=(2.0,) * 3,
+)  # fmt: skip
+
+
+def roomy(**limits) -> poses.Bench:
+    return poses.Bench(replace(WIDE, **limits), LENS, nominal_pose(), BOARD)
+
+
+def test_no_pose_has_a_part_of_the_arm_outside_its_box():
+    assert poses.is_free(roomy(), HOME_RAD)
+    assert not poses.is_free(roomy(arm_lower_m=(-0.05, -2.0, -2.0)), HOME_RAD), "the shoulder's back"
+    assert not poses.is_free(roomy(arm_upper_m=(2.0, 2.0, 0.6)), HOME_RAD), "the elbow's top"
+
+
+def test_the_board_keeps_off_the_table_and_the_walls():
+    corners = (kinematics.grip_pose(HOME_RAD) @ BOARD.held_pose() @ np.c_[BOARD.outline_m(), np.ones(4)].T)[
+        :3
+    ]
+    low, far = corners[2].min(), corners[0].max()
+    for room_m, free in ((0.01, False), (0.03, True)):
+        assert poses.is_free(roomy(arm_lower_m=(-2.0, -2.0, low - room_m)), HOME_RAD) == free
+    for room_m, free in ((-0.005, False), (0.005, True)):
+        assert poses.is_free(roomy(arm_upper_m=(far + room_m, 2.0, 2.0)), HOME_RAD) == free
+
+
+def test_a_way_is_free_only_if_all_of_it_is():
+    aside = np.array([0.8, 0, 0, 0, 0, 0, 0])
+    far_m = kinematics.grip_position(HOME_RAD)[0] - 0.02
+    narrow = roomy(workspace_upper_m=(far_m, 1.0, 1.0))
+    assert poses.is_free(narrow, HOME_RAD - aside) and poses.is_free(narrow, HOME_RAD + aside)
+    assert not poses.is_free_way(narrow, HOME_RAD - aside, HOME_RAD + aside)
+    assert poses.is_free_way(roomy(), HOME_RAD - aside, HOME_RAD + aside)

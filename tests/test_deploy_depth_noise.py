@@ -308,3 +308,24 @@ def test_the_tutorials_maniskill_runs():
     depth = picture["depth"]
     assert tuple(depth.shape) == (1, 180, 320, 1) and str(depth.dtype) == "torch.float32"
     assert 0.01 < float((depth == 0).float().mean()) < 0.9
+
+
+def test_another_seed_draws_other_noise(generator, scene):
+    one, other = (generator.noise(1, seed=seed).next() for seed in (1, 2))
+    assert not np.array_equal(one, other)
+    one, other = (DepthGenerator(FILE, threads=1, seed=seed)(scene) for seed in (5, 6))
+    assert not np.array_equal(one, other)
+
+
+def test_a_shape_that_is_nearly_the_generator_s_is_refused(generator):
+    height, width = generator.info.height_px, generator.info.width_px
+    generator.check_shape(height, round(1.015 * width))
+    with pytest.raises(UserError, match="render with that aspect ratio"):
+        generator.check_shape(height, round(1.04 * width))
+
+
+def test_a_scene_nearer_than_the_camera_reads_is_warned_of_too(scene):
+    generator = DepthGenerator(FILE, threads=1)
+    near_m = generator.info.camera["near_m"]
+    with pytest.warns(UserWarning, match="lies outside of the"):
+        generator(np.full_like(scene, 0.9 * near_m))

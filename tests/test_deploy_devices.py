@@ -711,3 +711,51 @@ def test_an_arm_is_not_asked_for_where_nobody_can_answer(robot, monkeypatch, tmp
     with pytest.raises(UserError, match=f"'{robot}' asks .*nobody can be asked here: give --yes"):
         deploy(get_preset("debug"), policy, options, said.append)
     assert said == []
+
+
+class Follows(ScriptedSpring):
+    def follow(self, q_target_rad, soft=False, heeds=True):
+        self.told.append("follow")
+
+
+def test_an_arm_that_is_held_again_stays_and_after_a_command_brakes_again():
+    robot, spring = _connected(poll_motion=lambda: None, state=SimpleNamespace(q=HOME_RAD)), Follows()
+    robot._following, robot._moved = spring, True
+    robot._hand = SimpleNamespace(set=lambda close: None)  # type: ignore[assignment]
+    for told in (robot.hold, robot.hold, lambda: robot.command(HOME_RAD, False), robot.hold):
+        told()
+    assert spring.told == ["stay", "follow", "stay"]
+
+
+@pytest.mark.parametrize(("dynamics", "start", "share"), [(0.2, 0.05, 0.25), (0.02, 0.05, 1.0)])
+def test_the_way_to_the_start_is_no_faster_than_the_arm_may_go(monkeypatch, dynamics, start, share):
+    robot = _connected(FrankaConfig(dynamics=dynamics, start_dynamics=start))
+    moved, asked = [], []
+    robot._arm = SimpleNamespace(
+        state=SimpleNamespace(q=np.asarray(HOME_RAD) + 0.5),
+        move=lambda motion, asynchronous: moved.append(motion),
+    )
+    robot._confirm = asked.append
+    for name, does in (
+        ("_home", lambda _: None),
+        ("_to", lambda q, **how: how),
+        ("_wait_at_start", lambda s: None),
+    ):
+        monkeypatch.setattr(robot, name, does)
+    robot._go_to_start(None)
+    assert moved == [{"relative_dynamics_factor": pytest.approx(share)}]
+    assert f"at {100 * min(dynamics, start):.2g} % of its speed" in asked[0]
+
+
+def test_the_hand_grasps_with_the_configured_force_whatever_the_width():
+    told: list = []
+    gripper = SimpleNamespace(
+        width=0.08, grasp=lambda *how, **also: told.append((how, also)), stop=lambda: None
+    )
+    hand = FrankaHand(gripper, (KeyError,), 33.0)
+    hand.set(True)
+    until(lambda: told)
+    hand.stop()
+    (width_m, speed_m_s, force_n), also = told[0]
+    assert (width_m, speed_m_s, force_n) == (0.0, contract.GRIPPER_SPEED_M_S, 33.0)
+    assert also["epsilon_outer"] > contract.GRIPPER_MAX_WIDTH_M

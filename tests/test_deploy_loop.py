@@ -387,3 +387,9 @@ def test_events_beyond_those_kept_are_counted(tmp_path):
     loop, *_ = make_loop(tmp_path, script)
     report = loop.run(max_steps=len(script))
     assert len(report.events) == KEPT_EVENTS and report.events_dropped > 5
+
+
+def test_a_frame_without_a_time_holds(tmp_path):
+    loop, robot, _ = make_loop(tmp_path, [depth_mm(), (depth_mm(), np.nan), depth_mm()])
+    assert loop.run(max_steps=3).events[0].reason == "stale frame: nan ms old"
+    assert robot.calls == ["start", "command", "hold", "command", "stop"]

@@ -9,7 +9,7 @@ from ddgrasp import contract
 from deploy import kinematics
 from deploy.clock import SimClock
 from deploy.loop import ControlLoop, LoopSettings
-from deploy.pace import Pace
+from deploy.pace import LONGEST_STEPS, Pace
 from deploy.policy import OnnxPolicy
 from deploy.safety import SafetyFilter, SafetyLimits
 from deploy_support import HOME_RAD, KinematicRobot, ScriptedCamera, depth_mm, describe, write_policy
@@ -90,3 +90,12 @@ def test_what_is_left_is_of_what_a_policy_may_ask_for(beyond):
     pace.made(q_rad, action, cut=True)
     np.testing.assert_allclose(pace.rest(q_rad + 0.04)[:7], 0.6)
     assert pace.made(q_rad + 0.04, action, cut=False) and pace.rest(q_rad) is None
+
+
+def test_an_action_has_so_many_steps_and_no_more():
+    pace, action, made = Pace(SCALE_RAD), np.full(contract.ACTION_SIZE, 1.0), []
+    for step in range(LONGEST_STEPS):
+        q_rad = np.array(HOME_RAD) + 0.002 * step
+        pace.rest(q_rad)
+        made.append(pace.made(q_rad, action, cut=True))
+    assert made == [False] * (LONGEST_STEPS - 1) + [True]

@@ -379,3 +379,28 @@ def test_the_loop_says_what_the_arm_feels(tmp_path):
     events = loop.run(4).events
     assert [(event.step, event.kind) for event in events] == [(FELT_STEPS - 1, "retry")]
     assert events[0].reason == "a finger of the open hand is on something; steps aside"
+
+
+@pytest.mark.parametrize(("width_m", "empty"), [(0.004, True), (0.008, False)])
+def test_a_shut_hand_does_not_say_quite_zero_and_something_thin_is_held(width_m, empty):
+    retry = Retry()
+    told(retry, LOW, width_m, EMPTY_STEPS)
+    assert ("on nothing" in retry.begun) == empty
+
+
+def test_fingers_that_meet_hold_nothing():
+    retry = Retry()
+    told(retry, LOW, OPEN, STILL_STEPS + 1)
+    for width_m in (0.05, 0.02, *[SHUT] * 4):
+        assert retry(state(LOW, width_m)) is not None and not retry.begun
+
+
+def test_the_loop_says_what_the_fingers_were_told(tmp_path):
+    """Something nearly as wide as the open hand is held, not stood at."""
+    clock, info = SimClock(), describe()
+    robot = KinematicRobot(clock)
+    robot.read_state = lambda: RobotState(LOW, 0.072, clock.now())
+    policy = OnnxPolicy(write_policy(tmp_path / "p.onnx", info, bias=constant_bias(0.0, gripper=1.0)))
+    camera, safety = ScriptedCamera(clock, [depth_mm()]), SafetyFilter(SafetyLimits(), 0.1)
+    loop = ControlLoop(camera, robot, policy, safety, clock, LoopSettings(0.1, retry=True))
+    assert loop.run(STILL_STEPS + 2).events[0].reason == "it has held something for 1 s; lifts it"

@@ -288,3 +288,23 @@ def test_a_joint_comes_to_its_limit_no_faster_than_it_can_brake():
         assert (q[0] - before) / 0.1 <= max(-0.30 + np.sqrt(12.0 * room), 0.0) + 1e-9
     assert 0.005 < room < 0.02
     assert filter_.target(q, action(-1.0))[0][0] == pytest.approx(q[0] - 0.1), "away from it at once"
+
+
+def test_the_elbow_stays_off_a_wall_to_its_left():
+    limits = SafetyLimits(acceleration_rad_s2=(1e6,) * 7, arm_upper_m=(0.95, 0.25, 1.3))
+    filter_, q, causes = SafetyFilter(limits, 0.1), HOME, []
+    for _ in range(40):
+        q, _, why = filter_.target(q, action(0.3, 0.0, 0.5))
+        causes += why
+    reach = kinematics.part_centers(q)[:, 1] + kinematics.PART_RADII_M
+    assert reach.max() <= 0.25 and "arm" in causes
+
+
+def test_a_joint_that_brakes_comes_back_from_outside_of_its_range():
+    arm, q = contract.FR3, HOME.copy()
+    limits = replace(
+        FREE, upper_rad=arm.joint_upper_rad, braking_rad_s2=arm.braking_rad_s2,
+        braking_reserve_rad_s=arm.braking_reserve_rad_s,
+    )  # fmt: skip
+    q[0] = arm.joint_upper_rad[0] + 0.03
+    assert SafetyFilter(limits, 0.1).target(q, action(1.0))[0][0] == pytest.approx(arm.joint_upper_rad[0])

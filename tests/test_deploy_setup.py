@@ -114,3 +114,10 @@ def test_a_real_arm_brakes_before_its_limits_as_its_maker_says(model):
     assert limits.braking_rad_s2 == arm.braking_rad_s2
     assert limits.braking_reserve_rad_s == arm.braking_reserve_rad_s and min(arm.braking_reserve_rad_s) > 0
     assert safety_filter(config, describe(), "sim").limits.braking_rad_s2 is None
+
+
+def test_a_hand_that_is_not_moved_does_not_try_again():
+    config = DeployConfig(retry=True)
+    assert (
+        loop_settings(config, describe()).retry and not loop_settings(config, describe(), moves=False).retry
+    )

@@ -3,6 +3,7 @@
 Before an arm of plain values, which says what it feels; tests/test_deploy_fr3.py has one that really touches.
 """
 
+import itertools
 import threading
 import time
 from types import SimpleNamespace
@@ -10,7 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from deploy.devices.franka_spring import DAMPING_S, FRICTION_NM, SOFT, WEIGHTS, FrankaSpring
+from deploy.devices import franka_spring
+from deploy.devices.franka_spring import DAMPING_S, FRICTION_NM, SOFT, WEIGHTS, FrankaSpring, touched
 
 STIFFNESS = 400.0
 STEP = np.full(7, 0.05)
@@ -198,3 +200,23 @@ def test_the_watch_ends_with_the_connection(spring, arm):
     arm.lost.set()
     spring._watch.join(2.0)
     assert not spring._watch.is_alive()
+
+
+def test_an_elbow_that_touches_something_is_felt_too(arm):
+    """No force at the hand; the second joint's torque is above its threshold."""
+    state = arm.state
+    assert not touched(state)
+    state.joint_contact = np.array([0.0, 1.0, 0, 0, 0, 0, 0])
+    state.tau_ext_hat_filtered = np.array([0.0, -9.0, 0, 0, 0, 0, 0])
+    assert touched(state) == "0 N and 0 N m at the hand, 9 N m on joint 2"
+
+
+def test_an_arm_that_somebody_pushes_is_let_go_all_the_same(arm, monkeypatch):
+    monkeypatch.setattr(franka_spring, "BRAKES_S", 0.05)
+    spring = FrankaSpring(FRANKY, arm, STIFFNESS)
+    arm.brakes = itertools.repeat(1.0)
+    stopping = threading.Thread(target=spring.stop, daemon=True)
+    stopping.start()
+    stopping.join(5.0)
+    moves, arm.brakes = stopping.is_alive(), iter(())
+    assert not moves
