@@ -386,6 +386,7 @@ def test_the_kept_logs_give_the_pairs_of_the_page(tmp_path, kept, rows_and_p):
         assert [holes[f"{row}_ellipses"] for row in ("sim_gt", "rand_noise", "ddg")] == [
             (62, 37), (42, 42), (30, 43),
         ]  # fmt: skip
+        assert _pairs(of["tables"]["formulas"])["rand_noise_normal"] == (125, 9)
         filled = _pairs(of["tables"]["filled"])
         kinds = (
             "rand_noise_filled",

@@ -235,6 +235,13 @@ BY_HAND: dict[int, tuple[str, tuple[tuple[str, object, str, object], ...]]] = {
             ("ddg.graft.window_px", 5.0, "ddg.graft.window_px", 5.0),
         ),
     ),
+    18: (
+        "table2/rand_noise_normal",
+        (
+            ("student.dextrah_normal_m", 0.01, "student.dextrah_normal_m", 0.01),
+            ("student.depth_source", "dextrah", "student.depth_source", "dextrah"),
+        ),
+    ),
 }
 """Version -> a manifest of it in pretrained/, and (field there, its value, field today, its value)."""
 
