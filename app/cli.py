@@ -147,7 +147,7 @@ def _one_line(error: BaseException) -> str | None:
     cause: BaseException | None = error
     while cause is not None:
         full = isinstance(cause, OSError) and cause.errno in _DISK_FULL
-        if full or os.strerror(errno.ENOSPC) in str(cause):
+        if full or any(os.strerror(number) in str(cause) for number in _DISK_FULL):
             where = f" at {cause.filename}" if isinstance(cause, OSError) and cause.filename else ""
             return (
                 f"No space left on the disk{where}: free some and give the same command again, with --resume "

@@ -23,6 +23,8 @@ STORE = "episodes.zarr"
 _ENDS = "episode_ends"
 _IMAGE_CHUNK = 16
 _ROW_CHUNK = 4096
+_GONE = (FileNotFoundError, NotADirectoryError)
+"""What of the operating system's errors says that a store is damaged: no full disk, no lack of rights."""
 
 
 class EpisodeStore:
@@ -42,7 +44,7 @@ class EpisodeStore:
             self._root = zarr.open_group(str(path), mode="a" if create else "r")
             self._data = self._root.require_group("data") if create else _group(self._root, "data")
             self._meta = self._root.require_group("meta") if create else _group(self._root, "meta")
-        except (KeyError, ValueError, OSError) as error:
+        except (KeyError, ValueError, *_GONE) as error:
             raise UserError(
                 f"The episode store {path} is damaged ({error}): delete it and collect again."
             ) from None
@@ -69,8 +71,9 @@ class EpisodeStore:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Names of the per-step arrays."""
-        return tuple(sorted(self._data.array_keys()))
+        """Names of the per-step arrays. Raises UserError if one is damaged."""
+        with self._readable("data"):
+            return tuple(sorted(self._data.array_keys()))
 
     def steps(self, field: str, first: int = 0, last: int | None = None) -> np.ndarray:
         """Per-step array of the complete episodes, or rows first..last of it."""
@@ -98,7 +101,7 @@ class EpisodeStore:
         """UserError for what Zarr raises of damaged files."""
         try:
             yield
-        except (KeyError, ValueError, OSError, RuntimeError) as error:
+        except (KeyError, ValueError, RuntimeError, *_GONE) as error:
             raise UserError(
                 f"{self.path}: {what} cannot be read ({error}). Delete {self.path.parent} and make it again."
             ) from None
@@ -106,11 +109,14 @@ class EpisodeStore:
     def append(self, steps: Mapping[str, np.ndarray], episode: Mapping[str, ArrayLike]) -> None:
         """Adds one episode: arrays (T, ...) per step and (...) per episode.
 
-        Raises UserError, and leaves what is there, for steps of other fields, sizes or types than it has.
+        Raises UserError, and leaves what is there, for steps of other fields, sizes or types than it has, and
+        where the file that they go into is damaged.
         """
         self._check(steps)
         ends = self.ends
         start, length = (int(ends[-1]) if len(ends) else 0), len(next(iter(steps.values())))
+        for name in steps.keys() if start else ():
+            self._read("data", name, start - 1, start)  # what is written into has to be whole
         for name, value in steps.items():
             if name not in self._data:
                 _create(self._data, name, value, self._codecs)

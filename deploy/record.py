@@ -196,8 +196,11 @@ class DeploymentRecord:
             pass
 
     def _taken(self, folder: Path) -> Iterator[_Frame]:
-        """The frames that `look` puts there, until `into` ends; a line of every step goes into `folder`."""
+        """The frames that `look` puts there, until `into` ends; a line of every step goes into `folder`. The
+        report of an attempt before is taken away: a kill would leave it beside other steps."""
         path, mode = folder / STEPS_FILE, "w"
+        with suppress(OSError):
+            (folder / REPORT_FILE).unlink()
         while (taken := self._queue.get()) is not None:
             row, frame = taken
             with suppress(OSError, ValueError):  # `finish` writes them all, and says why it cannot

@@ -8,6 +8,7 @@ from typing import Any
 
 from ddgrasp import contract
 from ddgrasp.config import Config
+from ddgrasp.errors import Trouble
 from deploy.interfaces import Filmed
 from deploy.loop_report import Step
 from deploy.policy import OnnxPolicy
@@ -57,6 +58,8 @@ class RecordingBench:
             result, film = self._bench.run(trial, look)
         for record in kept:
             record.finish(folder, _report(result), result.success, about)
+            if record.lost:  # not logged, so that the same command runs it again
+                raise Trouble(f"{folder}: pictures are not kept ({record.lost}): give the command again.")
         return result, film
 
     def close(self) -> None:

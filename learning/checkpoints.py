@@ -58,7 +58,9 @@ class Checkpoints:
         for step in sorted(self._manager.all_steps(), reverse=True):
             try:
                 restored: Any = self._manager.restore(step, args=ocp.args.StandardRestore(target))
-            except UNREADABLE as error:
+            except Exception as error:
+                if not isinstance(error, UNREADABLE) and type(error) is not Exception:
+                    raise  # a bare one is Orbax's, of a file of array data that is torn
                 unread[step] = error
                 continue
             for damaged in unread:  # one of another configuration would have others beside it

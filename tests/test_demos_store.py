@@ -1,6 +1,9 @@
 """Episodes on disk survive interruption; what is whole stays readable."""
 
+import errno
+import os
 import shutil
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -144,3 +147,40 @@ def test_steps_of_another_kind_are_refused_and_spoil_nothing(tmp_path):
             store.append(steps, {"object_index": np.int32(0)})
     assert len(store) == 1
     np.testing.assert_array_equal(store.steps("depth_mm"), depth_mm)
+
+
+@pytest.mark.parametrize("damage", ["lost", "cut", "emptied"])
+def test_what_is_damaged_is_not_added_to(tmp_path, damage):
+    """A lost file would be made anew, with zeros where a finished episode was."""
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    store.append(*episode(20, 7))
+    file = tmp_path / "s.zarr" / "data" / "depth_mm" / "c" / "1" / "0" / "0"
+    if damage == "lost":
+        file.unlink()
+    else:
+        file.write_bytes(file.read_bytes()[:10] if damage == "cut" else b"")
+    again = EpisodeStore(tmp_path / "s.zarr", create=True)
+    with pytest.raises(UserError, match="data/depth_mm cannot be read .* make it again"):
+        again.append(*episode(5, 8))
+    assert len(EpisodeStore(tmp_path / "s.zarr")) == 1
+
+
+def test_a_damaged_description_of_a_field_is_one_line(tmp_path):
+    EpisodeStore(tmp_path / "s.zarr", create=True).append(*episode(3, 7))
+    (tmp_path / "s.zarr" / "data" / "action" / "zarr.json").write_text("")
+    with pytest.raises(UserError, match="data cannot be read"):
+        print(EpisodeStore(tmp_path / "s.zarr").fields)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES, errno.EIO])
+def test_a_full_disk_and_a_lack_of_rights_are_not_called_damage(tmp_path, monkeypatch, number):
+    """Whoever is told to delete a store and make it again does."""
+    EpisodeStore(tmp_path / "s.zarr", create=True).append(*episode(3, 7))
+    failing = Mock(side_effect=OSError(number, os.strerror(number)))
+    store = EpisodeStore(tmp_path / "s.zarr")
+    monkeypatch.setattr("demos.store._check_chunks", failing)
+    with pytest.raises(OSError, match=os.strerror(number)):
+        store.steps("action")
+    monkeypatch.setattr("demos.store.zarr.open_group", failing)
+    with pytest.raises(OSError, match=os.strerror(number)):
+        EpisodeStore(tmp_path / "s.zarr")

@@ -1,5 +1,6 @@
 """Trials that are kept: a deployment's folder each, and the same trials as without."""
 
+import errno
 import json
 import os
 import signal
@@ -8,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,8 +17,10 @@ import pytest
 from app.lerobot.source import open_source
 from ddgrasp import policy_metadata as metadata
 from ddgrasp.config import Config, PictureConfig, StudentConfig, WorldConfig
-from ddgrasp.errors import UserError
+from ddgrasp.contract import D455
+from ddgrasp.errors import Trouble, UserError
 from ddgrasp.progress import Progress
+from deploy.record import DeploymentRecord
 from deploy.recorded import RecordedBench
 from deploy.trial_log import TrialLog
 from deploy.trials import Rig, Trial, TrialResult, run_trials
@@ -25,6 +29,7 @@ from evaluation import causes, rig_trials
 from evaluation.report import deployments
 from evaluation.rig_trials import Series
 from sensors.recordings.recording import Recording
+from sensors.recordings.writer import RecordingWriter
 
 CONFIG = Config(
     preset="test",
@@ -206,3 +211,26 @@ def test_a_worker_goes_when_its_parent_was_killed(tmp_path):
         except TimeoutError:
             os.kill(pid, signal.SIGKILL)
             raise
+
+
+def test_a_trial_whose_pictures_do_not_fit_is_not_logged_and_runs_again(tmp_path, policy, monkeypatch):
+    out, series = tmp_path / "out", Series("development", ("apple",), 1, seconds=0.4)
+    with monkeypatch.context() as full:
+        full.setattr(
+            RecordingWriter, "add", Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+        )
+        with pytest.raises(Trouble, match="pictures are not kept .*No space left.*: give the command again"):
+            rig_trials.run(CONFIG, policy, series, out, 0, Progress(quiet=True), record=True)
+    rig_trials.run(CONFIG, policy, series, out, 0, Progress(quiet=True), record=True)
+    (folder,) = (out / rig_trials.EPISODES).iterdir()
+    assert json.loads((folder / "report.json").read_text())["frames"] == 4
+
+
+def test_the_report_of_an_attempt_before_goes_with_the_first_step(tmp_path):
+    folder = tmp_path / "0001-apple"
+    folder.mkdir()
+    (folder / "report.json").write_text("{}")
+    record = DeploymentRecord(Mock(), D455, "rig", 1)
+    with record.into(folder):
+        pass
+    assert not (folder / "report.json").exists()

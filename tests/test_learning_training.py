@@ -183,6 +183,20 @@ def test_a_damaged_checkpoint_is_deleted_for_the_one_before(tmp_path, damage):
     assert sorted(path.name for path in (tmp_path / "c").iterdir()) == ["20", "30"]
 
 
+@pytest.mark.parametrize("damage", [cut, lambda file: file.write_bytes(b""), lambda file: file.unlink()])
+def test_a_torn_file_of_large_arrays_is_damage_too(tmp_path, damage):
+    """Orbax keeps small ones in its index, and raises of large ones what has no class of its own."""
+    rng = np.random.default_rng(0)
+    with Checkpoints(tmp_path) as saved:
+        for step in (1, 2):
+            saved.save(step, {"w": jnp.asarray(rng.normal(size=(step, 300, 1000)).astype(np.float32)[0])})
+    files = [file for file in (tmp_path / "2").rglob("*") if file.is_file()]
+    damage(max(files, key=lambda file: file.stat().st_size))
+    with Checkpoints(tmp_path) as saved:
+        restored = saved.restore({"w": jnp.zeros((300, 1000))})
+        assert saved.latest == 1 and restored["w"].shape == (300, 1000)
+
+
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_checkpoints_that_are_all_damaged_are_kept(tmp_path, damage):
     with Checkpoints(tmp_path) as saved:

@@ -110,6 +110,7 @@ class StudentPerception:
 
         series = Series("development", self.objects, self.trials, number=self.number)
         check_tried(series)
+        check_folder("RUN-DIR", self.run_dir / "student")
         progress = Progress(name="student perception")
         camera = self.camera
         if camera == "generator":
