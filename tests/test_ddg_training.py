@@ -335,3 +335,9 @@ def test_ancestral_sampler_and_bad_input(fitted, scene):
         sample.generate(jax.random.key(0), fitted, scene[:, :, :16])
     with pytest.raises(UserError, match="millimetres"):
         sample.generate(jax.random.key(0), fitted, scene * 1000)
+
+
+def test_a_shape_that_is_nearly_the_generator_s_is_refused():
+    sample.check_aspect((160, 243), TINY)
+    with pytest.raises(UserError, match="render with that aspect ratio"):
+        sample.check_aspect((160, 250), TINY)

@@ -349,3 +349,8 @@ def test_a_bare_fr3_stands_on_the_development_rig_s_ground(policy, tmp_path, ope
     ours, theirs = (seen[name].astype(int) for name in ("fr3", "development"))
     lower = slice(PROFILE.height_px // 2, None)  # below the arms: ground and object
     assert np.mean(np.abs(ours - theirs)[lower] <= 3) > 0.97
+
+
+def test_can_and_block_rest_as_their_meshes_do_in_every_row():
+    world = replace(CONFIG.world, random=replace(CONFIG.world.random, other_pose_share=0.5))
+    assert causes.one_pose(replace(CONFIG, world=world)).world.random.other_pose_share == 0.0

@@ -74,3 +74,18 @@ def test_repeats_by_hand():
     assert figures["repeat_iou"] == pytest.approx((1 + 1 / 3 + 1 / 3) / 3)
     assert figures["repeat_flicker"] == pytest.approx(2 / 32)
     assert figures["repeat_deviation_mm"] == pytest.approx(2 / 13, rel=1e-3)
+
+
+def test_readings_where_nothing_is_are_not_off_from_anything():
+    clean = np.full((1, 6, 10), 0.9, np.float32)
+    clean[0, 0] = 0.0
+    figures = holes.figures(sums(np.full_like(clean, 0.9), clean))
+    assert (figures["rmse_mm"], figures["outlier_share"]) == (0.0, 0.0)
+
+
+def test_a_gap_weighs_what_the_real_side_shows():
+    """A tenth of the real pixels is far, where the simulated side, most of which is, loses all."""
+    real, sim = (np.full((1, 10, 10), 0.55, np.float32) for _ in range(2))
+    real[0, 0], sim[0, 1:] = 1.7, 1.7
+    gaps = holes.gaps(sums(np.where(sim > 1, 0, sim), sim), sums(real, real))
+    assert gaps["gap_depth_m"] == pytest.approx(0.1)

@@ -211,3 +211,9 @@ def test_a_student_is_measured_beside_the_rig_s_truth_and_not_an_earlier_one(run
     capsys.readouterr()
     assert cli.main(command) == 2
     assert "export is of an earlier student: delete it" in capsys.readouterr().err
+
+
+def test_what_was_touched_and_lies_where_it_lay_has_been_touched():
+    seen = _seen([0.05, 0.0, 0.05], [0, 0.01, 0])
+    made = perception.errors(seen, _reported(seen, np.zeros(3), 0.0, [False] * 3))
+    assert made.touched.tolist() == [False, True, True]

@@ -152,3 +152,17 @@ def test_a_column_more_than_the_paper_has_is_drawn(monkeypatch):
     flat = {RAW: np.zeros((3, 2)), "sim_gt": np.ones((3, 2))}
     column = {"title": "mine", "real": RAW, "sim": "sim_gt", "fid": {"value": 1.0}, "mixing": {"value": 0.5}}
     assert draw_embedding(flat, {"sim_gt": column, "mine": column}, 1.0).startswith(b"\x89PNG")
+
+
+def test_what_is_scored_is_no_trajectory_that_a_stage_records():
+    class World:
+        def reset(self, seed, name):
+            raise LookupError(seed)
+
+    def world_of(number: int) -> int:
+        with pytest.raises(LookupError) as drawn:
+            score_data._record(PRESETS["debug"], "real", number, World(), None, None, False)
+        return drawn.value.args[0]
+
+    recorded = {int(np.random.default_rng([PRESETS["debug"].seed, i]).integers(2**31)) for i in range(100)}
+    assert not recorded & {world_of(number) for number in range(20)}

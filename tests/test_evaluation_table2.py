@@ -594,3 +594,19 @@ def test_trials_that_were_begun_otherwise_are_said_before_anything_is_made(tmp_p
 def test_without_out_a_study_has_a_folder_of_its_own():
     assert command().out == Path("runs") / "table2-debug"
     assert parse("run", ["--preset", "debug"]).out == Path("runs") / "debug"
+
+
+def test_a_row_without_a_common_trial_is_no_question_that_holm_counts():
+    def tried(first: int, won: bool) -> list[TrialResult]:
+        return [outcome(first + i, "apple", won) for i in range(8)]
+
+    made = results.compare(
+        TABLES["main"], {"ddg": tried(0, True), "sim_gt": tried(0, False), "rand_noise": tried(100, False)}
+    )
+    assert [row["row"] for row in made] == ["sim_gt"] and made[0]["p_holm"] == made[0]["p"] == 2 / 2**8
+
+
+def test_rows_without_holes_cut_by_hand_have_none_whatever_the_configuration():
+    holed = replace(LAPTOP, student=replace(LAPTOP.student, ellipse_dropout=2.0))
+    cut = {name: rows.row_config(holed, row).student.ellipse_dropout for name, row in ROWS.items()}
+    assert cut == {name: rows.ELLIPSES * row.ellipses for name, row in ROWS.items()}

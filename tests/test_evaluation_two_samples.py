@@ -125,3 +125,9 @@ def test_unknown_names_are_refused_with_the_nearest():
         ScoreConfig(columns=())
     with pytest.raises(UserError, match="score.trajectories is 1; expected at least 2"):
         ScoreConfig(trajectories=1)
+
+
+def test_of_many_maps_the_classifier_sees_some_of_either_set(monkeypatch):
+    monkeypatch.setattr(two_samples, "AUC_MAPS", 100)
+    auc, _ = two_samples.classifier_auc(sample(0, groups=20), sample(2, 4.0, 20, 200), [])
+    assert auc > 0.99
