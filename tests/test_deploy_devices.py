@@ -669,7 +669,7 @@ def test_sigterm_holds_and_stops_the_robot_as_ctrl_c_does(tmp_path, monkeypatch)
     assert report.interrupted and 2 < report.steps < 300
     assert robot.calls[-2:] == ["hold", "stop"] and camera.stopped
     assert said[-3].endswith("stop: interrupted; the robot holds position")
-    assert said[-1] == f"report: {next(tmp_path.glob('*/report.json'))}"
+    assert said[-2] == f"report: {next(tmp_path.glob('*/report.json'))}"
     assert signal.getsignal(signal.SIGTERM) is before
 
 
