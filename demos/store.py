@@ -37,7 +37,7 @@ class EpisodeStore:
 
     def __init__(self, path: Path | str, *, create: bool = False, compressed: bool = True):
         path = Path(path)
-        self._codecs = [_CODEC] if compressed else None
+        self._codecs, self._is_whole = [_CODEC] if compressed else None, False
         if not create and not (path / "zarr.json").exists():
             raise UserError(f"{path} is no episode store: collect one with `ddgrasp demos collect`.")
         try:
@@ -115,8 +115,10 @@ class EpisodeStore:
         self._check(steps)
         ends = self.ends
         start, length = (int(ends[-1]) if len(ends) else 0), len(next(iter(steps.values())))
-        for name in steps.keys() if start else ():
-            self._read("data", name, start - 1, start)  # what is written into has to be whole
+        if start and not self._is_whole:  # what is written into, by whoever opened it
+            for name in steps:
+                self._read("data", name, start - 1, start)
+            self._is_whole = True
         for name, value in steps.items():
             if name not in self._data:
                 _create(self._data, name, value, self._codecs)

@@ -72,7 +72,7 @@ class ControlLoop:
         try:
             self._camera.start()
             self._robot.start()
-            self._policy.warm_up()
+            self._policy.forget()
             moving = True
             self._keep_time(max_steps, on_step)
         except KeyboardInterrupt:

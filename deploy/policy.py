@@ -79,11 +79,11 @@ class OnnxPolicy:
         self._noise_kind = noise
         self.watch: Callable[[Depth, np.ndarray], None] | None = None
         """Is told the frames (3, H, W) and the state (9,) that the network gets in every call of `act`."""
-        self._try(seed)
-
-    def _try(self, seed: int) -> None:
-        """`reset`, after a run on blank frames: names and shapes may fit, and a type or a batch may not."""
         self.reset(seed)
+        self._try()
+
+    def _try(self) -> None:
+        """Raises UserError for a file that does not run: shapes may fit where a type or a batch does not."""
         try:
             self.warm_up()
         except Exception as error:  # onnxruntime raises classes of its own, without a common base

@@ -169,7 +169,7 @@ def test_a_damaged_description_of_a_field_is_one_line(tmp_path):
     EpisodeStore(tmp_path / "s.zarr", create=True).append(*episode(3, 7))
     (tmp_path / "s.zarr" / "data" / "action" / "zarr.json").write_text("")
     with pytest.raises(UserError, match="data cannot be read"):
-        print(EpisodeStore(tmp_path / "s.zarr").fields)
+        _ = EpisodeStore(tmp_path / "s.zarr").fields
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES, errno.EIO])

@@ -92,8 +92,8 @@ def run(
     if options.camera not in IMAGERS:
         raise unknown_name("camera", options.camera, IMAGERS)
     config = for_devices(config, session)
-    realsense = config.deploy.realsense.serial if options.camera == "realsense" else ""
-    _check_out(options, config.deploy.franka.host, realsense)
+    host = config.deploy.franka.host
+    _check_out(options, host, standing.named_serial(config, options.camera))
     info = policy_metadata.describe(config.student, config.export, config.world.profile)
     clock: Clock = RobotClock() if config.deploy.clock == "robot" else RealClock()
     confirm = (lambda question: None) if options.yes else ask_person
@@ -110,7 +110,7 @@ def run(
     driver = Driver(robot, safety, clock, min(options.speed_rad_s, *config.deploy.franka.speed_rad_s))
     with terminable(), _started(imager, robot, say) as start_robot:
         bench = poses.Bench(safety.limits, imager.lens(), nominal_pose(), options.board)
-        _check_out(options, config.deploy.franka.host, _serial(imager))
+        _check_out(options, host, _serial(imager))
         check_start(safety)
         say(space_notice(config.deploy))
         say(f"looking for: {options.board.describe()}")

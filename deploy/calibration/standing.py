@@ -111,9 +111,8 @@ def standing(config: Config, options: SessionOptions, trained: Mapping[str, Any]
         return Standing(_assumed("not calibrated", place, spread))
     found, host = load(path), config.deploy.franka.host
     camera = "rig" if options.camera == "rig-ideal" else options.camera
-    serial = config.deploy.realsense.serial if camera == "realsense" else ""
-    other = found.serial and serial and found.serial != serial
-    if (found.camera, found.host) != (camera, host) or other:
+    serial = named_serial(config, camera)
+    if not _is_of(found, camera, host, serial):
         unlike = f"{path} is of camera {_numbered(found.camera, found.serial)} and the robot at {found.host}"
         if options.calibration is not None:
             asked = f"{_numbered(camera, serial)} at {host}"
@@ -192,9 +191,7 @@ def check_own(path: Path, camera: str, host: str, serial: str = "") -> None:
         there = load(path) if path.exists() else None
     except UserError:
         return
-    if there is None:
-        return
-    if (there.camera, there.host) != (camera, host) or (there.serial and serial and there.serial != serial):
+    if there is not None and not _is_of(there, camera, host, serial):
         own = f"{_numbered(there.camera, there.serial)} and the robot at {there.host!r}"
         raise UserError(
             f"{path} is of camera {own}: name another file for {_numbered(camera, serial)} and {host!r}, "
@@ -205,6 +202,17 @@ def check_own(path: Path, camera: str, host: str, serial: str = "") -> None:
 def now() -> str:
     """ISO 8601, local time, seconds."""
     return time.strftime("%Y-%m-%dT%H:%M:%S%z")
+
+
+def named_serial(config: Config, camera: str) -> str:
+    """The serial number that `camera`, as `--camera` names it, is asked for by; empty for any."""
+    return config.deploy.realsense.serial if camera == "realsense" else ""
+
+
+def _is_of(calibration: Calibration, camera: str, host: str, serial: str) -> bool:
+    """Whether it was measured of these; a serial number that one side does not know fits every other."""
+    own = calibration.serial or serial
+    return (calibration.camera, calibration.host, own) == (camera, host, serial or own)
 
 
 def _numbered(camera: str, serial: str) -> str:

@@ -109,7 +109,10 @@ def along_normals(
     depth_m: Float[Array, "H W"], noise_m: Float[Array, "H W"], profile: CameraProfile
 ) -> Float[Array, "H W"]:
     """z'(v, u) = z + noise n_z: each pixel's point moved along the normal that it and its neighbours to the
-    right and below have (DextrAH-G's published code). (H, W) each; holes and what is beside one stay.
+    right and below have. (H, W) each; holes and what is beside one stay.
+
+    After DextrAH-G's published code, whose camera matrix makes what is tilted steeper than it is, and so
+    moves it less in depth.
     """
     height, width = depth_m.shape
     u = (jnp.arange(width)[None, :] - profile.cx_px) / profile.fx_px
