@@ -1,5 +1,6 @@
 """The built-in prior and the loading of recordings, by value on small pictures."""
 
+import gc
 import shutil
 import tracemalloc
 from dataclasses import replace
@@ -407,7 +408,8 @@ def test_one_long_recording_takes_what_is_said_of_it(tmp_path):
     _record(tmp_path / "long", frames=50, size=(54, 96))
     _record(tmp_path / "short", frames=1, size=(54, 96))
     config = DDGConfig(depth=DDGDepthConfig(height_px=54, width_px=96))
-    load(tmp_path / "short", config)  # what compiling takes is not the recording's
+    load(tmp_path / "short", config)  # what compiling takes is not the recording's,
+    gc.collect()  # nor what another test has left, to be told in pages of traceback
     tracemalloc.start()
     try:
         frames, _ = load(tmp_path / "long", config)
