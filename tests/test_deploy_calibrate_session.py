@@ -673,6 +673,11 @@ def test_the_board_keeps_off_the_table_and_the_walls():
         assert poses.is_free(roomy(arm_upper_m=(far + room_m, 2.0, 2.0)), HOME_RAD) == free
 
 
+def test_the_board_keeps_off_the_arm():
+    folded = HOME_RAD + np.array([0, 0, 0, 0, 0, -1.8, 0])  # the hand turned back to the forearm
+    assert poses.is_free(roomy(), HOME_RAD) and not poses.is_free(roomy(), folded)
+
+
 def test_a_way_is_free_only_if_all_of_it_is():
     aside = np.array([0.8, 0, 0, 0, 0, 0, 0])
     far_m = kinematics.grip_position(HOME_RAD)[0] - 0.02

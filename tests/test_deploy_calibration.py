@@ -101,6 +101,15 @@ def test_a_view_in_which_the_board_slipped_is_left_out():
     assert found.view_rms_px[4] > 3 and np.isnan(found.view_rms_px[7]) and error(found.T_base_cam)[0] < 0.5
 
 
+def test_views_that_are_too_few_once_outliers_are_left_out_are_refused():
+    views = synthetic_views(np.random.default_rng(6), count=7)
+    for slipped, turn_deg in ((1, 4), (4, -5)):
+        slip = pose((0, turn_deg, 0), (0.01, 0, 0))
+        views[slipped] = View(views[slipped].T_base_grip @ slip, views[slipped].corners)
+    with pytest.raises(UserError, match=r"5 of 7 views can be used .*at least 6"):
+        calibrate(views, LENS, BOARD)
+
+
 def test_a_view_of_a_single_line_of_corners_is_left_out():
     views = synthetic_views(np.random.default_rng(6))
     line = np.arange(0, 24, 4)

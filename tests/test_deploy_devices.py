@@ -20,7 +20,7 @@ from ddgrasp import contract
 from ddgrasp.config import CAMERAS, ROBOTS, FrankaConfig
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
-from deploy import session
+from deploy import kinematics, session
 from deploy.clock import SimClock
 from deploy.devices import franka_faults, franka_hand, franka_probe, franka_robot, registry
 from deploy.devices.franka_hand import FrankaHand, HandError
@@ -745,6 +745,21 @@ def test_the_way_to_the_start_is_no_faster_than_the_arm_may_go(monkeypatch, dyna
     robot._go_to_start(None)
     assert moved == [{"relative_dynamics_factor": pytest.approx(share)}]
     assert f"at {100 * min(dynamics, start):.2g} % of its speed" in asked[0]
+
+
+@pytest.mark.parametrize(
+    ("joint_2_rad", "low_m", "way"),
+    [
+        (0.1, -0.01, (False, True)),
+        (0.01, -0.01, (False, False)),
+        (-0.1, -0.01, (True, False)),
+        (-0.1, 1.0, (True, False)),
+    ],
+)
+def test_a_step_that_ends_low_may_land_and_one_that_goes_up_may_not(joint_2_rad, low_m, way):
+    below_m = float(kinematics.grip_position(HOME_RAD)[2]) + low_m
+    robot = _connected(FrankaConfig(approach_below_m=below_m), state=SimpleNamespace(q=HOME_RAD))
+    assert robot._way(HOME_RAD + joint_2_rad * np.eye(7)[1]) == way
 
 
 def test_the_hand_grasps_with_the_configured_force_whatever_the_width():
