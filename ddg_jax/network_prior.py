@@ -131,7 +131,8 @@ def metric_depth(
 ) -> Float32[np.ndarray, "*x"]:
     """The monocular baseline: depth in metres from relative inverse depth, fitted to what a camera measured.
 
-    1 / d = a relative + b by least squares over the valid pixels (Ranftl et al. 2020, eq. 4), d <= `far_m`.
+    1 / d = a relative + b by least squares over the valid pixels (Ranftl et al. 2020, eq. 4), d <= `far_m`;
+    a >= 0, since a network that tells nothing there, or takes near for far, tells no more than the mean.
 
     Args:
       relative: relative inverse depth.
@@ -141,4 +142,6 @@ def metric_depth(
     if np.count_nonzero(valid) < FEWEST_VALID:
         raise UserError("Relative depth cannot be made metric: the measured depth has no two valid pixels.")
     scale, shift = fit_scale_shift(relative[valid], 1 / depth_m[valid])
+    if scale <= 0 or np.ptp(relative[valid]) == 0:
+        scale, shift = 0.0, float(np.mean(1 / depth_m[valid]))
     return (1 / np.maximum(scale * relative + shift, 1 / far_m)).astype(np.float32)

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.errors import UserError
+from mjx_envs.object_checks import check_rgb, check_thing
 
 _HIDDEN_M = 0.001
 _AXIS_POINTS = 33
@@ -29,6 +30,7 @@ MOST_REACH_M = 0.14
 and objects of random size are up to 5 % larger by default."""
 PAD_HALF_WIDTH_M = 0.0105
 """A finger's pad, across the closing direction."""
+
 
 Factor = Float[AnyArray, ""] | float
 Vector = tuple[float, float, float]
@@ -136,15 +138,6 @@ class RestPose:
     """As the object's own, in this pose."""
 
 
-def check_symmetry(name: str, symmetry: int) -> None:
-    """UserError for a `grasp_symmetry` that no parallel hand has."""
-    if symmetry < 0 or symmetry % 2:
-        raise UserError(
-            f"{name}: grasp_symmetry is {symmetry}; expected 0 or an even number: the hand turned by half a "
-            "turn grasps the same way, so that an object without symmetry has 2."
-        )
-
-
 def _reach_m(part: Box | Capsule) -> float:
     """Largest distance of a surface point from the part's middle along an axis of its own."""
     if isinstance(part, Box):
@@ -216,15 +209,17 @@ class ObjectSpec:
         wider than the hand opens, of a symmetry that a parallel hand has not, or too long to collide."""
         if self.box is None and not self.capsules:
             raise UserError(f"{self.name}: nothing of it collides: give it a box or capsules.")
-        for what, value in (("mass_kg", self.mass_kg), ("friction", self.friction)):
-            if not value > 0.0:
-                raise UserError(f"{self.name}: {what} is {value:g}; expected more than 0.")
+        check_thing(self.name, self.mass_kg, self.friction, self.grasp_symmetry)
+        if self.category_id < 1:
+            raise UserError(f"{self.name}: category_id is {self.category_id}; expected 1 or more.")
+        own = (part.rgb for part in (self.box, *self.capsules, *self.cylinders) if part is not None)
+        for rgb in (self.rgb, *(rgb for rgb in own if rgb is not None)):
+            check_rgb(self.name, rgb)
         if (wide_m := 2.0 * self.half_width_m()) > contract.GRIPPER_MAX_WIDTH_M:
             raise UserError(
                 f"{self.name}: {wide_m:.3g} m wide where the fingers close; a hand opens by "
                 f"{contract.GRIPPER_MAX_WIDTH_M:g} m."
             )
-        check_symmetry(self.name, self.grasp_symmetry)
         if self.other_pose is not None:
             try:
                 self.in_other_pose()

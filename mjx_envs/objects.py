@@ -7,7 +7,8 @@ import math
 
 import numpy as np
 
-from ddgrasp.errors import looked_up
+from ddgrasp.errors import UserError, looked_up
+from mjx_envs.object_checks import named
 from mjx_envs.object_spec import Box, Capsule, Cylinder, ObjectSpec, Plate, RestPose, Vector
 
 
@@ -76,9 +77,8 @@ _FRUIT = "friction: golden apple on rubber 0.42 to 0.48 (Ooi Abdullah and Ch'ng 
 _MADE_UP = "all of it ours"
 _GREEN, _BROWN = (0.25, 0.45, 0.15), (0.35, 0.25, 0.15)
 
-OBJECTS: dict[str, ObjectSpec] = {
-    spec.name: spec
-    for spec in (
+OBJECTS: dict[str, ObjectSpec] = named(
+    (
         ObjectSpec(
             "cube", 1, mass_kg=0.12, friction=0.9, rgb=(0.85, 0.65, 0.35), rest_height_m=0.025,
             grasp_symmetry=4, box=Box((0.025, 0.025, 0.025)),
@@ -167,12 +167,11 @@ OBJECTS: dict[str, ObjectSpec] = {
             source="a hot-dog roll, USDA FoodData Central: 44 g; size and friction: our estimates",
         ),
     )
-}  # fmt: skip
+)  # fmt: skip
 
 
-SHAPES: dict[str, ObjectSpec] = {
-    spec.name: spec
-    for spec in (
+SHAPES: dict[str, ObjectSpec] = named(
+    (
         ObjectSpec(
             "tower", 13, mass_kg=0.100, friction=0.6, rgb=(0.60, 0.60, 0.62), rest_height_m=0.040,
             grasp_symmetry=4, grasp_offset_m=(0.0, 0.0, 0.015), box=Box((0.020, 0.020, 0.040)),
@@ -208,9 +207,23 @@ SHAPES: dict[str, ObjectSpec] = {
             source="54 x 70 mm, stands or lies; " + _MADE_UP,
         ),
     )
-}  # fmt: skip
+)  # fmt: skip
 """Plain shapes to train on besides (`--world.objects`), so that a student knows more than six: none is one
 of the twelve, and none is tried."""
+
+
+def _check_apart() -> None:
+    """UserError for a name or a category that two have."""
+    of_category: dict[int, str] = {}
+    for spec in named((*OBJECTS.values(), *SHAPES.values())).values():
+        if (other := of_category.setdefault(spec.category_id, spec.name)) != spec.name:
+            raise UserError(
+                f"{other} and {spec.name} have one category_id, {spec.category_id}, by which the teacher "
+                "tells objects apart: give one of them another that is free."
+            )
+
+
+_check_apart()
 
 
 def get_object(name: str) -> ObjectSpec:

@@ -19,6 +19,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
 from ddgrasp.stages import get_stage
+from demos.store import EpisodeStore
 from lerobot_support import LENGTHS, OBJECTS, SIZE, write_demos, write_deployment, write_noisy
 from recording_support import set_meta
 
@@ -254,6 +255,42 @@ def test_a_step_without_the_robot_s_state_is_no_step_of_a_dataset(tmp_path, told
     ]
 
 
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ({"action": [0.5, 0.5]}, r"in step 2 the action is [0.5, 0.5]; expected 8 numbers"),
+        ({"action": 1.0}, "in step 2 the action is 1.0; expected 8 numbers"),
+        ({"q_rad": ["x"] * 7}, "in step 2 the robot told no whole state (seven joints and the opening)"),
+        ({"q_rad": 0.5}, "in step 2 the robot told no whole state (seven joints and the opening)"),
+    ],
+)
+def test_a_step_of_something_else_leaves_its_deployment_out(tmp_path, told, said):
+    for name in ("odd", "whole"):
+        write_deployment(tmp_path / name)
+    steps_file = tmp_path / "odd" / "steps.jsonl"
+    rows = [json.loads(line) for line in steps_file.read_text().splitlines()]
+    rows[2] |= told
+    steps_file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert open_source(tmp_path).left_out == [f"odd: {said}"]
+
+
+def test_a_report_without_its_count_of_pictures_leaves_its_deployment_out(tmp_path):
+    for name in ("odd", "whole"):
+        write_deployment(tmp_path / name)
+    report = json.loads((tmp_path / "odd" / "report.json").read_text())
+    (tmp_path / "odd" / "report.json").write_text(json.dumps({**report, "frames": None}))
+    assert open_source(tmp_path).left_out == [
+        "odd: its report.json does not say how many pictures there are (frames)"
+    ]
+
+
+def test_a_store_without_episodes_says_so(tmp_path, monkeypatch):
+    write_demos(tmp_path / "run")
+    monkeypatch.setattr(EpisodeStore, "episodes", lambda store, name: np.zeros(0, int))
+    with pytest.raises(UserError, match="has no episode: collect some"):
+        open_source(tmp_path / "run")
+
+
 def test_what_stands_there_is_not_touched(tmp_path, monkeypatch):
     write_demos(tmp_path / "run")
     (tmp_path / "set").mkdir()
@@ -264,8 +301,11 @@ def test_what_stands_there_is_not_touched(tmp_path, monkeypatch):
 def test_without_lerobot_it_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "lerobot", None)
     write_demos(tmp_path / "run")
-    with pytest.raises(UserError, match=r"lerobot 0.6 or newer, on Python 3.12 .*pip install"):
+    old = sys.version_info < (3, 12)
+    remedy = "make setup PYTHON=python3.12" if old else "pip install"
+    with pytest.raises(UserError, match=rf"lerobot 0.6 or newer, on Python 3.12 .*{remedy}") as refused:
         parse("demos export", [str(tmp_path / "run"), "--out", str(tmp_path / "set")]).run()
+    assert not old or "pip install" not in str(refused.value), "the extra is empty there"
     assert not (tmp_path / "set").exists()
 
 

@@ -156,6 +156,9 @@ def test_monocular_depth_is_fitted_to_the_measured_one():
         network_prior.metric_depth(relative, np.zeros((6, 8)), 10.0)
     nearer = network_prior.metric_depth(relative, measured, 1.0)
     np.testing.assert_allclose(nearer, np.minimum(truth, 1.0), rtol=1e-5)
+    for blind in (np.full_like(relative, 3.0), -relative):  # tells nothing, or takes near for far
+        alike = network_prior.metric_depth(blind, measured, 10.0)
+        np.testing.assert_allclose(alike, 1 / np.mean(1 / measured[measured > 0]), rtol=1e-5)
 
 
 def test_monocular_depth_has_the_scale_of_what_was_measured_and_no_holes(weights):

@@ -215,6 +215,7 @@ def fit_by(tmp_path_factory):
                 TINY.training, steps=300, batch_size=16, checkpoint_every=1000, hole_loss=hole_loss
             ),
         )
+        train.init_state(config, jax.random.key_data(jax.random.key(0)))  # optimised it takes 30 s to compile
         with optimized():
             params = train.fit(config, pictures(64), tmp_path_factory.mktemp("ddg"), 0, Progress(quiet=True))
         return sample.Generator(config, params, make_prior(config))

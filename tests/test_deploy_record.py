@@ -588,6 +588,9 @@ def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
         ("5", "has no 'success'"),
         ('{"success": true, "steps": 3, "events": []}', "lacks holds, missed_deadlines, fault, latency_ms"),
         (None, "success\" is 'yes'"),
+        (json.dumps({**values, "steps": "x"}), "steps is 'x': change nothing in it but 'success'"),
+        (json.dumps({**values, "missed_deadlines": None}), "missed_deadlines is None: change nothing"),
+        (json.dumps({**values, "latency_ms": {}, "events": 1}), "latency_ms is {}, events is 1: change"),
     ):
         text = json.dumps({**values, "success": "yes"}) if written is None else written
         (other / "report.json").write_text(text)

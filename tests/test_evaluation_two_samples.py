@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from ddgrasp.config import ScoreConfig
 from ddgrasp.errors import UserError
@@ -27,10 +28,20 @@ def test_rows_repeat_groups_as_often_as_they_were_drawn():
 
 def test_an_interval_has_the_spread_of_the_draws_around_the_point():
     found = interval(10.0, list(np.linspace(20, 40, 101)))
-    assert (found["low"], found["high"]) == pytest.approx((10 - 9.5, 10 + 9.5))
+    assert (found["low"], found["high"]) == pytest.approx((10 - 9.69, 10 + 9.69))
     assert np.isnan(interval(1.0, [])["low"])
     within = interval(0.99, [0.90, 0.95, 1.0], 0.0, 1.0)
-    assert within == {"value": 0.99, "low": pytest.approx(0.9425), "high": 1.0}
+    assert within == {"value": 0.99, "low": pytest.approx(0.94), "high": 1.0}
+
+
+def test_an_interval_of_few_draws_holds_95_percent_of_what_was_not_drawn():
+    rng, held = np.random.default_rng(0), []
+    for count in (50, 100):
+        for _ in range(1000):
+            values = rng.normal(size=count)
+            found = interval(float(values.mean()), list(values))
+            held.append(norm.cdf(found["high"]) - norm.cdf(found["low"]))
+    assert 0.948 < np.mean(held) < 0.958
 
 
 def test_weighted_kernels_give_the_discrepancy_of_the_drawn_rows():

@@ -237,6 +237,42 @@ def test_parts_that_cannot_be_told_apart_are_refused(names):
         body_of(box("tin", shape=lambda: parts))
 
 
+def absent() -> tuple[Part, ...]:
+    return (Part("side", trimesh.load_mesh("/nowhere/nope.stl"), (0.5, 0.5, 0.5)),)
+
+
+SIDE = Part("side", trimesh.creation.box((60, 40, 20)), (0.5, 0.5, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [
+        (absent, r"The shape of 'tin' cannot be made \(.*file"),
+        (lambda: SIDE, "The shape of 'tin' cannot be made .*not iterable"),
+        (lambda: (SIDE.mesh,), "The shape of 'tin' gives .*; expected a tuple of Part"),
+        (lambda: (replace(SIDE, rgb=(1, 0.5, 0, 1)),), r"tin, side: rgb is \(1, 0.5, 0, 1\); expected three"),
+    ],
+)
+def test_a_shape_that_cannot_be_made_is_refused_with_its_object(shape, said):
+    with pytest.raises(UserError, match=said):
+        body_of(box("tin", shape=shape))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"mass_kg": 0.0}, "tin: mass_kg is 0; expected more than 0, at most 3"),
+        ({"friction": float("nan")}, "tin: friction is nan"),
+        ({"shape": (SIDE,)}, "tin: shape is a tuple; expected a function"),
+        ({"grasp_mm": (0.0, float("nan"), 0.0)}, "tin: grasp_mm is .*; expected three millimetres"),
+        ({"grasp_mm": (0.0, 10.0)}, "tin: grasp_mm is .*; expected three millimetres"),
+    ],
+)
+def test_a_description_that_no_object_has_is_refused(change, said):
+    with pytest.raises(UserError, match=f"^{said}"):
+        box("tin", **change)
+
+
 def shells(*, inverted: bool = False, at_mm: float = 20.0, size_mm: float = 20.0) -> trimesh.Trimesh:
     """A box of 40 mm and a smaller one beside, across or inside it, in one surface."""
     smaller = trimesh.creation.box((size_mm, size_mm, size_mm)).apply_translation((at_mm, 0.0, 0.0))

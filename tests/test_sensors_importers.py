@@ -14,7 +14,7 @@ from app.commands import parse
 from ddgrasp.contract import CONTRACT_VERSION
 from ddgrasp.errors import UserError
 from realsense_support import full_after
-from sensors.recordings import importers
+from sensors.recordings import folders, importers
 from sensors.recordings import writer as writing
 from sensors.recordings.recording import Recording
 
@@ -98,7 +98,7 @@ def test_bad_frames_are_named_and_counted(tmp_path, capsys):
     run(root, "--out", tmp_path / "out")
     shown = capsys.readouterr().out
     for name, reason in (
-        ("0001", "depth is 40x30, the frames before it 32x24"),
+        ("0001", "depth is 40x30, the others' 32x24"),
         ("0002", "no valid depth pixel"),
         ("0003", "colour is missing"),
         ("0004", "depth cannot be read"),
@@ -107,6 +107,53 @@ def test_bad_frames_are_named_and_counted(tmp_path, capsys):
     ):
         assert any(name in line and reason in line for line in shown.splitlines()), name
     assert shown.splitlines()[-1] == "1 recordings with 1 frames imported; left out: 6 frames, 0 recordings"
+
+
+def test_an_odd_first_frame_is_the_one_that_is_left_out(tmp_path, capsys):
+    root = make_folder(tmp_path / "desk", frames=5)
+    cv2.imwrite(str(root / "depth" / "0000_depth.png"), depth_mm(0, (30, 40)))
+    run(root, "--out", tmp_path / "out")
+    assert "0000_depth.png: depth is 40x30, the others' 32x24" in capsys.readouterr().out
+    assert len(Recording.open(tmp_path / "out" / "desk")) == 4
+
+
+def test_pictures_in_another_unit_than_most_are_left_out_unless_one_is_given(tmp_path, capsys):
+    root = make_folder(tmp_path / "desk", frames=5)
+    (root / "depth" / "0001_depth.png").unlink()
+    np.save(root / "depth" / "0001_depth.npy", depth_mm(1).astype(np.float32) / 1000)
+    run(root, "--out", tmp_path / "out")
+    assert "0001_depth.npy: depth is float32, the others' integers: in another" in capsys.readouterr().out
+    np.testing.assert_array_equal(Recording.open(tmp_path / "out" / "desk").depth_mm(1), depth_mm(2))
+    np.save(root / "depth" / "0001_depth.npy", depth_mm(1).astype(np.float32))
+    run(root, "--out", tmp_path / "given", "--depth-unit-m", "0.001")
+    np.testing.assert_array_equal(Recording.open(tmp_path / "given" / "desk").depth_mm(1), depth_mm(1))
+
+
+@pytest.mark.parametrize("folder", ["depth", "rgb"])
+def test_two_pictures_of_one_name_are_refused(tmp_path, folder):
+    root = make_folder(tmp_path / "desk", frames=2)
+    file = next((root / folder).glob("0001*.png"))
+    file.with_suffix(".npy" if folder == "depth" else ".jpg").write_bytes(file.read_bytes())
+    with pytest.raises(UserError, match=rf"0001_{folder}\.\w+ and 0001_{folder}\.\w+ have one name: keep"):
+        run(root, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_empty_colour_folder_is_passed_over_for_one_with_pictures(tmp_path):
+    root = make_folder(tmp_path / "desk", frames=2)
+    (root / "color").mkdir()
+    run(root, "--out", tmp_path / "out")
+    assert len(Recording.open(tmp_path / "out" / "desk")) == 2
+
+
+def test_two_sources_of_one_name_do_not_call_each_other_made_before(tmp_path):
+    source = folders.folder_source(make_folder(tmp_path / "walk"), 0.0, {})
+    twice = [replace(source, path=tmp_path / f"walk{suffix}") for suffix in (".bag", ".db3")]
+    done, refused = importers.import_all(twice, tmp_path / "out")
+    assert (
+        len(done) == 1 and [line for line in refused if "another one here is called walk" in line] == refused
+    )
+    assert refused[0].startswith(str(tmp_path / "walk.db3"))
 
 
 def test_a_telephone_that_was_held_upright_turns_no_colour(tmp_path):
@@ -140,7 +187,7 @@ def test_what_is_passed_over_is_named(tmp_path, capsys, monkeypatch):
     assert f"{tmp_path / 'all' / 'grey'}: depth/ without one of color/" in shown
     assert "left out: 0 frames, 1 recordings" in shown
     (tmp_path / "all" / "a.bag").touch()
-    source = importers.folder_source(tmp_path / "all" / "desk", 0.0, {})
+    source = folders.folder_source(tmp_path / "all" / "desk", 0.0, {})
     monkeypatch.setattr("sensors.recordings.realsense.file_source", lambda file: source)
     _, refused = importers.find_sources(tmp_path / "all", 0.0, {})
     assert refused == [f"{tmp_path / 'all' / 'desk'}: pictures beside RealSense files: import it by itself."]
@@ -225,7 +272,7 @@ def test_what_is_hidden_is_no_source(tmp_path, capsys, monkeypatch):
     (tmp_path / "all" / "._desk.bag").touch()
     assert len(importers.find_sources(tmp_path / "all", 0.0, {})[0]) == 1
     (tmp_path / "all" / "desk.bag").touch()
-    source = importers.folder_source(tmp_path / "all" / "desk", 0.0, {})
+    source = folders.folder_source(tmp_path / "all" / "desk", 0.0, {})
     monkeypatch.setattr("sensors.recordings.realsense.file_source", lambda file: source)
     sources, refused = importers.find_sources(tmp_path / "all", 0.0, {})
     assert len(sources) == 1 and [line.split(":")[0] for line in refused] == [str(tmp_path / "all" / "desk")]
@@ -246,7 +293,7 @@ def test_what_is_not_a_number_is_a_hole(tmp_path):
     metres[5, 5], metres[6, 6], metres[7, 7] = np.nan, np.inf, -1.0
     np.save(root / "depth" / "0000_depth.npy", metres)
     (root / "depth" / "0000_depth.png").unlink()
-    source = importers.folder_source(root, 0.0, {})
+    source = folders.folder_source(root, 0.0, {})
     importers.import_recording(source, tmp_path / "out")
     read = Recording.open(tmp_path / "out").depth_mm(0)
     assert read[5, 5] == read[6, 6] == read[7, 7] == 0 and read[8, 8] == depth_mm(0)[8, 8]
@@ -342,7 +389,7 @@ def test_numbers_in_names_count_as_numbers(tmp_path):
     for i in range(12):
         cv2.imwrite(str(root / "depth" / f"{i}.png"), np.full(SIZE, 600 + i, np.uint16))
         cv2.imwrite(str(root / "rgb" / f"{i}.png"), np.zeros((*SIZE, 3), np.uint8))
-    importers.import_recording(importers.folder_source(root, 0.0, {}), tmp_path / "out")
+    importers.import_recording(folders.folder_source(root, 0.0, {}), tmp_path / "out")
     read = Recording.open(tmp_path / "out")
     assert [int(read.depth_mm(i).max()) for i in range(12)] == list(range(600, 612))
 
@@ -390,7 +437,7 @@ def test_a_folder_s_recording_has_its_whole_name(tmp_path, monkeypatch):
 
 
 def test_depth_that_cannot_be_is_refused_after_a_few_frames(tmp_path):
-    source, read = importers.folder_source(make_folder(tmp_path / "far", frames=12), 0.0, {}), []
+    source, read = folders.folder_source(make_folder(tmp_path / "far", frames=12), 0.0, {}), []
 
     def frames():
         for frame in source.frames():

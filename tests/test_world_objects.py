@@ -14,9 +14,10 @@ from ddgrasp import contract
 from ddgrasp.config import RandomConfig, WorldConfig
 from ddgrasp.errors import UserError
 from evaluation import object_sheet
-from mjx_envs import grasp_math, scene
+from mjx_envs import grasp_math, objects, scene
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_env import GraspEnv
+from mjx_envs.object_checks import named
 from mjx_envs.object_spec import (
     DEFAULT_SLOTS,
     Box,
@@ -255,12 +256,38 @@ def test_the_round_end_of_what_begins_beside_the_pads_counts():
         ({"box": None, "cylinders": (Cylinder(0.02, 0.02),)}, "nothing of it collides: give it a box"),
         ({"box": Box((0.02, 0.041, 0.02))}, "0.082 m wide where the fingers close; a hand opens by 0.08 m"),
         ({"mass_kg": -1.0}, "mass_kg is -1; expected more than 0"),
+        ({"mass_kg": 120.0}, "mass_kg is 120; expected more than 0, at most 3"),
         ({"friction": 0.0}, "friction is 0; expected more than 0"),
+        ({"friction": float("inf")}, "friction is inf; expected more than 0"),
+        ({"category_id": 0}, "category_id is 0; expected 1 or more"),
+        ({"rgb": (255, 128, 0)}, r"rgb is \(255, 128, 0\); expected three numbers of 0 to 1"),
+        ({"rgb": "#ff8000"}, "rgb is '#ff8000'; expected three"),
+        ({"box": Box((0.02, 0.02, 0.02), rgb=(0.1, 0.2))}, r"rgb is \(0.1, 0.2\); expected three"),
     ],
 )
 def test_what_no_hand_grasps_or_no_engine_sees_is_refused(change, message):
     with pytest.raises(UserError, match=f"^cube: {message}"):
         replace(get_object("cube"), **change)
+
+
+@pytest.mark.parametrize("name", ["ycb/mug", "two words", "", ".hidden", "a&b"])
+def test_a_name_that_no_file_can_have_is_refused(name):
+    with pytest.raises(UserError, match="An object is called .*expected letters, digits"):
+        replace(get_object("cube"), name=name)
+
+
+def test_two_objects_of_one_name_or_category_are_refused(monkeypatch):
+    cube = get_object("cube")
+    with pytest.raises(UserError, match="Two objects are called 'cube': give one"):
+        named([cube, replace(cube, category_id=99)])
+    monkeypatch.setitem(
+        OBJECTS, "mine", replace(cube, name="mine", category_id=get_object("tin").category_id)
+    )
+    with pytest.raises(UserError, match="mine and tin have one category_id, 18"):
+        objects._check_apart()
+    monkeypatch.setitem(OBJECTS, "mine", replace(cube, name="tower", category_id=99))
+    with pytest.raises(UserError, match="Two objects are called 'tower'"):
+        objects._check_apart()
 
 
 # --- slots ---------------------------------------------------------------------------------------

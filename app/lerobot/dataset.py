@@ -3,7 +3,9 @@
 import contextlib
 import importlib
 import os
+import platform
 import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -72,9 +74,11 @@ def load_lerobot() -> Any:
             raise ImportError("this one knows no depth")
         _silence()
     except ImportError as error:
+        here, remedy = platform.python_version(), pip_install("lerobot")
+        if sys.version_info < (3, 12):  # the extra is empty there
+            remedy = f"this is {here}; make an environment of a newer one (`make setup PYTHON=python3.12`)"
         raise UserError(
-            f"LeRobot datasets need lerobot 0.6 or newer, on Python 3.12 or newer ({error}): "
-            f"{pip_install('lerobot')}."
+            f"LeRobot datasets need lerobot 0.6 or newer, on Python 3.12 or newer ({error}): {remedy}."
         ) from error
     return library
 

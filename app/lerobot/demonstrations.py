@@ -48,6 +48,8 @@ def read(folder: Path, objects: Sequence[str] = (), noisy: Path | None = None) -
     indices = store.episodes("object_index").tolist()
     taken = [i for i, index in enumerate(indices) if not objects or names[index] in objects]
     if not taken:
+        if not objects:
+            raise UserError(f"{folder} has no episode: collect some with `ddgrasp demos collect`.")
         raise UserError(f"{folder} has no episode with {' or '.join(objects)}: choose others of {names}.")
     width, height = config.world.profile.width_px, config.world.profile.height_px
     disturbed = (

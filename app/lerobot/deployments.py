@@ -100,6 +100,8 @@ def _seen(deployment: Deployment) -> str:
 def _pictures(deployment: Deployment) -> Recording:
     """One for every step. UserError with the reason where it is no episode."""
     report = deployment.report
+    if not isinstance(report.get("frames"), int):
+        raise UserError("its report.json does not say how many pictures there are (frames)")
     if not deployment.is_driven:
         raise UserError("a dry run: the arm did not do what its steps say")
     if report["success"] is None:
@@ -155,22 +157,37 @@ def _steps(path: Path) -> list[dict[str, Any]]:
 def states(rows: Sequence[Mapping[str, Any]]) -> np.ndarray:
     """(T, 8) float32 joints (rad) and opening (m). Raises UserError for a step of which the robot told no
     whole state: the loop held the arm there, and a dataset has no room for what is not known."""
-    told = [[*(row["q_rad"] or ()), row["width_m"]] for row in rows]
+    told = [[*_listed(row["q_rad"]), row["width_m"]] for row in rows]
     for step, state in enumerate(told):
-        if len(state) != STATE.size or None in state:
+        if not _are_numbers(state, STATE.size):
             raise UserError(f"in step {step} the robot told no whole state (seven joints and the opening)")
     return np.array(told, np.float32).reshape(-1, STATE.size)
 
 
 def actions(rows: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    """(T, 8) float32; a step that was held is what holding does: no joint step, the gripper as before."""
+    """(T, 8) float32; a step that was held is what holding does: no joint step, the gripper as before.
+
+    Raises UserError for an action of another size.
+    """
     made = np.zeros((len(rows), ACTION.size), np.float32)
     gripper = OPEN
-    for action, row in zip(made, rows, strict=True):
+    for step, (action, row) in enumerate(zip(made, rows, strict=True)):
         if row["action"] is not None:
+            if not _are_numbers(_listed(row["action"]), ACTION.size):
+                raise UserError(
+                    f"in step {step} the action is {row['action']!r}; expected {ACTION.size} numbers"
+                )
             action[:] = row["action"]
             gripper = action[ACTION.gripper.start]
         if "close" in row:  # the fingers wait for a slow hand
             gripper = CLOSE if row["close"] else OPEN
         action[ACTION.gripper] = gripper
     return made
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _are_numbers(values: Sequence[Any], count: int) -> bool:
+    return len(values) == count and all(isinstance(value, int | float) for value in values)

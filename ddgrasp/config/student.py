@@ -129,7 +129,8 @@ class HeadConfig(Section, name="student.head"):
     chunk: Annotated[int, Range(1, 1000)] = 2
     """Actions predicted at once."""
     execute_steps: Annotated[int, Range(1, 1000)] = 1
-    """Actions of a chunk that are executed before the policy looks again."""
+    """Actions of a chunk that are executed before the policy looks again. Labels of the later ones are noisy:
+    where a demonstration was pushed or a student acted, they are of where that led, not the chunk's first."""
     closing_steps: Annotated[int, Range(0, 100)] = 8
     """Control steps that a closing of the gripper lasts at least, once begun (ddgrasp/gripper.py): the hand's
     from open to shut. 0 for none."""

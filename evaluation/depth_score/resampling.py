@@ -41,13 +41,15 @@ def interval(
     point, as far as it is within what the figure can be.
 
     Resampling with replacement repeats maps, which moves Frechet distances and polynomial MMD upwards by more
-    than they vary: only the spread is taken from it.
+    than they vary: only the spread is taken from it. Quantiles are at (n + 1) p of n values
+    (Hyndman and Fan 1996, definition 6), below which a share p of what was not drawn lies; at (n - 1) p, 100
+    draws would hold 93.3 %, not 95.
     """
     values = np.asarray([v for v in resampled if np.isfinite(v)])
     if not len(values) or not np.isfinite(point):
         return {"value": float(point), "low": float("nan"), "high": float("nan")}
     tail = (1 - LEVEL) / 2
-    low, high = np.quantile(values - values.mean(), (tail, 1 - tail))
+    low, high = np.quantile(values - values.mean(), (tail, 1 - tail), method="weibull")
     low, high = (float(np.clip(point + end, least, most)) for end in (low, high))
     return {"value": float(point), "low": low, "high": high}
 

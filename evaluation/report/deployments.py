@@ -22,6 +22,7 @@ _NOTE = (
 
 _FIELDS = ("steps", "holds", "missed_deadlines", "fault", "events", "latency_ms")
 """What the page shows of a report."""
+_COUNTS, _TIMES = ("steps", "holds", "missed_deadlines"), ("p50", "p99")
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,18 @@ def _report(path: Path) -> Mapping[str, Any]:
         raise UserError(f'{path}: "success" is {report["success"]!r}; expected true, false or null.')
     if absent := [name for name in _FIELDS if name not in report]:
         raise UserError(f"{path} lacks {', '.join(absent)}: change nothing in it but 'success'.")
+    if wrong := [f"{name} is {report[name]!r}" for name in _damaged(report)]:
+        raise UserError(f"{path}: {', '.join(wrong)}: change nothing in it but 'success'.")
     return {"interrupted": False, **report}
+
+
+def _damaged(report: Mapping[str, Any]) -> list[str]:
+    """Fields of another kind than `ddgrasp deploy` writes."""
+    times, number = report["latency_ms"], (int, float, type(None))
+    timed = isinstance(times, dict) and all(isinstance(times.get(name, ""), number) for name in _TIMES)
+    listed = isinstance(report["events"], list)
+    counted = [name for name in _COUNTS if not isinstance(report[name], int) or report[name] < 0]
+    return counted + ["latency_ms"] * (not timed) + ["events"] * (not listed)
 
 
 def write(folder: Path, deployments: Sequence[Deployment]) -> Path:

@@ -5,11 +5,13 @@ The world frame is the robot's base, as in the contract: x forward, z up, table 
 
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from ddgrasp import contract
-from mjx_envs.object_spec import ObjectSpec, SlotLayout, check_symmetry, slot_layout
+from mjx_envs.object_checks import check_symmetry
+from mjx_envs.object_spec import ObjectSpec, SlotLayout, slot_layout
 from mjx_envs.objects import get_object
 from mjx_envs.scene import mjcf
 
@@ -68,11 +70,11 @@ def meshed(name: str) -> SceneObject:
     geoms = [f'<inertial mass="{body.mass_kg}" pos="0 0 0" fullinertia="{inertia}"/>']
     assets = []
     for surface in body.surfaces:
-        mesh = f"{OBJECT_BODY}_{surface.name}"
+        mesh = quoteattr(f"{OBJECT_BODY}_{surface.name}")
         vertices, faces = mjcf(surface.vertices_m.ravel()), " ".join(map(str, surface.faces.ravel()))
-        assets.append(f'<mesh name="{mesh}" vertex="{vertices}" face="{faces}" inertia="shell"/>')
+        assets.append(f'<mesh name={mesh} vertex="{vertices}" face="{faces}" inertia="shell"/>')
         look = f'rgba="{mjcf(surface.rgb)} 1" contype="0" conaffinity="0" group="1"'
-        geoms.append(f'<geom name="{mesh}" type="mesh" mesh="{mesh}" {look} mass="0"/>')
+        geoms.append(f'<geom name={mesh} type="mesh" mesh={mesh} {look} mass="0"/>')
     touching = _touching(body.friction, mjcf(CONTACT_SOLREF))
     for i, vertices_m in enumerate(body.convex_m):
         mesh = f"{OBJECT_BODY}_contact{i}"

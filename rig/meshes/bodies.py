@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from ddgrasp import contract
 from ddgrasp.errors import UserError
 from ddgrasp.install import pip_install
+from mjx_envs.object_checks import check_rgb
 from rig.meshes.convex import convex_parts
 from rig.meshes.objects import MeshObject, get_mesh_object
 from rig.meshes.solids import Part, Vector, one_surface, union
@@ -86,9 +87,10 @@ def body_of(described: MeshObject) -> MeshBody:
     described, and for a concave one where CoACD is not installed.
     """
     _check_libraries()
-    parts = described.shape()
+    parts = _parts(described)
     _check_names(described.name, parts)
     for part in parts:
+        check_rgb(f"{described.name}, {part.name}", part.rgb)
         _check_closed(described.name, part)
     parts = [replace(part, mesh=one_surface(part.mesh)) for part in parts]
     solid = union([part.mesh for part in parts])
@@ -187,6 +189,17 @@ def _check_libraries() -> None:
     missing = [name for name in ("manifold3d", "networkx") if find_spec(name) is None]
     if missing:
         raise UserError(f"Mesh objects need {' and '.join(missing)}: {pip_install('fr3')}.")
+
+
+def _parts(described: MeshObject) -> Sequence[Part]:
+    """What its shape gives. UserError, with the reason, where that is no sequence of parts."""
+    try:
+        parts = tuple(described.shape())
+    except (OSError, ValueError, TypeError) as error:  # trimesh: a file that is absent or of no known type
+        raise UserError(f"The shape of {described.name!r} cannot be made ({error}).") from error
+    if not all(isinstance(part, Part) for part in parts):
+        raise UserError(f"The shape of {described.name!r} gives {parts!r}; expected a tuple of Part.")
+    return parts
 
 
 def _check_names(name: str, parts: Sequence[Part]) -> None:

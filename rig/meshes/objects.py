@@ -4,11 +4,12 @@ The twelve of training by name, size, mass and friction, in other shapes, and si
 All shapes are made here by code, so their licence is the project's; docs/objects.md has the table.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ddgrasp.errors import looked_up
-from mjx_envs.object_spec import check_symmetry
+from ddgrasp.errors import UserError, looked_up
+from mjx_envs.object_checks import check_thing, named
 from mjx_envs.objects import OBJECTS
 from rig.meshes import fruit, things
 from rig.meshes.solids import Part, Vector
@@ -36,8 +37,15 @@ class MeshObject:
     """The grip's place in the shape's frame; None is the centre of mass."""
 
     def __post_init__(self):
-        assert self.mass_kg > 0 and self.friction > 0
-        check_symmetry(self.name, self.grasp_symmetry)
+        check_thing(self.name, self.mass_kg, self.friction, self.grasp_symmetry)
+        if not callable(self.shape):
+            raise UserError(
+                f"{self.name}: shape is a {type(self.shape).__name__}; expected a function of no "
+                "arguments that makes the parts."
+            )
+        at_mm = self.grasp_mm
+        if at_mm is not None and (len(at_mm) != 3 or not all(map(math.isfinite, at_mm))):
+            raise UserError(f"{self.name}: grasp_mm is {at_mm!r}; expected three millimetres, or None.")
 
 
 def _as_trained(
@@ -52,9 +60,8 @@ def _as_trained(
     return MeshObject(name, shape, spec.mass_kg, spec.friction, symmetry, source, grasp_mm)
 
 
-MESH_OBJECTS: dict[str, MeshObject] = {
-    described.name: described
-    for described in (
+MESH_OBJECTS: dict[str, MeshObject] = named(
+    (
         _as_trained("apple", fruit.apple, "surface of revolution with dimple, five bumps, stem", 0),
         _as_trained("pear", fruit.pear, "surface of revolution with a neck, bent stem", 2),
         _as_trained("peach", fruit.peach, "surface of revolution with a cleft", 2),
@@ -86,7 +93,7 @@ MESH_OBJECTS: dict[str, MeshObject] = {
         MeshObject("hammer", things.hammer, 0.200, 0.5, 2, "a 200 g joiner's hammer; our estimates"),
         MeshObject("bulb", things.bulb, 0.040, 0.4, 2, "A60 lamp, 60 x 108 mm; our estimates"),
     )
-}  # fmt: skip
+)  # fmt: skip
 
 
 def get_mesh_object(name: str) -> MeshObject:

@@ -1,47 +1,35 @@
-"""Recordings from elsewhere into the format of `recordings.py`: folders of pictures, RealSense files.
+"""Recordings from elsewhere into the format of `recording.py`: folders of pictures, RealSense files.
 
 Only pictures, what the camera is, and licence and source are kept: no pose, no CAD, no pairing. A frame that
 cannot be used is named and left out; a source none of whose frames can be used, or whose depth is in another
 unit, is refused.
 """
 
-import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ddgrasp.contract import DEPTH_UNIT_M
 from ddgrasp.depth import from_counts
 from ddgrasp.errors import UserError
+from sensors.recordings.folders import folder_sources, is_pair
 from sensors.recordings.recording import (
-    COLOR_AS_STORED,
     FARTHEST_MEDIAN_M,
-    META_FILE,
     NEAREST_MEDIAN_M,
     UNIT_CHECK_FRAMES,
     UNIT_IS_CERTAIN,
-    check_fields,
 )
-from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, has_alone_between, in_time, paired
-from sensors.recordings.writer import BEGUN_FILE, RecordingWriter
+from sensors.recordings.sources import COLOR_SUFFIXES, RawFrame, Source, is_depth, opened, visible
+from sensors.recordings.writer import RecordingWriter
 
 MARKER = 2**16 - 1
 SAME_SHAPE = 0.02
 """Colour and depth of one view have the same ratio of columns to rows, up to this share."""
-COLOR_FOLDERS = ("color", "colour", "rgb", "image")
-_COLOR_NAMES = ", ".join(f"{name}/" for name in COLOR_FOLDERS)
-DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 REALSENSE_SUFFIXES = (".bag", ".db3")
-KEPT_META = (
-    "sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth", "repeated_frames",
-    "licence", "source", UNIT_IS_CERTAIN,
-)  # fmt: skip
-"""What is taken over of a folder's own meta.json."""
 
 
 @dataclass(frozen=True)
@@ -84,19 +72,19 @@ def import_recording(source: Source, path: Path) -> Imported:
     """
     if path.exists():
         raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
-    skipped, medians_m, size, frames, gaps, last = [], [], None, 0, source.has_gaps, False
+    skipped, medians_m, frames, gaps, last = [], [], 0, source.has_gaps, False
     loss, marked, unlike = "", 0, ""
     certain = {UNIT_IS_CERTAIN: True} if source.unit_is_certain else {}
     with RecordingWriter(path, source.meta | certain, keep=source.cut_short is not None) as writer:
         for frame in map(_without_markers, source.frames()):
-            medians_m += _median_m(frame, source.depth_unit_m)
-            depth_mm, reason = _usable(frame, source.depth_unit_m, size)
+            medians_m += _median_m(frame, source)
+            depth_mm, reason = _usable(frame, source)
             if depth_mm is None or frame.rgb is None:
                 skipped.append(f"{frame.name}: {reason}")
                 last = False
                 continue
             gaps, last = gaps or not (last or not frames), True
-            size = depth_mm.shape
+            source = replace(source, shape=depth_mm.shape)
             loss = loss or _loss(frame, source.depth_unit_m)
             marked += frame.marked
             unlike = unlike or _unlike(frame.rgb, depth_mm)
@@ -152,10 +140,15 @@ def import_all(
     Raises:
         UserError: every one was refused.
     """
-    done, refused = [], list(refused)
+    done, refused, names = [], list(refused), set()
     for source in sources:
+        name = _name(source.path)
+        if name in names:
+            refused.append(f"{source.path}: another one here is called {name}, too: rename one of them.")
+            continue
+        names.add(name)
         try:
-            done.append(import_recording(source, out / _name(source.path)))
+            done.append(import_recording(source, out / name))
         except UserError as error:
             refused.append(str(error))
     if not done:
@@ -195,32 +188,38 @@ def _without_markers(frame: RawFrame) -> RawFrame:
     return replace(frame, depth=depth, marked=int(marked.sum())) if marked.any() else frame
 
 
-def _usable(frame: RawFrame, unit_m: float, size: tuple[int, ...] | None) -> tuple[np.ndarray | None, str]:
+def _usable(frame: RawFrame, source: Source) -> tuple[np.ndarray | None, str]:
     """((H, W) uint16 millimetres, "") or (None, why the frame is left out)."""
-    depth = frame.depth
+    depth, shape = frame.depth, source.shape
     if depth is None:
         return None, "depth cannot be read"
-    if not _is_depth(depth):
+    if not is_depth(depth):
         return None, f"depth is {depth.dtype} {depth.shape}, expected one channel of 16 bits or floats"
     if frame.rgb is None:
         return None, f"colour is missing or cannot be read (a {', '.join(COLOR_SUFFIXES)} of its name)"
-    if size is not None and depth.shape != size:
-        return None, f"depth is {depth.shape[1]}x{depth.shape[0]}, the frames before it {size[1]}x{size[0]}"
-    millimetres = from_counts(depth, unit_m)
+    if shape is not None and depth.shape != shape:
+        return None, f"depth is {depth.shape[1]}x{depth.shape[0]}, the others' {shape[1]}x{shape[0]}"
+    if not _is_of_kind(depth, source):
+        others = "floating-point" if source.floats else "integers"
+        return (
+            None,
+            f"depth is {depth.dtype}, the others' {others}: in another unit, to be imported by itself",
+        )
+    millimetres = from_counts(depth, source.depth_unit_m)
     return (millimetres, "") if millimetres.any() else (None, "no valid depth pixel")
 
 
-def _median_m(frame: RawFrame, unit_m: float) -> list[float]:
+def _median_m(frame: RawFrame, source: Source) -> list[float]:
     """The median of a frame's positive depths in metres; nothing if it has none."""
-    if frame.depth is None or not _is_depth(frame.depth):
+    depth = frame.depth
+    if depth is None or not is_depth(depth) or not _is_of_kind(depth, source):
         return []
-    positive = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
-    return [float(np.median(positive)) * unit_m] if positive.size else []
+    positive = depth[np.isfinite(depth) & (depth > 0)]
+    return [float(np.median(positive)) * source.depth_unit_m] if positive.size else []
 
 
-def _is_depth(depth: np.ndarray) -> bool:
-    """Whether an array can be depth in some unit: one channel of floats, or integers of more than 8 bits."""
-    return depth.ndim == 2 and depth.dtype.kind in "iuf" and depth.dtype.itemsize > 1
+def _is_of_kind(depth: np.ndarray, source: Source) -> bool:
+    return source.floats in (None, depth.dtype.kind == "f")
 
 
 def _check_unit(source: Source, medians_m: list[float]) -> None:
@@ -241,117 +240,6 @@ def _check_unit(source: Source, medians_m: list[float]) -> None:
     )
 
 
-# --- folders of pictures ---------------------------------------------------------------------------
-
-
-def folder_sources(root: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple[list[Source], list[str]]:
-    """`root` if it has depth/ and a colour folder, else every folder in it that does; why others are refused.
-
-    A name that begins with a dot is passed over: a recording that is not finished has one.
-
-    Raises:
-        UserError: neither, or every one was refused.
-    """
-    inside = _visible(root)
-    folders = [root] if _is_pair(root) else [p for p in inside if _is_pair(p)]
-    if not folders:
-        raise UserError(
-            f"{root}: no depth/ beside one of {_COLOR_NAMES} in it or in its folders; put the pictures "
-            "there, named alike."
-        )
-    sources, refused = _each(folders, lambda folder: folder_source(folder, depth_unit_m, meta))
-    without = (p for p in inside if (p / "depth").is_dir() and not _is_pair(p))
-    passed_over = (f"{p}: depth/ without one of {_COLOR_NAMES} beside it." for p in without)
-    return sources, [*refused, *(() if folders == [root] else passed_over)]
-
-
-def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> Source:
-    """Pictures depth/*.png (16 bits), .npy or .tif, matched with those of the colour folder (`paired`).
-
-    `depth_unit_m` 0 takes that of the folder's own meta.json, if it is or was a recording; without one,
-    millimetres for integers, metres for floats. `meta` comes before that file's KEPT_META.
-
-    Raises:
-        UserError: no depth pictures, or a meta.json that is none.
-    """
-    pictures = (p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
-    files = sorted(pictures, key=in_time)
-    if not files:
-        raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
-    own = _own_meta(folder / META_FILE) or _own_meta(folder / BEGUN_FILE)
-    depth_unit_m = depth_unit_m or own.get("depth_unit_m", 0.0)
-    if not depth_unit_m:
-        first = next((d for d in map(_read_depth, files) if d is not None and _is_depth(d)), None)
-        floats = first is not None and np.issubdtype(first.dtype, np.floating)
-        depth_unit_m = 1.0 if floats else DEPTH_UNIT_M
-    colors = sorted(p for p in _color_folder(folder).iterdir() if p.suffix.lower() in COLOR_SUFFIXES)
-    pairs, note = paired(files, colors)
-    by_name = not note  # by time, a faster colour stream has pictures of its own
-    gaps = (own.get("frames") or 0) > len(files) or (by_name and has_alone_between(colors, pairs.values()))
-
-    def frames() -> Iterator[RawFrame]:
-        for file in files:
-            color = pairs.get(file)
-            yield RawFrame(file.name, _read_depth(file), None if color is None else _read_rgb(color))
-
-    kept = {name: own[name] for name in KEPT_META if name in own}
-    certain = bool(kept.pop(UNIT_IS_CERTAIN, False)) and depth_unit_m == own.get("depth_unit_m")
-    return Source(folder, frames, depth_unit_m, {**kept, **meta}, certain, has_gaps=gaps, note=note)
-
-
-def _own_meta(file: Path) -> dict[str, Any]:
-    """What a folder's meta.json says, nothing if there is none. Raises UserError if it is none."""
-    if not file.exists():
-        return {}
-    try:
-        meta = json.loads(file.read_text())
-    except (ValueError, OSError) as error:
-        raise UserError(f"{file}: cannot be read ({error}); repair it, or take it away.") from None
-    if not isinstance(meta, dict):
-        raise UserError(f"{file}: is a {type(meta).__name__}; expected a recording's fields: take it away.")
-    unit = meta.get("depth_unit_m", DEPTH_UNIT_M)
-    if isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit <= 1:
-        raise UserError(f"{file}: depth_unit_m is {unit!r}; expected metres per unit of depth, up to 1.")
-    check_fields(file, meta)
-    return meta
-
-
-def _visible(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
-
-
-def _is_pair(folder: Path) -> bool:
-    return (folder / "depth").is_dir() and any((folder / name).is_dir() for name in COLOR_FOLDERS)
-
-
-def _color_folder(folder: Path) -> Path:
-    return next(folder / name for name in COLOR_FOLDERS if (folder / name).is_dir())
-
-
-def _read_depth(file: Path) -> np.ndarray | None:
-    if file.suffix.lower() == ".npy":
-        try:
-            array = np.load(file, allow_pickle=False)
-        except (ValueError, EOFError, OSError, MemoryError):  # the last of a header that claims too much
-            return None
-        return array if isinstance(array, np.ndarray) else None  # several under one name are no picture
-    return _read_picture(file, cv2.IMREAD_UNCHANGED)
-
-
-def _read_rgb(file: Path) -> np.ndarray | None:
-    bgr = _read_picture(file, COLOR_AS_STORED)
-    return None if bgr is None else cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-
-
-def _read_picture(file: Path, how: int) -> np.ndarray | None:
-    """None of what cannot be read: a folder of that name, a bad disk, no permission, no picture."""
-    try:
-        data = np.fromfile(file, np.uint8)
-    except OSError:
-        return None
-    return cv2.imdecode(data, how) if data.size else None
-
-
 # --- anything --------------------------------------------------------------------------------------
 
 
@@ -367,7 +255,7 @@ def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple
         )
     if path.is_file() and path.suffix.lower() not in REALSENSE_SUFFIXES:
         raise UserError(f"{path}: a file of type {path.suffix!r}; expected a RealSense .bag or .db3.")
-    inside = [path] if path.is_file() else _visible(path)
+    inside = [path] if path.is_file() else visible(path)
     files = [file for file in inside if file.suffix.lower() in REALSENSE_SUFFIXES]
     if not files:
         return folder_sources(path, depth_unit_m, meta)
@@ -378,21 +266,8 @@ def find_sources(path: Path, depth_unit_m: float, meta: dict[str, Any]) -> tuple
         source = replace(source, meta={**source.meta, **meta})
         return replace(source, depth_unit_m=depth_unit_m, unit_is_certain=False) if depth_unit_m else source
 
-    sources, refused = _each(files, given)
+    sources, refused = opened(files, given)
     passed_over = (
-        f"{p}: pictures beside RealSense files: import it by itself." for p in inside if _is_pair(p)
+        f"{p}: pictures beside RealSense files: import it by itself." for p in inside if is_pair(p)
     )
     return sources, [*refused, *passed_over]
-
-
-def _each(paths: Iterable[Path], source_of: Callable[[Path], Source]) -> tuple[list[Source], list[str]]:
-    """(the sources of `paths`, why others are refused). Raises UserError if all are."""
-    sources, refused = [], []
-    for path in paths:
-        try:
-            sources.append(source_of(path))
-        except UserError as error:
-            refused.append(str(error))
-    if not sources:
-        raise UserError(refused[0])
-    return sources, refused

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from ddgrasp.errors import UserError
+
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg")
 """Those of colour pictures, in small or capital letters."""
 _ROLE_WORDS = ("depth", "color", "colour", "rgb", "image")
@@ -41,6 +43,10 @@ class Source:
     """Metres per count of integer depth; for floating-point depth, metres per unit."""
     meta: dict[str, Any]
     """Fields of meta.json."""
+    shape: tuple[int, ...] | None = None
+    """(rows, columns) of depth; None for those of the first frame that can be used."""
+    floats: bool | None = None
+    """Whether depth is floating-point; None if one unit is that of both kinds."""
     unit_is_certain: bool = False
     """Whether depths that cannot be a D4xx's are the scene's fault, not the unit's."""
     closing_meta: Callable[[], dict[str, Any]] = dict
@@ -52,6 +58,29 @@ class Source:
     cut_short: Callable[[OSError], None] | None = None
     """What is told that a frame could not be written, where the frames before are kept then, since they come
     but once; None keeps none."""
+
+
+def is_depth(depth: np.ndarray) -> bool:
+    """Whether an array can be depth in some unit: one channel of floats, or integers of more than 8 bits."""
+    return depth.ndim == 2 and depth.dtype.kind in "iuf" and depth.dtype.itemsize > 1
+
+
+def opened(paths: Iterable[Path], source_of: Callable[[Path], Source]) -> tuple[list[Source], list[str]]:
+    """(the sources of `paths`, why others are refused). Raises UserError if all are."""
+    sources, refused = [], []
+    for path in paths:
+        try:
+            sources.append(source_of(path))
+        except UserError as error:
+            refused.append(str(error))
+    if not sources:
+        raise UserError(refused[0])
+    return sources, refused
+
+
+def visible(folder: Path) -> list[Path]:
+    """What is in it, sorted, but for names that begin with a dot, as what is not finished has."""
+    return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
 
 
 def in_time(file: Path) -> list[tuple[Decimal, str]]:
