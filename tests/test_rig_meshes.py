@@ -241,6 +241,10 @@ def absent() -> tuple[Part, ...]:
     return (Part("side", trimesh.load_mesh("/nowhere/nope.stl"), (0.5, 0.5, 0.5)),)
 
 
+def unknown() -> tuple[Part, ...]:
+    return (Part("side", trimesh.load_mesh(__file__), (0.5, 0.5, 0.5)),)
+
+
 SIDE = Part("side", trimesh.creation.box((60, 40, 20)), (0.5, 0.5, 0.5))
 
 
@@ -248,7 +252,8 @@ SIDE = Part("side", trimesh.creation.box((60, 40, 20)), (0.5, 0.5, 0.5))
     ("shape", "said"),
     [
         (absent, r"The shape of 'tin' cannot be made \(.*file"),
-        (lambda: SIDE, "The shape of 'tin' cannot be made .*not iterable"),
+        (unknown, r"The shape of 'tin' cannot be made \(.*not supported"),
+        (lambda: SIDE, "The shape of 'tin' gives .*; expected a tuple of Part"),
         (lambda: (SIDE.mesh,), "The shape of 'tin' gives .*; expected a tuple of Part"),
         (lambda: (replace(SIDE, rgb=(1, 0.5, 0, 1)),), r"tin, side: rgb is \(1, 0.5, 0, 1\); expected three"),
     ],

@@ -129,14 +129,38 @@ def test_pictures_in_another_unit_than_most_are_left_out_unless_one_is_given(tmp
     np.testing.assert_array_equal(Recording.open(tmp_path / "given" / "desk").depth_mm(1), depth_mm(1))
 
 
-@pytest.mark.parametrize("folder", ["depth", "rgb"])
-def test_two_pictures_of_one_name_are_refused(tmp_path, folder):
+@pytest.mark.parametrize(
+    ("folder", "other"), [("depth", "0001_depth.tif"), ("depth", "0001.png"), ("rgb", "0001_rgb.jpg")]
+)
+def test_two_pictures_of_one_moment_are_refused(tmp_path, folder, other):
     root = make_folder(tmp_path / "desk", frames=2)
     file = next((root / folder).glob("0001*.png"))
-    file.with_suffix(".npy" if folder == "depth" else ".jpg").write_bytes(file.read_bytes())
-    with pytest.raises(UserError, match=rf"0001_{folder}\.\w+ and 0001_{folder}\.\w+ have one name: keep"):
+    (root / folder / other).write_bytes(file.read_bytes())
+    with pytest.raises(UserError, match=r"0001\S+ and 0001\S+ have one name: keep pictures of one type"):
         run(root, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_pictures_for_people_beside_depth_are_passed_over(tmp_path):
+    root = make_folder(tmp_path / "desk", frames=3)
+    for file in (root / "depth").glob("*.png"):
+        np.save(file.with_suffix(".npy"), cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
+        cv2.imwrite(str(file), np.full(SIZE, 7, np.uint8))
+    run(root, "--out", tmp_path / "out", "--consecutive")
+    recording = Recording.open(tmp_path / "out" / "desk")
+    assert len(recording) == 3 and recording.consecutive
+    np.testing.assert_array_equal(recording.depth_mm(2), depth_mm(2))
+
+
+def test_of_many_pictures_a_few_say_of_which_size_and_unit_they_are(tmp_path, capsys):
+    root = make_folder(tmp_path / "desk", frames=20)
+    cv2.imwrite(str(root / "depth" / "0000_depth.png"), depth_mm(0, (30, 40)))
+    for frame in (3, 6):
+        (root / "depth" / f"{frame:04d}_depth.png").unlink()
+        np.save(root / "depth" / f"{frame:04d}_depth.npy", depth_mm(frame).astype(np.float32) / 1000)
+    run(root, "--out", tmp_path / "out")
+    assert len(Recording.open(tmp_path / "out" / "desk")) == 17
+    assert capsys.readouterr().out.count("the others' integers") == 2
 
 
 def test_an_empty_colour_folder_is_passed_over_for_one_with_pictures(tmp_path):
@@ -154,6 +178,9 @@ def test_two_sources_of_one_name_do_not_call_each_other_made_before(tmp_path):
         len(done) == 1 and [line for line in refused if "another one here is called walk" in line] == refused
     )
     assert refused[0].startswith(str(tmp_path / "walk.db3"))
+    empty = replace(twice[0], frames=lambda: iter(()))
+    done, refused = importers.import_all([empty, twice[1]], tmp_path / "second")
+    assert len(done) == 1 and "it is empty" in refused[0], "one that was refused has taken no name"
 
 
 def test_a_telephone_that_was_held_upright_turns_no_colour(tmp_path):

@@ -257,8 +257,8 @@ def test_the_round_end_of_what_begins_beside_the_pads_counts():
         ({"box": Box((0.02, 0.041, 0.02))}, "0.082 m wide where the fingers close; a hand opens by 0.08 m"),
         ({"mass_kg": -1.0}, "mass_kg is -1; expected more than 0"),
         ({"mass_kg": 120.0}, "mass_kg is 120; expected more than 0, at most 3"),
-        ({"friction": 0.0}, "friction is 0; expected more than 0"),
-        ({"friction": float("inf")}, "friction is inf; expected more than 0"),
+        ({"friction": 0.0}, "friction is 0; expected a number above 0"),
+        ({"friction": float("inf")}, "friction is inf; expected a number above 0"),
         ({"category_id": 0}, "category_id is 0; expected 1 or more"),
         ({"rgb": (255, 128, 0)}, r"rgb is \(255, 128, 0\); expected three numbers of 0 to 1"),
         ({"rgb": "#ff8000"}, "rgb is '#ff8000'; expected three"),
@@ -272,7 +272,7 @@ def test_what_no_hand_grasps_or_no_engine_sees_is_refused(change, message):
 
 @pytest.mark.parametrize("name", ["ycb/mug", "two words", "", ".hidden", "a&b"])
 def test_a_name_that_no_file_can_have_is_refused(name):
-    with pytest.raises(UserError, match="An object is called .*expected letters, digits"):
+    with pytest.raises(UserError, match="An object is called .*expected letters of ASCII, digits"):
         replace(get_object("cube"), name=name)
 
 

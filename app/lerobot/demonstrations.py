@@ -45,11 +45,11 @@ def read(folder: Path, objects: Sequence[str] = (), noisy: Path | None = None) -
             raise unknown_name("object", name, names)
     store = EpisodeStore(folder / STORE)
     depth, depth_is = (store, CLEAN_DEPTH) if noisy is None else _open_noisy(noisy, folder)
+    if not len(store):
+        raise UserError(f"{folder} has no episode: collect some with `ddgrasp demos collect`.")
     indices = store.episodes("object_index").tolist()
     taken = [i for i, index in enumerate(indices) if not objects or names[index] in objects]
     if not taken:
-        if not objects:
-            raise UserError(f"{folder} has no episode: collect some with `ddgrasp demos collect`.")
         raise UserError(f"{folder} has no episode with {' or '.join(objects)}: choose others of {names}.")
     width, height = config.world.profile.width_px, config.world.profile.height_px
     disturbed = (

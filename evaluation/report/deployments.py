@@ -20,9 +20,9 @@ _NOTE = (
     "still for want of a frame or a state. Frame to command: from a frame in hand to the command sent.</p>"
 )
 
-_FIELDS = ("steps", "holds", "missed_deadlines", "fault", "events", "latency_ms")
-"""What the page shows of a report."""
 _COUNTS, _TIMES = ("steps", "holds", "missed_deadlines"), ("p50", "p99")
+_FIELDS = (*_COUNTS, "fault", "events", "latency_ms")
+"""What the page shows of a report."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,10 @@ def _report(path: Path) -> Mapping[str, Any]:
 
 def _damaged(report: Mapping[str, Any]) -> list[str]:
     """Fields of another kind than `ddgrasp deploy` writes."""
-    times, number = report["latency_ms"], (int, float, type(None))
-    timed = isinstance(times, dict) and all(isinstance(times.get(name, ""), number) for name in _TIMES)
-    listed = isinstance(report["events"], list)
+    times, events = report["latency_ms"], report["events"]
+    taken = [times.get(name, "") for name in _TIMES] if isinstance(times, dict) else [""]
+    timed = all(time is None for time in taken) or all(isinstance(time, int | float) for time in taken)
+    listed = isinstance(events, list) and all(isinstance(event, str) for event in events)
     counted = [name for name in _COUNTS if not isinstance(report[name], int) or report[name] < 0]
     return counted + ["latency_ms"] * (not timed) + ["events"] * (not listed)
 

@@ -192,12 +192,17 @@ def _check_libraries() -> None:
 
 
 def _parts(described: MeshObject) -> Sequence[Part]:
-    """What its shape gives. UserError, with the reason, where that is no sequence of parts."""
+    """What its shape gives. UserError, with the reason, where its file cannot be read, or that is no sequence
+    of parts."""
     try:
-        parts = tuple(described.shape())
-    except (OSError, ValueError, TypeError) as error:  # trimesh: a file that is absent or of no known type
+        parts = described.shape()
+    except (
+        OSError,
+        ValueError,
+        NotImplementedError,
+    ) as error:  # trimesh's, of absent files and unknown types
         raise UserError(f"The shape of {described.name!r} cannot be made ({error}).") from error
-    if not all(isinstance(part, Part) for part in parts):
+    if not isinstance(parts, tuple | list) or not all(isinstance(part, Part) for part in parts):
         raise UserError(f"The shape of {described.name!r} gives {parts!r}; expected a tuple of Part.")
     return parts
 

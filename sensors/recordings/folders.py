@@ -1,10 +1,10 @@
 """Folders of pictures as sources of recordings: depth/ beside colour, named alike or by their times."""
 
 import json
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
+from statistics import mode
 from typing import Any
 
 import cv2
@@ -20,6 +20,7 @@ from sensors.recordings.sources import (
     has_alone_between,
     in_time,
     is_depth,
+    key,
     opened,
     paired,
     visible,
@@ -30,7 +31,7 @@ COLOR_FOLDERS = ("color", "colour", "rgb", "image")
 _COLOR_NAMES = ", ".join(f"{name}/" for name in COLOR_FOLDERS)
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 LOOKED_AT = 9
-"""Pictures that say of which size and kind a folder's are."""
+"""Pictures, from the first to the last, that say of which size and kind a folder's are."""
 KEPT_META = (
     "sensor", "fx_px", "baseline_m", "hz", "consecutive_frames", "color_aligned_to_depth", "repeated_frames",
     "licence", "source", UNIT_IS_CERTAIN,
@@ -70,18 +71,16 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
         UserError: no depth pictures, two files of one name, or a meta.json that is none.
     """
     pictures = (p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
-    files = sorted(pictures, key=in_time)
+    files = _named_once(sorted(pictures, key=in_time))
     if not files:
         raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
     own = _own_meta(folder / META_FILE) or _own_meta(folder / BEGUN_FILE)
     depth_unit_m = depth_unit_m or own.get("depth_unit_m", 0.0)
-    shape, floats = _most(files)
     by_kind = not depth_unit_m
+    shape, floats = _most(files, by_kind)
     if by_kind:
         depth_unit_m = 1.0 if floats else DEPTH_UNIT_M
-    colors = _colors(folder)
-    _check_names(files)
-    _check_names(colors)
+    colors = _named_once(_colors(folder))
     pairs, note = paired(files, colors)
     by_name = not note  # by time, a faster colour stream has pictures of its own
     gaps = (own.get("frames") or 0) > len(files) or (by_name and has_alone_between(colors, pairs.values()))
@@ -99,27 +98,36 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
     )  # fmt: skip
 
 
-def _most(files: Sequence[Path]) -> tuple[tuple[int, ...] | None, bool | None]:
-    """(size of depth, whether it is floating-point) of most of a few `files` from first to last, or else of
-    the first that is depth at all."""
+def _most(files: Sequence[Path], by_kind: bool) -> tuple[tuple[int, ...] | None, bool | None]:
+    """(size of depth, whether it is floating-point) of most of `LOOKED_AT` of the `files`, or else of the
+    first that is depth at all; `by_kind`: the size of those of that kind."""
 
     def kinds(some: Sequence[Path]) -> Iterator[tuple[tuple[int, ...], bool]]:
         read = (depth for depth in map(_read_depth, some) if depth is not None and is_depth(depth))
         return ((depth.shape, depth.dtype.kind == "f") for depth in read)
 
-    counts = Counter(kinds(files[:: -(-len(files) // LOOKED_AT)])) or Counter(islice(kinds(files), 1))
-    return counts.most_common(1)[0][0] if counts else (None, None)
+    seen = list(kinds(files[:: -(-len(files) // LOOKED_AT)])) or list(islice(kinds(files), 1))
+    if not seen:
+        return None, None
+    floats = mode(kind for _, kind in seen)
+    return mode(shape for shape, kind in seen if kind == floats or not by_kind), floats
 
 
-def _check_names(files: Sequence[Path]) -> None:
-    """UserError if two are of one moment by their names: each would be a frame, and in a unit of its own."""
-    named: dict[str, Path] = {}
+def _named_once(files: Sequence[Path]) -> list[Path]:
+    """Those of `files`, without what is no depth beside depth of its name, as pictures for people are.
+
+    Raises UserError for two of depth, or of colour, of one name: each would be a frame, in a unit of its own.
+    """
+    named: dict[str, list[Path]] = {}
     for file in files:
-        other = named.setdefault(file.stem, file)
-        if other is not file:
-            raise UserError(
-                f"{file.parent}: {other.name} and {file.name} have one name: keep pictures of one type there."
-            )
+        named.setdefault(key(file), []).append(file)
+    for alike in (alike for alike in named.values() if len(alike) > 1):
+        usable = [file for file in alike if (depth := _read_depth(file)) is not None and is_depth(depth)]
+        if len(usable) != 1:
+            names = " and ".join(file.name for file in alike)
+            raise UserError(f"{files[0].parent}: {names} have one name: keep pictures of one type there.")
+        named[key(alike[0])] = usable
+    return [file for file in files if file in named[key(file)]]
 
 
 def _own_meta(file: Path) -> dict[str, Any]:

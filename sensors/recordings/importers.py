@@ -146,9 +146,9 @@ def import_all(
         if name in names:
             refused.append(f"{source.path}: another one here is called {name}, too: rename one of them.")
             continue
-        names.add(name)
         try:
             done.append(import_recording(source, out / name))
+            names.add(name)
         except UserError as error:
             refused.append(str(error))
     if not done:
