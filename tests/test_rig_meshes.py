@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.layout import QPOS
 from mjx_envs import grasp_math
 from mjx_envs.objects import OBJECTS, get_object
+from rig.fr3 import scene
 from rig.mesh_world import MeshWorld
 from rig.meshes import convex
 from rig.meshes.bodies import CONTACT_GROUP, VISUAL_GROUP, MeshBody, body_of, make_body, place
@@ -235,6 +237,15 @@ def test_parts_that_cannot_be_told_apart_are_refused(names):
     parts = tuple(Part(name, trimesh.creation.box((60, 40, 20)), (0.5, 0.5, 0.5)) for name in names)
     with pytest.raises(UserError, match="The parts of 'tin' are called .*name of its own"):
         body_of(box("tin", shape=lambda: parts))
+
+
+def test_a_surface_s_name_may_have_what_xml_means_something_by(monkeypatch):
+    part = Part('nut & "bolt" <M8>', trimesh.creation.box((60, 40, 20)), (0.5, 0.5, 0.5))
+    monkeypatch.setitem(MESH_OBJECTS, "nut", box("nut", shape=lambda: (part,)))
+    thing = scene.meshed("nut")
+    made = ET.fromstring(f"<it>{thing.assets_xml}{thing.geoms_xml}</it>")
+    assert [mesh.get("name") for mesh in made.iter("mesh")][0] == f"object_{part.name}"
+    assert f"object_{part.name}" in [geom.get("mesh") for geom in made.iter("geom")]
 
 
 def absent() -> tuple[Part, ...]:

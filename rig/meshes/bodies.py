@@ -33,6 +33,8 @@ CONTACT_SOLREF = (0.005, 1.0)
 """Time constant (s) and damping ratio of contacts; half of the time constant bounds the time step."""
 VISUAL_GROUP, CONTACT_GROUP = 1, 3
 """MuJoCo draws groups 0 to 2 by default."""
+_UNREADABLE = (OSError, ValueError, NotImplementedError)
+"""What trimesh raises of a file that is absent, damaged or of a type that it does not know."""
 _CONTACT = re.compile(r"contact\d+")
 """What `make_spec` calls contact parts."""
 
@@ -196,11 +198,7 @@ def _parts(described: MeshObject) -> Sequence[Part]:
     of parts."""
     try:
         parts = described.shape()
-    except (
-        OSError,
-        ValueError,
-        NotImplementedError,
-    ) as error:  # trimesh's, of absent files and unknown types
+    except _UNREADABLE as error:
         raise UserError(f"The shape of {described.name!r} cannot be made ({error}).") from error
     if not isinstance(parts, tuple | list) or not all(isinstance(part, Part) for part in parts):
         raise UserError(f"The shape of {described.name!r} gives {parts!r}; expected a tuple of Part.")

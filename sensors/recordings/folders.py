@@ -20,7 +20,7 @@ from sensors.recordings.sources import (
     has_alone_between,
     in_time,
     is_depth,
-    key,
+    moment,
     opened,
     paired,
     visible,
@@ -120,14 +120,14 @@ def _named_once(files: Sequence[Path]) -> list[Path]:
     """
     named: dict[str, list[Path]] = {}
     for file in files:
-        named.setdefault(key(file), []).append(file)
+        named.setdefault(moment(file), []).append(file)
     for alike in (alike for alike in named.values() if len(alike) > 1):
         usable = [file for file in alike if (depth := _read_depth(file)) is not None and is_depth(depth)]
         if len(usable) != 1:
             names = " and ".join(file.name for file in alike)
             raise UserError(f"{files[0].parent}: {names} have one name: keep pictures of one type there.")
-        named[key(alike[0])] = usable
-    return [file for file in files if file in named[key(file)]]
+        named[moment(alike[0])] = usable
+    return [file for file in files if file in named[moment(file)]]
 
 
 def _own_meta(file: Path) -> dict[str, Any]:

@@ -99,8 +99,8 @@ def paired(depth: Sequence[Path], color: Sequence[Path]) -> tuple[dict[Path, Pat
     such a partner, but named by its time, has the nearest in time, if that is less than half a period away:
     half of the median between depth pictures, in whatever unit the names are.
     """
-    named = {key(file): file for file in color}
-    pairs = {file: named[key(file)] for file in depth if key(file) in named}
+    named = {moment(file): file for file in color}
+    pairs = {file: named[moment(file)] for file in depth if moment(file) in named}
     times = {file: time for file in depth if (time := _time(file)) is not None}
     colors = sorted((time, file) for file in color if (time := _time(file)) is not None)
     if len(pairs) == len(depth) or len(times) < 2 or not colors:
@@ -126,7 +126,7 @@ def has_alone_between(colors: Sequence[Path], taken: Iterable[Path]) -> bool:
     return len(places) > 0 and places[-1] - places[0] + 1 > len(places)
 
 
-def key(file: Path) -> str:
+def moment(file: Path) -> str:
     """The file's name without what says whether it is depth or colour: 0007_depth and 0007_rgb are a pair."""
     words = re.split(r"[-_.]", file.stem.lower())
     return "_".join(word for word in words if word not in _ROLE_WORDS)
