@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import stat
+from collections.abc import Iterator
 
 
 def ending() -> list[signal.Signals]:
@@ -11,6 +12,16 @@ def ending() -> list[signal.Signals]:
     and goes on without it."""
     hangs_up = signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
     return [signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hangs_up else [])]
+
+
+@contextlib.contextmanager
+def held_back(*numbers: signal.Signals) -> Iterator[None]:
+    """These come once the block has ended; processes that it starts never get them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def forget_terminal(number: int) -> None:

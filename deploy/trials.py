@@ -21,6 +21,7 @@ from jaxtyping import Float, UInt8
 from ddgrasp import contract
 from ddgrasp.config import Config
 from ddgrasp.errors import Trouble, UserError
+from ddgrasp.signals import held_back
 from deploy.changes import AS_IT_IS, Change
 from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
@@ -258,8 +259,10 @@ def run_trials(
         initializer=_start_worker,
         initargs=(config, policy_path, make, os.getpid()),
     )
-    waiting = {executor.submit(_run_in_worker, trial) for trial in trials}
+    waiting: set[Future] = set()
     try:
+        with held_back(signal.SIGINT, signal.SIGHUP):  # workers leave them to this process
+            waiting |= {executor.submit(_run_in_worker, trial) for trial in trials}
         for future in as_completed(waiting):
             waiting.discard(future)  # its film is megabytes
             yield future.result()
@@ -363,10 +366,8 @@ _make_bench: Callable[[], Bench]
 def _start_worker(
     config: Config, policy_path: Path, make: Callable[[Config, Path], Bench], parent: int
 ) -> None:
-    """Leave Ctrl-C and a terminal that closes to the parent, and go when the parent has gone."""
+    """Go when the parent has gone."""
     global _make_bench
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
     _make_bench = partial(make, config, policy_path)
 

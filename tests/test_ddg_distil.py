@@ -11,6 +11,7 @@ import pytest
 from ddg_jax import distil, sample, train
 from ddg_jax.data import Frames
 from ddg_jax.prior import make_prior
+from ddg_jax.train import config_schedule, step_keys
 from ddgrasp.config import (
     DDGConfig,
     DDGDepthConfig,
@@ -146,6 +147,33 @@ def test_teacher_and_student_see_the_prior_under_the_same_noise(monkeypatch):
     np.testing.assert_array_equal(given[0], given[1])
     off = given[0] - np.float32(0.7)
     assert off.std() == pytest.approx(0.2, rel=0.05) and abs(off.mean()) < 0.02
+
+
+@pytest.mark.parametrize(("limit", "order"), [(1.0, 2), (np.inf, 1)])
+def test_a_step_is_held_against_two_of_the_teacher_s(monkeypatch, limit, order):
+    """The fitted network's x_0 is clipped and its second step of second order; a distilled one's of first.
+    Not compiled; the network is linear, and the error weighs as much as the signal to the noise."""
+    monkeypatch.setattr(distil, "predict_clean", lambda config, params, x_k, *_: params["w"] * x_k)
+    monkeypatch.setattr(distil, "updated", lambda state, *_: state)
+    made, w = config_schedule(DISTILLED), 0.8
+    params = {"w": jnp.float32(w)}
+    state = first_state(params, optax.identity(), jax.random.key_data(jax.random.key(0)))
+    k, middle, end = path = distil.teacher_path(made.steps, 4, np.array([0, 1, 2, 3]), "quadratic")
+    x_0 = jax.random.uniform(jax.random.key(1), (4, 16, 24, 2), minval=-1.0)
+    _, metrics = distil.distil_step.__wrapped__(
+        DISTILLED, state, params, limit, path, x_0, jnp.zeros((4, 16, 24))
+    )
+
+    eps_key, _, _ = step_keys(state)
+    x_k = diffusion.q_sample(made, x_0, jnp.asarray(k), jax.random.normal(eps_key, x_0.shape))
+    first = jnp.clip(w * x_k, -limit, limit)
+    half = diffusion.dpm_solver_step(made, x_k, k, middle, first, k, x_k)
+    second = jnp.clip(w * half, -limit, limit)
+    before = k if order == 2 else middle
+    x_end = diffusion.dpm_solver_step(made, half, middle, end, second, before, first)
+    error = (distil.one_step_target(made, x_k, jnp.asarray(k), x_end, jnp.asarray(end)) - w * x_k) ** 2
+    weight = np.clip(diffusion.signal_to_noise(made, jnp.asarray(k)), *DISTILLED.training.snr_limits)
+    assert float(metrics["loss"]) == pytest.approx(float(jnp.mean(weight * error.mean((1, 2, 3)))), rel=1e-4)
 
 
 def test_a_step_s_average_has_the_configured_decay(monkeypatch):

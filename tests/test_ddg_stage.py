@@ -86,6 +86,14 @@ def test_manifest_says_what_was_made(fitted):
     assert picture.shape == (4 * 16, 2 * 24, 3)
 
 
+def test_deviation_is_that_of_inverse_depth_where_both_are_known():
+    depth_m = np.array([[[1.0, 0.0, 2.0, 1.0]]], np.float32)
+    surface_m = np.array([[[1.25, 1.0, 2.0, 0.0]]], np.float32)  # 0.2 1/m, a hole, 0, none
+    assert stage.deviation_statistics(depth_m, surface_m) == pytest.approx(
+        {"deviation_median_per_m": 0.1, "deviation_p99_per_m": 0.198}
+    )
+
+
 def test_a_generator_is_not_fitted_on_the_frames_that_it_is_judged_on(recordings, tmp_path, monkeypatch):
     """In the fit's and the score's place what they are given."""
     given = {}

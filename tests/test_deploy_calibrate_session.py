@@ -25,7 +25,7 @@ from ddgrasp.presets import get_preset
 from deploy import clock, kinematics
 from deploy import session as deploy_session
 from deploy.calibration import poses, session, standing
-from deploy.calibration.drive import Driver
+from deploy.calibration.drive import ARRIVED_RAD, Driver
 from deploy.calibration.hand_eye import invert, project, rotation_spread_rad
 from deploy.calibration.session import CalibrationOptions
 from deploy.calibration.standing import Offset, describe, offset
@@ -239,10 +239,38 @@ def test_after_an_arm_has_met_something_it_goes_back(tmp_path, bench, planned, m
         return replace(state, met="12 N" if near else "")
 
     touches: list[np.ndarray] = []
+    command, went = bench.arm.command, []
+
+    def told(q_target_rad, close):
+        command(q_target_rad, close)
+        if touches:
+            went.append(bench.arm.q_rad.copy())
+
     monkeypatch.setattr(bench.arm, "read_state", met)
+    monkeypatch.setattr(bench.arm, "command", told)
     said: list[str] = []
     session.run(fast(), options(tmp_path), said.append)
     assert "pose 4 of 7: not reached, left out: something is in the way" in said and len(touches) == 1
+    away_rad = [np.abs(planned - q).max(axis=1) for q in went]  # of every command, from every pose
+    back = next(i for i, each in enumerate(away_rad) if each.min() < ARRIVED_RAD)
+    assert away_rad[back].argmin() == 2, "to where it stood before"
+
+
+def test_a_view_in_which_the_arm_moved_is_left_out(tmp_path, bench, monkeypatch):
+    """Its joints would be between those of before and after the picture."""
+    drawn = bench.imager.picture
+
+    def sags():
+        gray = drawn()
+        if bench.imager.taken == 3:
+            bench.arm.q_rad = bench.arm.q_rad + 2 * session.MOVED_RAD * np.eye(7)[1]
+        return gray
+
+    monkeypatch.setattr(bench.imager, "picture", sags)
+    said: list[str] = []
+    assert session.run(fast(), options(tmp_path), said.append) is not None
+    assert "pose 3 of 7: the arm moved while the picture was taken, left out" in said
+    assert len(json.loads((tmp_path / "cal.json").read_text())["views"]) == 6
 
 
 def test_after_something_in_the_way_the_arm_goes_back_and_takes_free_ways_alone(

@@ -54,9 +54,20 @@ def test_arm_and_object_begin_where_they_do_in_the_development_rig(world):
     np.testing.assert_allclose(changed.data.qpos[QPOS.object_pos], other[QPOS.object_pos], atol=2e-3)
 
 
-def test_a_draw_is_the_same_whatever_is_changed():
-    one, again = (drawn(CONFIG, Trial(7, "can")) for _ in range(2))
+@pytest.mark.parametrize(
+    "changed",
+    [
+        CONFIG,
+        replace(CONFIG, world=replace(CONFIG.world, objects=("cube", "can", "apple"), episode_steps=7)),
+        replace(CONFIG, record=replace(CONFIG.record, other_tables=True)),
+        replace(CONFIG, deploy=replace(CONFIG.deploy, retry=False)),
+    ],
+)
+def test_a_draw_is_the_same_whatever_is_changed(changed):
+    """What pairs of trials rest on."""
+    one, again = drawn(CONFIG, Trial(7, "can")), drawn(changed, Trial(7, "can"))
     assert (one.world_seed, one.policy_seed) == (again.world_seed, again.policy_seed)
+    np.testing.assert_array_equal(one.T_world_cam, again.T_world_cam)
     assert one.rng.integers(1 << 30) == again.rng.integers(1 << 30)
 
 
@@ -79,7 +90,7 @@ def test_a_dark_table_returns_less_light():
 
     bright, dark = table_mm(Change()), table_mm(Change("dark table"))
     far = slice(0, 30)  # rows whose light has the longest way
-    assert np.mean(dark[far] == 0) > np.mean(bright[far] == 0)
+    assert np.mean(dark[far] == 0) > 1.5 * np.mean(bright[far] == 0)
 
 
 def test_every_trial_has_a_table_of_its_own_and_few_a_hole_where_the_rigs_is_too_bright():

@@ -155,13 +155,16 @@ def test_realsense_refuses_what_it_cannot_deliver():
         camera._checked(stream_intrinsics(ppy=299.5))
 
 
-def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
+@pytest.mark.parametrize(("stamp_ms", "exposed_s"), [(999_960.0, 4.96), (1_000_200.0, 5.0)])
+def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch, stamp_ms, exposed_s):
+    """No frame is of the future, where the camera's clock is ahead of the host's."""
+
     class DepthFrame:
         def get_frame_timestamp_domain(self):
             return "global_time"
 
         def get_timestamp(self):
-            return 999_960.0  # ms, 40 ms before the patched time of day
+            return stamp_ms  # of a patched time of day, 1,000,000
 
     class Library:
         class timestamp_domain:
@@ -172,7 +175,7 @@ def test_realsense_timestamps_become_ages_on_the_loops_clock(monkeypatch):
     camera = RealSenseCamera(clock, PROFILE)
     camera._rs = Library
     monkeypatch.setattr("deploy.devices.realsense_camera.time.time", lambda: 1000.0)
-    assert camera._exposed_s(DepthFrame()) == pytest.approx(4.96)
+    assert camera._exposed_s(DepthFrame()) == pytest.approx(exposed_s)
 
 
 class SlowGripper:
@@ -232,10 +235,11 @@ def test_fingers_that_are_stuck_and_say_so_are_told_again_and_then_an_error():
         gripper = SimpleNamespace(width=0.04, open=lambda speed, told=told: next(told), stop=lambda: None)
         hand = FrankaHand(gripper, (KeyError,), 20.0)
         hand.set(False)
-        time.sleep(0.1)
         if answers[-1]:
+            until(lambda told=told: not told.__length_hint__())
             assert hand.width_m() == 0.04
         else:
+            until(lambda hand=hand: hand._error is not None)
             with pytest.raises(HandError, match="told to open, twice, the hand stands at 40 mm"):
                 hand.width_m()
         hand.stop()
@@ -287,6 +291,30 @@ def test_an_arm_without_its_hand_is_told_from_no_arm(monkeypatch, answers):
 def test_a_mistyped_address_is_no_franka():
     with pytest.raises(UserError, match=r"no Franka at '172\.16\.\.0\.2' \(.*check --host"):
         franka_probe.check_arm("172.16..0.2", "fr3")
+
+
+def test_arm_and_hand_are_as_stiff_and_strong_as_configured(monkeypatch):
+    made = []
+
+    class NotedSpring(FrankaSpring):
+        def __init__(self, franky, arm, stiffness_nm_rad):
+            made.append(stiffness_nm_rad)
+
+    monkeypatch.setattr(franka_robot, "FrankaSpring", NotedSpring)
+    monkeypatch.setattr(franka_robot, "FrankaHand", lambda gripper, errors, force_n: made.append(force_n))
+    monkeypatch.setattr(franka_robot, "check_arm", lambda host, model: None)
+    library = SimpleNamespace(
+        Robot=lambda *host, **settings: None, RealtimeConfig=SimpleNamespace(Enforce=1, Ignore=2),
+        Exception=KeyError, NetworkException=KeyError,
+    )  # fmt: skip
+    monkeypatch.setattr(franka_robot, "load_franky", lambda: library)
+    config = FrankaConfig(host="127.0.0.9", stiffness_nm_rad=123.0, grip_force_n=21.0)
+    robot = FrankaRobot(config, SimClock(), None)
+    monkeypatch.setattr(robot, "_prepare", lambda: None)
+    monkeypatch.setattr(robot, "_gripper", lambda: None)
+    robot.start()
+    robot._spring()
+    assert made == [21.0, 123.0]
 
 
 class Homing:

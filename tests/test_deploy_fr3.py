@@ -4,7 +4,6 @@ The arm, its protocol and its gripper are franky-sim's, in a process of its own.
 time, so a busy machine makes these tests slower and nothing else.
 """
 
-import io
 import json
 import os
 import re
@@ -40,8 +39,8 @@ from deploy.kinematics import grip_pose, grip_position
 from deploy.loop import ControlLoop, LoopSettings
 from deploy.loop_report import LoopReport
 from deploy.policy import OnnxPolicy
-from deploy.session import ask_person, deploy
-from deploy.setup import safety_filter, speed_notice
+from deploy.session import deploy
+from deploy.setup import safety_filter
 from deploy_support import HOME_RAD, ScriptedCamera, constant_bias, depth_mm, describe, write_policy
 from rig.fr3.channel import PORT, Channel
 from rig.fr3.process import Fr3Rig
@@ -542,21 +541,3 @@ def test_rig_goes_with_the_process_that_started_it():
 def _listens(host: str) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex((host, 1339)) == 0
-
-
-def test_speed_the_policy_may_ask_for_is_said_when_dynamics_gives_less():
-    info, config = describe(), DeployConfig()
-    assert "may ask for 1.00 rad/s, deploy.franka.dynamics 0.2 gives 0.43" in speed_notice(config, info)
-    assert safety_filter(config, info, "franka").limits.velocity_rad_s == config.franka.speed_rad_s
-    assert speed_notice(replace(config, franka=replace(config.franka, dynamics=0.5)), info) == ""
-
-
-def test_nobody_to_ask_is_refused(monkeypatch):
-    monkeypatch.setattr("sys.stdin", open(os.devnull))
-    with pytest.raises(UserError, match="give --yes"):
-        ask_person("Is its way clear?")
-    terminal = io.StringIO()  # Ctrl-D
-    terminal.isatty = lambda: True
-    monkeypatch.setattr("sys.stdin", terminal)
-    with pytest.raises(UserError, match="not confirmed: the arm stays where it is"):
-        ask_person("Is its way clear?")

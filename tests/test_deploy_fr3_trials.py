@@ -17,15 +17,17 @@ from franky_sim.mujoco_simulator import MujocoSimulator
 from ddgrasp import contract
 from ddgrasp.config import Config, RecordConfig
 from ddgrasp.contract import HOME_RAD
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble, UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress
+from deploy import fr3_lab
 from deploy.clock import RobotClock, SimClock
 from deploy.devices import fr3_camera
 from deploy.devices.franka_faults import no_connection
 from deploy.devices.franka_robot import LOST
 from deploy.fr3_lab import Fr3Lab, free_host
 from deploy.fr3_trials import Fr3Bench, Fr3Runner
+from deploy.interfaces import RobotError
 from deploy.trials import TrialResult
 from deploy_support import constant_bias, describe, write_policy
 from evaluation import rig_trials
@@ -237,6 +239,23 @@ def test_a_connection_lost_at_the_start_is_made_again(said):
         return "made"
 
     assert Fr3Lab("primitive").repeated(attempt) == "made" and len(attempts) == 2
+
+
+def test_a_connection_lost_again_and_again_is_the_machine_s_fault():
+    def lost():
+        raise RobotError(f"{LOST} 127.0.0.2 is lost")
+
+    with pytest.raises(Trouble, match=r"is lost \(3 times\): use fewer --workers"):
+        Fr3Lab("mesh").repeated(lost)
+
+
+def test_no_free_address_is_said(monkeypatch):
+    def taken(host: str):
+        raise UserError(f"{host} is another rig's.")
+
+    monkeypatch.setattr(fr3_lab, "check_ports", taken)
+    with pytest.raises(UserError, match="no loopback address is free for an FR3 rig: end the others"):
+        free_host()
 
 
 def test_a_series_on_the_rig_is_kept_and_not_run_again(tmp_path, open_gl):

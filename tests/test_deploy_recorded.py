@@ -205,7 +205,7 @@ def test_a_worker_goes_when_its_parent_was_killed(tmp_path):
             parent.kill()
             parent.wait()
     with worker:
-        worker.settimeout(5)
+        worker.settimeout(20)
         try:
             assert worker.recv(1) == b""
         except TimeoutError:

@@ -1,5 +1,7 @@
 """What a user configures is what the filter and the loop keep to."""
 
+import io
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +13,8 @@ from ddgrasp.errors import UserError
 from deploy.clock import RealClock, RobotClock, SimClock
 from deploy.devices.options import SessionOptions
 from deploy.loop import LoopSettings
-from deploy.session import keep_time_of
-from deploy.setup import check_start, loop_settings, safety_filter, space_notice
+from deploy.session import ask_person, keep_time_of
+from deploy.setup import check_start, loop_settings, safety_filter, space_notice, speed_notice
 from deploy_support import KinematicRobot, describe
 
 DEPLOY, FR3 = DeployConfig(), contract.ARMS["fr3"]
@@ -121,3 +123,21 @@ def test_a_hand_that_is_not_moved_does_not_try_again():
     assert (
         loop_settings(config, describe()).retry and not loop_settings(config, describe(), moves=False).retry
     )
+
+
+def test_speed_the_policy_may_ask_for_is_said_when_dynamics_gives_less():
+    info, config = describe(), DeployConfig()
+    assert "may ask for 1.00 rad/s, deploy.franka.dynamics 0.2 gives 0.43" in speed_notice(config, info)
+    assert safety_filter(config, info, "franka").limits.velocity_rad_s == config.franka.speed_rad_s
+    assert speed_notice(replace(config, franka=replace(config.franka, dynamics=0.5)), info) == ""
+
+
+def test_nobody_to_ask_is_refused(monkeypatch):
+    monkeypatch.setattr("sys.stdin", open(os.devnull))
+    with pytest.raises(UserError, match="give --yes"):
+        ask_person("Is its way clear?")
+    terminal = io.StringIO()  # Ctrl-D
+    terminal.isatty = lambda: True
+    monkeypatch.setattr("sys.stdin", terminal)
+    with pytest.raises(UserError, match="not confirmed: the arm stays where it is"):
+        ask_person("Is its way clear?")

@@ -328,6 +328,28 @@ def test_a_terminal_that_closes_costs_no_trial_that_runs(tmp_path):
     assert tried_one.index == 3
 
 
+class SaysWhatItIsSpared:
+    """A bench that leaves the signals that its process was spared before anything was imported there."""
+
+    def __init__(self, config: Config, folder: Path):
+        (folder / "spared").write_text(str(signal.pthread_sigmask(signal.SIG_BLOCK, ())))
+
+    def run(self, trial: Trial) -> tuple[TrialResult, None]:
+        return result(trial.index), None
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_ctrl_c_is_not_for_workers_even_while_they_start(tmp_path):
+    """Their modules take seconds to import, and would end in a traceback each."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    assert list(run_trials(CONFIG, tmp_path, [Trial(0, "apple")], 1, SaysWhatItIsSpared))
+    spared = (tmp_path / "spared").read_text()
+    assert "SIGINT" in spared and "SIGHUP" in spared and "SIGTERM" not in spared
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
+
+
 def test_ctrl_c_while_one_is_kept_costs_no_trial_that_runs(tmp_path, ctrl_c):
     trials, kept = [Trial(i, "apple") for i in range(12)], []
 

@@ -58,6 +58,8 @@ def test_kid_by_hand():
     # k = (pq + 1)^3: within x 1 and 1, within y 1 and 1, across 1 everywhere
     assert distances.mmd2(x, y) == pytest.approx(0)
     assert distances.mmd2(x, x) == pytest.approx(1 + 1 - 2 * (1 + 1 + 1 + 8) / 4)
+    # By the number of features: (1 * 2 + 3 * 1) / 2 + 1.
+    assert distances.kernel(np.array([[1.0, 3.0]]), np.array([[2.0, 1.0]])).item() == pytest.approx(3.5**3)
     with pytest.raises(UserError, match="subsets of 1000"):
         distances.kid(x, y)
     with pytest.raises(UserError, match="expected"):

@@ -61,6 +61,16 @@ def test_alike_and_different_sets():
     assert same["mixing"]["value"] == pytest.approx(1, abs=0.25) and other["mixing"]["value"] < 0.05
     assert same["fid"]["value"] < 2 and other["fid"]["value"] == pytest.approx(6 * 4**2, rel=0.2)
     assert abs(same["kid_x100"]["value"]) < 0.1 * other["kid_x100"]["value"]
+    kid, _ = distances.kid(real.features, far.features, CONFIG.kid_subsets, CONFIG.kid_subset_size)
+    assert other["kid_x100"]["value"] == pytest.approx(100 * kid)
+
+
+def test_kid_of_few_maps_draws_half_of_the_smaller_set():
+    real, few = sample(0, groups=4), sample(2, 4.0, 3, 200)
+    drawn = [(real.groups[:1], few.groups[:1])] * 2
+    kid, _ = distances.kid(real.features, few.features, CONFIG.kid_subsets, len(few.features) // 2)
+    assert len(few.features) // 2 < CONFIG.kid_subset_size
+    assert two_samples.compare(real, few, CONFIG, drawn)["kid_x100"]["value"] == pytest.approx(100 * kid)
 
 
 def test_neighbours_of_alike_sets_may_mix_more_than_by_chance():

@@ -26,7 +26,7 @@ from demos.stage import STORE
 from demos.store import EpisodeStore
 from export import stage
 from job_support import make_job
-from learning.params import save_params
+from learning.params import load_params, save_params
 from student_jax import policy
 
 CONFIG = Config(
@@ -70,6 +70,15 @@ def test_a_missed_bound_writes_nothing_and_keeps_the_old_file(tmp_path):
         stage.run(make_job("export", config, tmp_path / "export"))
     assert old.read_bytes() == b"old"
     assert not artifacts.is_finished(tmp_path / "export")
+
+
+def test_actions_that_are_no_numbers_are_written_nowhere(tmp_path):
+    finish_student(tmp_path, CONFIG)
+    path = tmp_path / "student" / policy.PARAMS_FILE
+    save_params(path, jax.tree.map(lambda a: a * np.nan, load_params(path)))
+    with pytest.raises(UserError, match="no finite numbers on some inputs; nothing was written"):
+        stage.run(make_job("export", CONFIG, tmp_path / "export"))
+    assert not (tmp_path / "export" / stage.POLICY_FILE).exists()
 
 
 def test_a_larger_bound_is_advised_where_the_setting_takes_it():

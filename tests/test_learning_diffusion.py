@@ -216,6 +216,10 @@ def test_the_last_row_of_the_table_leads_to_the_clean_sample():
     assert s.ddim_table(made, s.timesteps(20, 4))[-1, 2:].tolist() == [1, 0]
 
 
+def test_linear_noise_rises_from_a_ten_thousandth_to_a_fiftieth():
+    np.testing.assert_allclose(s.linear_betas(3), [1e-4, 0.01005, 0.02], rtol=1e-12)
+
+
 def test_a_terminal_time_below_one_is_the_start_of_the_whole_schedule():
     """Half the time in 10 steps is the first half of 20 steps."""
     np.testing.assert_allclose(s.cosine_betas(10, 0.5), s.cosine_betas(20)[:10], rtol=1e-12)

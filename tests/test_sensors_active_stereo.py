@@ -16,6 +16,7 @@ from ddgrasp.config import RecordConfig, StereoConfig, WorldConfig
 from ddgrasp.errors import UserError
 from mjx_envs.camera import Buffers, Camera, nominal_camera
 from rig.camera import RigCamera, jittered_pose
+from sensors.models import matching
 from sensors.models.active_stereo import ActiveStereo, of_scale
 from sensors.models.matching import flatten
 from sensors.models.materials import Material
@@ -25,6 +26,7 @@ PROFILE = WorldConfig().profile
 FB_PX_M = PROFILE.fx_px * PROFILE.baseline_m
 GREY = {0: Material(0.5, texture=0.1), 1: Material(0.5, texture=0.1)}
 T_WORLD_CAM = np.eye(4)
+JITTERS = ("camera_position_jitter_m", "camera_aim_jitter_m", "camera_roll_jitter_rad")
 
 
 def wall(range_m: float, square_range_m: float = 0.0, half_m: float = 0.1):
@@ -51,6 +53,25 @@ def wall(range_m: float, square_range_m: float = 0.0, half_m: float = 0.1):
 def sense(render, seed: int = 0, materials=GREY, **config) -> np.ndarray:
     camera = ActiveStereo(replace(StereoConfig(), **config), PROFILE)
     return camera.sense(render, T_WORLD_CAM, np.random.default_rng(seed), materials)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("block_px", 9), ("smoothness", 4.0), ("uniqueness_percent", 40), ("speckle_px", 10_000),
+        ("residual_limit", 0.3), ("contrast_limit", 30.0), ("dark_limit", 60), ("subpixel_steps", 4),
+        ("dot_radius_mrad", 2.0), ("speckle_contrast", 0.6), ("refine_window_px", 5),
+    ],
+)  # fmt: skip
+def test_every_setting_of_the_camera_is_used(name, value):
+    """A user sets them to a camera of his own."""
+    scene = wall(0.8, 0.6, 0.1)
+    assert getattr(StereoConfig(), name) != value
+    assert (sense(scene, **{name: value}) != sense(scene)).any()
+
+
+def test_the_matcher_compares_left_with_right_as_configured():
+    assert matching.matcher(replace(StereoConfig(), left_right_px=7), 48).getDisp12MaxDiff() == 7
 
 
 def test_windows_cover_as_much_of_a_surface_in_larger_pictures():
@@ -264,6 +285,21 @@ def test_jittered_pose_stays_near_the_nominal_one():
         assert np.abs(T[:3, 3] - nominal[:3, 3]).max() <= config.camera_position_jitter_m
         np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
         assert np.arccos(T[:3, 2] @ nominal[:3, 2]) < 0.25
+
+
+def test_a_pose_is_jittered_by_as_much_as_is_configured():
+    nominal, none = nominal_camera(PROFILE).T_world_cam, dict.fromkeys(JITTERS, 0.0)
+    still = jittered_pose(replace(RecordConfig(), **none), np.random.default_rng(3))
+    np.testing.assert_allclose(still, nominal, atol=1e-12)
+
+    def turned_rad(**jitter: float) -> float:
+        T = jittered_pose(replace(RecordConfig(), **none | jitter), np.random.default_rng(3))
+        np.testing.assert_allclose(T[:3, 3], nominal[:3, 3], atol=1e-12)
+        return np.arccos((np.trace(T[:3, :3].T @ nominal[:3, :3]) - 1) / 2)
+
+    for name in JITTERS[1:]:
+        assert turned_rad(**{name: 0.02}) > 5e-4
+        assert turned_rad(**{name: 0.04}) == pytest.approx(2 * turned_rad(**{name: 0.02}), rel=0.05)
 
 
 def test_lens_blur_is_as_wide_as_it_says_and_the_rig_s_as_it_was():

@@ -22,6 +22,7 @@ from ddgrasp.files import (
     atomic_path,
     atomic_write_bytes,
     atomic_write_json,
+    atomic_write_text,
     new_folder,
     read_json,
     replaced_folder,
@@ -47,6 +48,16 @@ def test_a_failing_write_leaves_the_previous_file_and_no_litter(tmp_path):
         raise KeyboardInterrupt
     assert path.read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["params.bin"]
+
+
+def test_bytes_are_on_the_disk_before_they_have_their_name_and_the_name_is(tmp_path, monkeypatch):
+    """Or a power cut leaves an empty file of that name."""
+    did: list[str] = []
+    fsync, rename = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda number: did.append("on disk") or fsync(number))
+    monkeypatch.setattr(os, "replace", lambda one, other: did.append("named") or rename(one, other))
+    atomic_write_text(tmp_path / "a.json", "1")
+    assert did == ["on disk", "named", "on disk"]
 
 
 def test_what_a_process_of_the_same_number_left_or_writes_is_in_nobody_s_way(tmp_path, monkeypatch):

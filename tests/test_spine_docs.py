@@ -233,10 +233,7 @@ def test_the_site_shows_every_page_and_every_package():
 def test_docstrings_and_comments_name_files_that_exist():
     packages = "|".join(_packages())
     named = re.compile(rf"(?<![\w./])((?:{packages}|tests|benchmarks|docs)/[\w/]+\.(?:py|md))")
-    missing = [
-        f"{file.relative_to(ROOT)}: {name}"
-        for file in _files()
-        for name in named.findall(file.read_text())
-        if not (ROOT / name).exists()
-    ]
+    found = [(file, name) for file in _files() for name in named.findall(file.read_text())]
+    assert len(found) > 50
+    missing = [f"{file.relative_to(ROOT)}: {name}" for file, name in found if not (ROOT / name).exists()]
     assert missing == []

@@ -425,14 +425,3 @@ def test_a_disk_that_takes_no_events_stops_nothing(tmp_path, monkeypatch, capsys
         said = capsys.readouterr().err
         assert "[fit] TensorBoard's events are not whole ([Errno 28] No space left" in said
     assert len(read_curves(tmp_path)["loss"]) == 39
-
-
-def test_progress_prints_plain_lines_with_an_estimate_outside_a_terminal(capsys):
-    progress = Progress(None, "teacher")
-    with progress.task("PPO", 4) as task:
-        for _ in range(4):
-            time.sleep(0.01)
-            task.advance(success=0.9312)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith("[teacher] PPO 1/4  0 s left  success 0.931")
-    assert lines[-1] == "[teacher] PPO 4/4  success 0.931"

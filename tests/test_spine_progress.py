@@ -37,11 +37,11 @@ def test_plain_lines_come_now_and_then_and_at_the_end(clock, capsys):
     with Progress(name="teacher").task("PPO", 4) as task:
         for seconds in (1, 2, 13, 1):  # since the line before: 1, 2, 15, 1
             clock.now += seconds
-            task.advance()
+            task.advance(success=0.9312)
     assert capsys.readouterr().err.splitlines() == [
-        "[teacher] PPO 1/4  3 s left",
-        "[teacher] PPO 3/4  5 s left",
-        "[teacher] PPO 4/4",
+        "[teacher] PPO 1/4  3 s left  success 0.931",
+        "[teacher] PPO 3/4  5 s left  success 0.931",
+        "[teacher] PPO 4/4  success 0.931",
     ]
 
 

@@ -315,6 +315,16 @@ def test_every_step_of_a_fit_on_pictures_draws_samples_of_its_own(tmp_path, monk
     np.testing.assert_array_equal(trainer.params["encoder"]["w"], 7)  # the averaged ones
 
 
+@pytest.mark.parametrize("damage", [[], {"done": []}])
+def test_a_damaged_plan_is_named(tmp_path, damage):
+    atomic_write_json(tmp_path / PLAN, damage)
+    trainer = Trainer(
+        Config("test", student=CONFIG), cast(Any, None), cast(Any, None), tmp_path, Progress(quiet=True)
+    )
+    with pytest.raises(UserError, match=r"plan\.json is damaged: delete .* and begin anew"):
+        trainer._restore()
+
+
 def test_a_fit_on_pictures_draws_steps_with_the_object_in_the_hand_by_their_weight(tmp_path, monkeypatch):
     drawn = []
 

@@ -395,6 +395,25 @@ def test_an_update_sees_by_the_scales_that_its_experience_was_made_with(from_not
     np.testing.assert_allclose(state.normalizer.std, floored, rtol=1e-5)
 
 
+@pytest.mark.parametrize("target_kl", [0.0, 0.01])
+def test_gradients_are_clipped_to_the_configured_norm(target_kl):
+    """After one of 100 and one of 1 Adam moves as after two of 1."""
+    params = learner.network_params({"w": jnp.zeros(1)}, {"w": jnp.zeros(1)})
+    moved = {}
+    for most in (1.0, 1000.0):
+        teacher = replace(TEACHER, max_grad_norm=most, target_kl=target_kl, total_steps=1000 * 8 * 4)
+        optimizer = learner.make_optimizer(teacher)
+        state = optimizer.init(params)
+        for size in (100.0, 1.0):
+            gradient = learner.network_params({"w": jnp.full(1, size)}, {"w": jnp.full(1, size)})
+            update, state = optimizer.update(gradient, state, params)
+        moved[most] = (float(update.policy["w"][0]), float(update.value["w"][0]))
+    for clipped, free, rate in zip(
+        moved[1.0], moved[1000.0], (teacher.learning_rate, teacher.critic_learning_rate), strict=True
+    ):
+        assert clipped == pytest.approx(-rate, rel=0.01) and abs(free) < 0.9 * rate
+
+
 def test_step_sizes_fall_to_a_tenth_while_each_of_both_learns():
     """Adam's steps along one constant gradient are as large as its step size."""
     teacher = dataclasses.replace(TEACHER, total_steps=10 * 8 * 4, critic_warmup=4, target_kl=0.0)
