@@ -39,7 +39,7 @@ class Study:
     """What is to be done; everything in it was checked."""
 
     config: Config
-    """What the rows have in common (`evaluation.table2.rows.shared_config`)."""
+    """What the rows have in common."""
     out: Path
     rows: tuple[str, ...]
     series: Series

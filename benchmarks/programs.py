@@ -2,7 +2,7 @@
 
 The one table that the tests lower for accelerators, `benchmarks.costs` prices, and memory is read from:
 
-    jitted, arguments = PROGRAMS["student train step"](config)
+    jitted, arguments = PROGRAMS["student: train step"](config)
     jitted.trace(*arguments).lower(lowering_platforms=("cuda",))
 
 Nothing is computed: arrays are stood in for by their shapes. Physics is MJX-JAX (the C engine is a host

@@ -23,6 +23,7 @@ from ddgrasp.arrays import AnyArray
 from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.depth import resize_nearest
 from ddgrasp.errors import UserError
+from ddgrasp.generator_metadata import ASPECT_TOLERANCE, FARTHEST_SANE_M
 from ddgrasp.shipped import shipped
 from learning import diffusion
 from learning.convolutions import compiler_options
@@ -31,9 +32,6 @@ from learning.params import Params, load_params, save_params
 PARAMS_FILE = "params.msgpack"
 SHARED = 2**31 - 1
 """Stands for the frame number in the key of the noise that an episode's frames share."""
-_ASPECT_TOLERANCE = 0.02
-FARTHEST_SANE_M = 200.0
-"""Simulated depth beyond this is another unit."""
 
 
 @dataclass(frozen=True)
@@ -328,7 +326,7 @@ def filled_up(values: np.ndarray, size: int) -> np.ndarray:
 def check_aspect(size: tuple[int, ...], config: DDGConfig) -> None:
     """UserError if simulated depth of (H, W) `size` is not of the generator's shape."""
     (height, width), maps = size, config.depth
-    if abs(width / height / (maps.width_px / maps.height_px) - 1) > _ASPECT_TOLERANCE:
+    if abs(width / height / (maps.width_px / maps.height_px) - 1) > ASPECT_TOLERANCE:
         raise UserError(
             f"Simulated depth is {width}x{height}, the generator's {maps.width_px}x{maps.height_px}: render "
             f"with that aspect ratio, or fit one with --ddg.depth.height-px "

@@ -212,11 +212,18 @@ def config_from_json(value: Mapping[str, Any]) -> Config:
 
 def _dataclass_from_json(cls: type, value: Mapping[str, Any], name: str) -> Any:
     types = typing.get_type_hints(cls)
-    fields = {field.name for field in dataclasses.fields(cls)}
-    if unknown := sorted(value.keys() - fields):
+    fields = {field.name: field for field in dataclasses.fields(cls)}
+    if unknown := sorted(value.keys() - fields.keys()):
         raise UserError(
             f"{name} has no field {unknown[0]!r}: it was made by another version of this project."
         )
+    missing = [
+        field.name
+        for field in fields.values()
+        if field.name not in value and field.default is field.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise UserError(f"{name} lacks {missing[0]!r}, which has no default: it is damaged.")
     arguments = {
         key: _dataclass_from_json(types[key], item, f"{name}.{key}")
         if dataclasses.is_dataclass(types[key])

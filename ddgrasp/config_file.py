@@ -58,7 +58,7 @@ def read(path: Path) -> Config:
     import yaml
 
     try:
-        values = yaml.load(path.read_text(), _loader())  # noqa: S506 - a safe loader
+        values = yaml.load(path.read_text(encoding="utf-8"), _loader())  # noqa: S506 - a safe loader
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "no text"
         raise UserError(f"--config {path} cannot be read ({reason}).") from None

@@ -25,6 +25,10 @@ OUTPUT_PREDICTED = "predicted"
 """(B, H, W) the generator's own map."""
 OUTPUT_MASK = "mask"
 """(B, H, W) bool, where an artefact was grafted."""
+ASPECT_TOLERANCE = 0.02
+"""Simulated depth is of the generator's shape, but for this share."""
+FARTHEST_SANE_M = 200.0
+"""Simulated depth beyond this is in another unit."""
 REMEDY = "make one with `ddgrasp ddg export`"
 
 

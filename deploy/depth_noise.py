@@ -19,9 +19,6 @@ from ddgrasp.errors import UserError
 from ddgrasp.onnx_runtime import ort
 from ddgrasp.shipped import shipped
 
-ASPECT_TOLERANCE = 0.02
-FARTHEST_SANE_M = 200.0
-"""Depth beyond this is another unit."""
 _OUTPUTS = {names.OUTPUT_DEPTH: np.float32, names.OUTPUT_PREDICTED: np.float32, names.OUTPUT_MASK: np.bool_}
 
 Array = Any
@@ -131,8 +128,8 @@ class DepthGenerator:
 
     def check_shape(self, height_px: int, width_px: int, count: int = 1) -> None:
         """UserError unless the generator takes `count` frames of that size."""
-        shape = self.info.width_px / self.info.height_px
-        if not (height_px and width_px and count) or abs(width_px / height_px / shape - 1) > ASPECT_TOLERANCE:
+        shape, tolerance = self.info.width_px / self.info.height_px, names.ASPECT_TOLERANCE
+        if not (height_px and width_px and count) or abs(width_px / height_px / shape - 1) > tolerance:
             raise UserError(
                 f"Depth is {count} frames of {width_px}x{height_px}; {self.path} takes the shape of "
                 f"{self.info.width_px}x{self.info.height_px}: render with that aspect ratio, or crop."
@@ -142,7 +139,7 @@ class DepthGenerator:
         count, height, width = frames.shape
         self.check_shape(height, width, count)
         low, high = float(frames.min()), float(frames.max())
-        if not (low >= 0 and high <= FARTHEST_SANE_M):  # neither is so for NaN
+        if not (low >= 0 and high <= names.FARTHEST_SANE_M):  # neither is so for NaN
             raise UserError(
                 f"Depth reaches from {low:g} to {high:g}; expected finite metres, 0 where nothing is in "
                 "range (put 0 for infinity and NaN; divide millimetres by 1000)."
@@ -232,7 +229,8 @@ class EpisodeNoise:
 
     def next(self, steps: int | None = None) -> Array:
         """(count, P, h, w) for the next frame of every camera. `steps` stays the first one's."""
-        steps = steps or self._info.steps
+        steps = self._info.steps if steps is None else steps
+        check_count("steps", steps, 1)
         if self._shared is None:
             self._steps = steps
             self._shared = self._normals.draw(self._shape(self._count))

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from ddgrasp import contract, policy_metadata
 from ddgrasp.config import Config
+from ddgrasp.config_hash import differences
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_json, read_json, to_json
 from ddgrasp.progress import Progress
@@ -96,10 +97,8 @@ def _begin(config: Config, takes: Takes, out: Path) -> None:
         del camera["other_tables"]  # as in recordings that were begun before there was a choice
     made = to_json({"takes": takes, "record": camera, "camera_scale": config.world.camera_scale})
     file = out / SETTINGS_FILE
-    if file.exists() and read_json(file) != made:
-        raise UserError(
-            f"{out} has recordings that were made otherwise ({SETTINGS_FILE} says how): choose another --out."
-        )
+    if file.exists() and (other := next(differences(read_json(file), made), "")):
+        raise UserError(f"{out} has recordings that were made otherwise ({other}): choose another --out.")
     out.mkdir(parents=True, exist_ok=True)
     atomic_write_json(file, made)
 

@@ -246,7 +246,7 @@ class Judge(Protocol):
         ...
 
 
-class RigCamera(Filmed, Judge, Protocol):
+class TrialCamera(Filmed, Judge, Protocol):
     """What a trial is filmed with and judged by."""
 
     def object_pos_m(self) -> Float[np.ndarray, "3"]:

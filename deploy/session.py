@@ -92,7 +92,7 @@ def _run(
     sensor = f"{seen_by}, {'D455 profile' if simulated else FITTED}"
     kept = DeploymentRecord(camera, policy.info.profile, sensor, config.deploy.film_every, simulated)
     about: dict[str, Any] = {"policy": str(policy_path), "robot": options.robot, "camera": seen_by}
-    about["policy_sha256"] = hashlib.sha256(policy_path.read_bytes()).hexdigest()
+    about["policy_sha256"] = hashlib.sha256(policy.path.read_bytes()).hexdigest()
     name = options.object_name or (config.world.objects[0] if options.camera == "stereo" else "")
     about |= {"dry_run": options.dry_run, "created": _stamp(), "calibration": place.as_dict()}
     ending = contextlib.ExitStack()

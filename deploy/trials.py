@@ -26,7 +26,7 @@ from deploy.changes import AS_IT_IS, Change
 from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
 from deploy.devices.rig_robot import SimRobot
-from deploy.interfaces import Depth, Filmed, RigCamera
+from deploy.interfaces import Depth, Filmed, TrialCamera
 from deploy.loop import ControlLoop
 from deploy.loop_report import LoopReport, Step
 from deploy.policy import OnnxPolicy
@@ -304,7 +304,7 @@ class Filming:
     """Collects pictures and the object's trajectory, shows every step to who watches, and ends a trial that
     has succeeded."""
 
-    def __init__(self, camera: RigCamera, every: int, watch: Watch | None = None):
+    def __init__(self, camera: TrialCamera, every: int, watch: Watch | None = None):
         self._camera, self._every, self._watch = camera, every, watch
         self._columns: list[tuple[int, UInt8[np.ndarray, "H W 3"], Depth]] = []
         self.object_pos_m: list[list[float]] = []

@@ -16,8 +16,9 @@ def save(directory: Path, name: str, measured: Mapping[str, Any]) -> Path:
 
 
 def load(directory: Path, name: str) -> dict[str, Any]:
-    """What the file holds; nothing without one, or if the stage was made anew since."""
+    """What the file holds; nothing without one, or if it is not of that artifact: made anew since, say."""
     if not (directory / name).exists():
         return {}
     saved, artifact = read_json(directory / name), artifacts.read_artifact(directory)
-    return saved if saved[artifact.manifest.stage] == artifact.hash else {}
+    own = isinstance(saved, dict) and saved.get(artifact.manifest.stage) == artifact.hash
+    return saved if own else {}

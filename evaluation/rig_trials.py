@@ -16,6 +16,7 @@ from ddgrasp.config_hash import config_hashes
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.files import atomic_write_bytes, atomic_write_text, to_json
 from ddgrasp.progress import Progress
+from ddgrasp.shipped import shipped
 from ddgrasp.trained import policy_objects
 from deploy.changes import Change
 from deploy.fr3_lab import Shapes, stopping_at
@@ -384,7 +385,7 @@ def made_with(config: Config, policy: Path, trained: Sequence[str]) -> dict[str,
     other objects may be added: which ones the rig has counts for nothing."""
     config = replace(config, world=replace(config.world, objects=_listed()))
     return {
-        "policy_sha256": hashlib.sha256(policy.read_bytes()).hexdigest(),
+        "policy_sha256": hashlib.sha256(shipped(policy).read_bytes()).hexdigest(),
         CONFIG_HASH: config_hashes(config, STAGE),
         _DRAWS: _draws_hash(config),
         _TRAINED: list(trained),

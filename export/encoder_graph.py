@@ -19,7 +19,7 @@ def write_encoder(
     student: StudentConfig,
     profile: CameraProfile,
 ) -> str:
-    """Picture to features (B, feature_size)."""
+    """Picture to features (B, encoder.features)."""
     x = layers.write_stem(g, picture, params["stem"], student.encoder.stem)
     for index, (_, stride) in enumerate(encoder.stage_plan(student)):
         for block in range(student.encoder.stage_blocks[index]):

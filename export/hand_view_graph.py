@@ -29,7 +29,7 @@ def write_grip(g: GraphBuilder, state: str) -> str:
 def write_hand_view(
     g: GraphBuilder, picture: str, grip: str, params: Params, student: StudentConfig, profile: CameraProfile
 ) -> str:
-    """Picture (B, C, h, w) and grip point (B, 3) to (B, hand_view_features)."""
+    """Picture (B, C, h, w) and grip point (B, 3) to (B, hand_view.features)."""
     view = _write_cut(g, picture, grip, student, profile)
     x = layers.write_stem(g, view, params["stem"], hand_view.STEM)
     for block in range(student.hand_view.blocks):

@@ -118,8 +118,7 @@ def _pick(frames_m: np.ndarray | None, size: int, rng: np.random.Generator) -> n
 def demo_frames(demos: Path, config: Config, count: int = 64) -> Float32[np.ndarray, "N 3 H W"] | None:
     """(N, 3, H, W) metres: frame triples of the first demonstrations in the stage directory `demos`; None if
     there are none."""
-    from demos.stage import STORE
-    from demos.store import EpisodeStore
+    from demos.store import STORE, EpisodeStore
 
     path = demos / STORE
     if not path.exists():

@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from ddgrasp import artifacts, attempts
 from ddgrasp.alone import alone_in
 from ddgrasp.config import DepthFeatureConfig
+from ddgrasp.config_hash import differences
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path, atomic_write_json, read_json, read_npz, to_json
 from ddgrasp.progress import Progress
@@ -97,8 +98,10 @@ def _train(config: DepthFeatureConfig, out: Path, quiet: bool) -> dict[str, Any]
 def _check_begun(config: DepthFeatureConfig, work: Path) -> None:
     path = work / attempts.STARTED
     wanted = to_json(config)
-    if path.exists() and read_json(path) != wanted:
-        raise UserError(f"{work} was begun with other settings: use those, another --out, or delete it.")
+    if path.exists() and (other := next(differences(read_json(path), wanted), "")):
+        raise UserError(
+            f"{work} was begun with other settings ({other}): use those, another --out, or delete it."
+        )
     atomic_write_json(path, wanted)
 
 

@@ -159,7 +159,7 @@ class GraspEnv(MjxEnv):
         touching, closing = jnp.all(new.touch > grasp_math.TOUCH_N), closes(action)
         grasped = touching & closing
         rewarded = rewards.grasped(self.config.reward, touching, closing, distances.grip_to_object)
-        held = jnp.linalg.norm(object_pos - jnp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
+        held = grasp_math.at_lift_target(object_pos, jnp)
         hold_count = jnp.where(held & grasped, episode.hold_count + 1, 0)
         succeeds = rewards.succeeds(self.config.reward, held, grasped) & sound
         bonus_count = jnp.where(succeeds, episode.bonus_count + 1, 0)

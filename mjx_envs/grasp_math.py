@@ -3,7 +3,7 @@
 from types import ModuleType
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
@@ -105,6 +105,11 @@ def controls(
     target = xp.clip(target, xp.asarray(contract.JOINT_LOWER_RAD), xp.asarray(contract.JOINT_UPPER_RAD))
     finger = xp.where(closes(action)[..., None], 0.0, contract.GRIPPER_MAX_WIDTH_M / 2)
     return xp.concatenate([target, finger, finger], axis=-1)
+
+
+def at_lift_target(object_pos: Float[AnyArray, "3"], xp: ModuleType = np) -> Bool[AnyArray, ""]:
+    """Whether an object at `object_pos` (3,), metres, is where it is to be lifted to."""
+    return xp.linalg.norm(object_pos - xp.asarray(contract.LIFT_TARGET_M)) < contract.LIFT_TOLERANCE_M
 
 
 def touch_from_sensors(

@@ -16,9 +16,10 @@ from ddgrasp.artifacts import Artifact
 from ddgrasp.config import Config
 from ddgrasp.contract import CameraProfile
 from ddgrasp.job import Job
-from ddgrasp.layout import ACTION, closes
+from ddgrasp.layout import CONTROLS, closes
 from ddgrasp.progress import Progress
 from mjx_envs.camera import nominal_camera
+from mjx_envs.grasp_math import controls
 from rig.camera import RigCamera, jittered_pose, make_camera
 from rig.world import RigWorld, make_world
 from sensors.recordings.recording import Recording, is_recording
@@ -74,9 +75,7 @@ def record_trajectory(
 def act(world: RigWorld, action: Float[np.ndarray, "8"]) -> None:
     """Execute one (8,) action for one control period."""
     q, _ = world.state()
-    target = q + contract.ACTION_SCALE_RAD * np.clip(action[ACTION.arm], -1.0, 1.0)
-    target = np.clip(target, contract.JOINT_LOWER_RAD, contract.JOINT_UPPER_RAD)
-    world.command(target, bool(closes(action)))
+    world.command(controls(q, action)[CONTROLS.arm], bool(closes(action)))
     world.step(contract.CONTROL_DT_S)
 
 

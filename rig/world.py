@@ -75,7 +75,8 @@ class RigWorld:
         for _ in range(round(seconds / contract.CONTROL_DT_S)):
             mujoco.mj_step(self.model, self.data, nstep=round(contract.CONTROL_DT_S / SIM_DT_S))
             mujoco.mj_kinematics(self.model, self.data)
-            self._hold_steps = self._hold_steps + 1 if self._held() else 0
+            held = grasp_math.at_lift_target(self.data.qpos[QPOS.object_pos])
+            self._hold_steps = self._hold_steps + 1 if held else 0
 
     def observation(self) -> Float[np.ndarray, "40"]:
         """(40,) what the teacher sees; for the teacher alone."""
@@ -97,10 +98,6 @@ class RigWorld:
     def success(self) -> bool:
         """Whether the object has been at the lift target for the last HOLD_STEPS control steps."""
         return self._hold_steps >= contract.HOLD_STEPS
-
-    def _held(self) -> bool:
-        away_m = np.linalg.norm(self.data.qpos[QPOS.object_pos] - np.array(contract.LIFT_TARGET_M))
-        return bool(away_m < contract.LIFT_TOLERANCE_M)
 
     def _put(self, seed: int, size: float, mass: float, friction: float) -> float:
         """Makes the object that of `self._spec`, by those factors; returns its origin's height at rest."""

@@ -19,8 +19,9 @@ DICTIONARIES: tuple[Dictionary, ...] = get_args(Dictionary)
 PAPERS_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0)}
 HELD_AT_M = 0.020
 """From the point between the finger pads to the pattern's upper edge: the plate's margin is between them."""
-_FEWEST_CORNERS = 6
-"""Calibration uses no view with fewer (`deploy.calibration.hand_eye.MIN_CORNERS`)."""
+MIN_CORNERS = 6
+"""Calibration uses no view with fewer, nor one with those of a single line: a plane's pose from them is a
+guess."""
 _SMALLEST_MARKER_M = 0.001
 _INCH_MM = 25.4
 _PRINT_DPI = 300
@@ -59,7 +60,7 @@ class CharucoBoard:
     def __post_init__(self) -> None:
         if self.dictionary not in DICTIONARIES:
             raise UserError(f"board dictionary {self.dictionary!r}: choose one of {', '.join(DICTIONARIES)}.")
-        if min(self.columns, self.rows) < 3 or self.corner_count < _FEWEST_CORNERS:
+        if min(self.columns, self.rows) < 3 or self.corner_count < MIN_CORNERS:
             raise UserError(f"a board of {self.columns} x {self.rows} squares: give at least 3 x 4.")
         if not 0 < self.marker_m < self.square_m:
             raise UserError(

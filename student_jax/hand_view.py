@@ -121,7 +121,7 @@ def cut(
     per_metre: Float[AnyArray, "B 2"],
     config: StudentConfig,
 ) -> Float[jax.Array, "B n n C"]:
-    """(B, n, n, C) part of the picture (B, h, w, C) around `centre`, samples hand_view_pitch_m apart.
+    """(B, n, n, C) part of the picture (B, h, w, C) around `centre`, samples hand_view.pitch_m apart.
 
     Measures are averaged over valid pixels alone; the valid channel becomes the share of them.
     """

@@ -17,6 +17,7 @@ from learning.params import load_params, save_params
 from learning.prefetch import Prefetched
 from learning.train_state import TrainState
 from ppo.policy import TeacherPolicy
+from ppo.warmup import guide_share
 from student_jax import train
 from student_jax.data import Frames, make_frames, random_crops, sharpen_gripper
 from student_jax.policy import Seen
@@ -53,8 +54,9 @@ def fit_on_poses(
     with progress.task("head, on poses", steps) as task:
         for i in range(rounds):
             head = jax.tree.map(np.asarray, state.ema) if i else None
-            share = 0.5**i if i < rounds - 1 else 0.0
-            actor = PoseActor(head, student, config.world.profile, rng, student.poses.episodes, share)
+            actor = PoseActor(
+                head, student, config.world.profile, rng, student.poses.episodes, guide_share(i, rounds)
+            )
             key = jax.random.fold_in(jax.random.PRNGKey(_SEED + config.seed), i)
             episodes = roller.run(key, actor)
             for name in _COLUMNS:

@@ -12,8 +12,7 @@ from ddgrasp.artifacts import Artifact
 from ddgrasp.files import to_json
 from ddgrasp.job import Job
 from ddgrasp.trained import trains
-from demos.stage import STORE
-from demos.store import EpisodeStore
+from demos.store import STORE, EpisodeStore
 from mjx_envs.render.batch_render import check_renderer
 from ppo import policy as teacher_policy
 from student_jax import evaluate, pretrained_encoder

@@ -341,6 +341,18 @@ def test_a_picture_that_cannot_be_written_costs_no_calibration(tmp_path, bench, 
     assert (tmp_path / "cal.json").exists() and said[-1] == "the hand keeps the board"
 
 
+def test_a_refused_calibration_leaves_the_one_before_and_its_picture(tmp_path, bench):
+    before = {}
+    for name in ("cal.json", "cal.png"):
+        before[name] = name.encode()
+        (tmp_path / name).write_bytes(before[name])
+    narrow = replace(BOARD, square_m=0.020, marker_m=0.015)
+    with pytest.raises(UserError, match=r"contradict one another .* Look at \S+cal-refused\.png"):
+        session.run(fast(), options(tmp_path, board=narrow), lambda text: None)
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before
+    assert cv2.imread(str(tmp_path / "cal-refused.png")) is not None
+
+
 def test_where_calibrate_writes_by_itself_is_tried_too(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").touch()

@@ -137,6 +137,9 @@ def test_noise_of_an_episode_lasts_and_ends_with_it(generator):
     for wrong in (1, ["a"], [True]):  # the tests' own check of types would stop these at the door
         with pytest.raises(UserError, match="are to be reset; expected numbers, as in"):
             type(noise).reset.__wrapped__(noise, wrong)
+    for none in (0, -1):
+        with pytest.raises(UserError, match=f"steps is {none}; expected a whole number of at least 1"):
+            noise.next(none)
     with pytest.raises(UserError, match="steps is 2; this noise was begun with 8"):
         noise.next(2)
 

@@ -159,6 +159,13 @@ def test_reflex_from_hitting_the_table_ends_the_trial_in_one_line(tmp_path, rig)
     lift_off(tmp_path)
 
 
+@pytest.mark.parametrize(("what", "values"), [("fly", {}), ("place", {"x_m": 0.5}), ("slow", {"off": 1})])
+def test_a_request_that_the_rig_does_not_know_is_refused_and_the_arm_stays_up(rig, what, values):
+    with pytest.raises(UserError, match=rf"the FR3 rig refuses .*'{what}'"):
+        rig.channel.ask(what, **values)
+    assert stands(rig)
+
+
 def test_a_hand_that_comes_down_slowly_comes_to_stand_on_the_table(tmp_path, rig):
     """What ends the trial above, at the speed that an arm has by default."""
     wrong_floor = config_for(HOST, workspace_lower_m=BELOW_THE_TABLE)

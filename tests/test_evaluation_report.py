@@ -33,7 +33,7 @@ from rig.film import INVALID_RGB, colored
 CONFIG = Config(preset="debug")
 ROOT = Path(__file__).parents[1]
 METRICS = {
-    "teacher": {"success": {"successes": 9, "n": 10}, "per_object": {"cube": {"successes": 4, "n": 5}}},
+    "teacher": {"success": {"successes": 9, "n": 10}, "objects": {"cube": {"successes": 4, "n": 5}}},
     "demos": {"episodes": 120},
     "record": {"frames": 300, "invalid_fraction": 0.107},
     "ddg": {"loss": 0.02},
@@ -64,7 +64,7 @@ def test_the_report_has_the_promised_keys(run_dir):
     half = {"rate": 0.5, "n": 10, "successes": 5, "low": pytest.approx(0.23659, abs=1e-5)}
     assert half.items() <= report["student_rig"]["success"].items()
     assert report["teacher"]["success"]["rate"] == 0.9
-    assert report["teacher"]["per_object"]["cube"]["rate"] == 0.8
+    assert report["teacher"]["objects"]["cube"]["rate"] == 0.8
     assert report["student_clean"]["success"]["high"] > 0.7 > report["student_clean"]["success"]["low"]
     assert report["student_ddg"]["success"]["n"] == 10
     assert report["export"]["max_abs_diff"] == 3e-6
@@ -259,7 +259,7 @@ def test_the_page_opens_with_the_verdict_and_leads_to_every_section(run_dir):
     write_report(run_dir)
     page = (run_dir / "report.html").read_text()
     opening = page[: page.index("<nav")]
-    assert "Targets: 2 met, 2 not met, 2 not measured." in opening
+    assert "Targets: 2 met, 3 not met, 1 not measured." in opening
     assert "<td class=missed>not met" in opening and "50.0 % of 10 (23.7 to 76.3)" in opening
     anchors = re.findall(r'<a href="#([^"]*)"', page)
     assert anchors == re.findall(r'<h2 id="([^"]*)"', page)

@@ -67,7 +67,7 @@ def test_holm_s_step_down():
 
 
 def test_the_main_table_is_the_paper_s_with_hand_made_noise_off():
-    shared = rows.shared_config(LAPTOP)
+    shared = LAPTOP
     assert [ROWS[name].source for name in TABLES["main"].rows] == [
         "ideal", "dextrah", "ideal", "monocular", "learned_ungrafted", "learned", "rig",
     ]  # fmt: skip
@@ -87,7 +87,7 @@ def test_the_main_table_is_the_paper_s_with_hand_made_noise_off():
 
 
 def test_rows_differ_in_the_student_s_section_alone_so_that_they_share_what_comes_before():
-    shared = rows.shared_config(LAPTOP)
+    shared = LAPTOP
     for row in ROWS.values():
         made = rows.row_config(shared, row)
         stages = (
@@ -104,7 +104,7 @@ def test_rows_differ_in_the_student_s_section_alone_so_that_they_share_what_come
 
 
 def test_rows_with_holes_cut_by_hand_differ_in_them_alone():
-    shared = rows.shared_config(LAPTOP)
+    shared = LAPTOP
     for name in ("sim_gt", "rand_noise", "ddg"):
         plain, holed = (rows.row_config(shared, ROWS[row]).student for row in (name, f"{name}_ellipses"))
         assert (plain.ellipse_dropout, holed.ellipse_dropout) == (0.0, rows.ELLIPSES)
@@ -117,7 +117,7 @@ def test_rows_with_holes_cut_by_hand_differ_in_them_alone():
 
 
 def test_ripple_filled_differs_from_ripple_in_who_fills_the_holes():
-    shared = rows.shared_config(LAPTOP)
+    shared = LAPTOP
     plain, filled = (rows.row_config(shared, ROWS[row]) for row in ("sim_gt_ripple", "sim_gt_ripple_filled"))
     assert plain.student.training == filled.student.training == LAPTOP.student.training
     picture = replace(plain.student.picture, fill_holes=True)
@@ -125,7 +125,7 @@ def test_ripple_filled_differs_from_ripple_in_who_fills_the_holes():
 
 
 def test_ripple_and_the_paper_s_generator_are_one_difference_each():
-    shared = rows.shared_config(LAPTOP)
+    shared = LAPTOP
     rippled = rows.row_config(shared, ROWS["ddg_ripple"])
     assert rippled.student.training == LAPTOP.student.training
     assert rippled.student.training.disparity_noise_px == 0.25
@@ -144,7 +144,7 @@ def test_ripple_and_the_paper_s_generator_are_one_difference_each():
 
 
 def test_a_filled_row_differs_from_its_own_in_who_fills_the_holes():
-    shared = rows.shared_config(LAPTOP)
+    shared = LAPTOP
     for name in ("sim_gt", "rand_noise", "ddg"):
         plain, filled = (rows.row_config(shared, ROWS[row]) for row in (name, f"{name}_filled"))
         picture = replace(plain.student.picture, fill_holes=True)
@@ -164,21 +164,18 @@ def test_students_may_start_from_one_that_saw_clean_depth_alone(tmp_path):
         artifacts.finish(folder, "student", whole, seconds=1.0, metrics={})
         return str(tmp_path / name)
 
-    def shared(start: str) -> str:
-        return rows.shared_config(
-            replace(LAPTOP, student=replace(LAPTOP.student, init_from=start))
-        ).student.init_from
+    def check(start: str) -> None:
+        rows.check_shared(replace(LAPTOP, student=replace(LAPTOP.student, init_from=start)))
 
-    clean = student("clean")
-    assert shared(clean) == clean
+    check(student("clean"))
     with pytest.raises(
         UserError, match=r"trained with student.training.unseen_share 0.25: a student that has"
     ):
-        shared(student("holes", unseen_share=0.25))
+        check(student("holes", unseen_share=0.25))
     with pytest.raises(UserError, match="trained with student.init_from 'pretrained/student'"):
-        shared(student("later", init_from="pretrained/student"))
+        check(student("later", init_from="pretrained/student"))
     with pytest.raises(UserError, match=r"trained with student.ellipse_dropout 4.0: a student that has"):
-        shared(student("cut", ellipse_dropout=4.0))
+        check(student("cut", ellipse_dropout=4.0))
 
 
 def test_pages_have_words_for_what_every_row_is_trained_on_and_sees():

@@ -403,6 +403,11 @@ def test_a_config_survives_its_journey_through_json(name):
     assert artifacts.config_from_json(value) == PRESETS[name]
 
 
+def test_a_config_without_a_field_that_has_no_default_is_refused():
+    with pytest.raises(UserError, match="config lacks 'preset', which has no default"):
+        artifacts.config_from_json({"world": {}})
+
+
 def test_a_config_with_an_unknown_field_is_refused():
     value = to_json(CONFIG)
     value["world"]["gravity"] = 3

@@ -112,7 +112,7 @@ class StudyTable2(FromPreset):
                 begun_by = rows.row_config(config, rows.ROWS[name], self.paper_generator)
                 attempts.check_place(self.out / results.PAPER / "ddg", "ddg", begun_by)
         if not results.has_students(self.out, names):
-            config = rows.shared_config(config)
+            rows.check_shared(config)
             check_config_values(config, shared, finished=("student",))  # the paper's rows have another `ddg`
         check_devices(config, shared)
         return Study(config, self.out, names, series, self.workers, left_out, self.paper_generator)
@@ -165,7 +165,7 @@ class StudyCauses:
         config = config_of(self.policy, self.preset, self.config_file)
         causes.run(config, self.policy, rows, series, self.out, self.workers, self.generator)
         print(self.out / causes.JSON_FILE, self.out / causes.TABLE_FILE, sep="\n")
-        print((self.out / causes.TABLE_FILE).read_text())
+        print((self.out / causes.TABLE_FILE).read_text(encoding="utf-8"))
 
 
 def _check_paper_generator(config: DDGConfig, given: str, made: Path) -> None:

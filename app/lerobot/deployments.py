@@ -146,7 +146,7 @@ def _read(deployment: Deployment, recording: Recording) -> Episode:
 def _steps(path: Path) -> list[dict[str, Any]]:
     """The lines of a steps.jsonl. Raises UserError for a damaged one."""
     try:
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         if lacking := next((name for row in rows for name in _NEEDED if name not in row), ""):
             raise ValueError(f"a step lacks {lacking}")
     except (ValueError, OSError, TypeError) as error:

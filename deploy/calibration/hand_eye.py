@@ -15,11 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from ddgrasp.errors import UserError
 from deploy.interfaces import Lens
-from sensors.charuco_board import CharucoBoard, Corners
+from sensors.charuco_board import MIN_CORNERS, CharucoBoard, Corners
 
-MIN_CORNERS = 6
-"""Fewer corners of a view are not used, nor are those of a single line: a plane's pose from them is a
-guess."""
 MIN_VIEWS = 6
 MIN_SPREAD_RAD = np.radians(5.0)
 """RMS of the hand's turns about the second of their principal axes. With turns about one axis alone the

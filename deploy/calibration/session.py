@@ -276,9 +276,10 @@ def _solved(
     host = config.deploy.franka.host
     measured = found.T_base_cam, found.rms_px, _serial(imager)
     result = Calibration(standing.now(), options.camera, host, *measured, details)
-    sheet = options.file.with_suffix(".png")
-    if found.rms_px <= MOST_RMS_PX:  # before the picture, which takes more room
+    saved = found.rms_px <= MOST_RMS_PX
+    if saved:  # before the picture, which takes more room
         standing.save(options.file, result)
+    sheet = options.file.with_name(f"{options.file.stem}{'' if saved else '-refused'}.png")
     atomic_write_bytes(sheet, picture.sheet(taken.pictures, taken.views, found, lens, options.board))
     _check_fit(found.rms_px, 1e3 * options.board.square_m, sheet, say)
     reads = "`ddgrasp deploy`" if options.out is None else f"`ddgrasp deploy --calibration {options.file}`"

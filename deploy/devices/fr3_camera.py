@@ -14,6 +14,7 @@ from deploy.devices.options import Setup
 from deploy.devices.realsense_camera import RealSenseCamera
 from deploy.interfaces import CameraError, Clock, Depth, Frame, Robot
 from mjx_envs.camera import Camera
+from mjx_envs.grasp_math import at_lift_target
 
 if TYPE_CHECKING:
     import mujoco
@@ -157,7 +158,7 @@ class Fr3Camera:
         return self._held_steps >= contract.HOLD_STEPS
 
     def object_pos_m(self) -> Float[np.ndarray, "3"]:
-        """See RigCamera; as of the last `read`."""
+        """See TrialCamera; as of the last `read`."""
         return self._object_pos_m
 
     def _colour(self) -> UInt8[np.ndarray, "H W 3"]:
@@ -166,8 +167,7 @@ class Fr3Camera:
 
     def _judge(self, object_pos_m: np.ndarray) -> None:
         self._object_pos_m = object_pos_m
-        held = np.linalg.norm(object_pos_m - contract.LIFT_TARGET_M) < contract.LIFT_TOLERANCE_M
-        self._held_steps = self._held_steps + 1 if held else 0
+        self._held_steps = self._held_steps + 1 if at_lift_target(object_pos_m) else 0
 
     def picture(self) -> UInt8[np.ndarray, "H W 3"]:
         """(H, W, 3) uint8 colour of the scene as it was last read, from the same place (for people)."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ddgrasp import contract
-from ddgrasp.errors import UserError
+from ddgrasp.errors import Trouble, UserError
 from deploy.devices.options import Setup
 from deploy.interfaces import CameraError, Lens
 from sensors.recordings.realsense import load_pyrealsense2, project
@@ -63,7 +63,7 @@ class RealSenseImager:
             self._serial = active.get_device().get_info(rs.camera_info.serial_number)
         except RuntimeError as error:
             self.stop()
-            raise UserError(
+            raise Trouble(
                 f"the RealSense streams, and does not answer ({error}): plug it in anew."
             ) from error
 

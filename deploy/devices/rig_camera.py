@@ -66,7 +66,7 @@ class StereoCamera:
         return self._world.success()
 
     def object_pos_m(self) -> Float[np.ndarray, "3"]:
-        """See RigCamera."""
+        """See TrialCamera."""
         return self._world.data.qpos[QPOS.object_pos].copy()
 
     def picture(self) -> UInt8[np.ndarray, "H W 3"]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ddgrasp.artifacts import Artifact
-from ddgrasp.config import Config
+from ddgrasp.config import DPM_SOLVER, Config
 from ddgrasp.files import atomic_write_bytes, atomic_write_json, read_json, to_json
 from ddgrasp.job import Job
 from ddgrasp.progress import PICTURES, Progress
@@ -110,7 +110,6 @@ def _fitted(
 ) -> "ddg_jax.sample.Generator":
     """A generator fitted on `frames`, from its checkpoints if there are any."""
     from ddg_jax.prior import make_prior
-    from ddg_jax.sample import DPM_SOLVER
     from ddg_jax.stage import fitted_generator
 
     steps = config.score.curve_steps or config.ddg.training.steps

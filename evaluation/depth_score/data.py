@@ -16,7 +16,7 @@ from jaxtyping import Int, UInt8, UInt16
 
 from ddg_jax.network_prior import FEWEST_VALID
 from ddgrasp import depth
-from ddgrasp.config import Config
+from ddgrasp.config import PIECEWISE, Config
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path, read_npz
 from ddgrasp.progress import Progress
@@ -277,7 +277,7 @@ def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
 
     Raises UserError if colour is wanted that is not aligned to depth.
     """
-    from ddg_jax.data import PIECEWISE, surfaces
+    from ddg_jax.data import surfaces
 
     check_colour(frames, with_rgb)
     depth_mm, rgb = frames.depth_mm, frames.rgb

@@ -118,9 +118,7 @@ def verdict(deployments: Sequence[Deployment]) -> str:
     alike: dict[tuple[str, ...], list[Deployment]] = {}  # by the file's hash: its path may be typed otherwise
     for deployment in sorted(driven, key=_setup):
         policy, robot, camera, sha256 = _setup(deployment)
-        alike.setdefault((sha256 or policy, robot, camera), []).append(
-            deployment
-        )  # a path may be typed otherwise
+        alike.setdefault((sha256 or policy, robot, camera), []).append(deployment)
     setups = [_setup(some[0]) for some in alike.values()]
     rates = [_rate(some) for some in alike.values()]
     if len(setups) > 1:  # a rig's trials say nothing of an arm's, nor one policy's of another's

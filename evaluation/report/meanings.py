@@ -64,7 +64,6 @@ MEANINGS: dict[str, Meaning] = {
     "temporal_deviation_mm": Meaning("how far a pixel strays over time", MM),
     "temporal_range_mm": Meaning("distance at which that was measured", MM),
     "deviation_median_per_m": Meaning("half of the pixels are nearer the surface, inverse depth", "1/m"),
-    "grafted_error_m": Meaning("largest change of a pixel that grafting keeps", "m"),
     "deviation_p99_per_m": Meaning("1 of 100 pixels is further off the surface, inverse depth", "1/m"),
     # student
     "rollout_success": Meaning(
@@ -112,7 +111,6 @@ MEANINGS: dict[str, Meaning] = {
     "loss": Meaning("training loss"),
     "grad_norm": Meaning("length of the gradient"),
     "head_loss": Meaning("the action head's loss"),
-    "head_grad_norm": Meaning("length of the action head's gradient"),
     "pose_loss": Meaning("the action head's loss, trained on true poses"),
     "pose_success": Meaning(
         "success while poses were collected: of the teacher alone at first, of that head alone at last", SHARE

@@ -215,12 +215,7 @@ def _results(stage: str, report: Mapping[str, Any]) -> list[str]:
     metrics = report.get(stage, {})
     if stage == "teacher":
         lines = [f"success {wilson.describe(metrics['success'])}"] if "success" in metrics else []
-        per_object = metrics.get("per_object") or metrics.get("objects") or {}
-        lines += [
-            f"{name}: {wilson.describe(value.get('success', value))}"
-            for name, value in (per_object.items() if isinstance(per_object, Mapping) else ())
-            if "rate" in value.get("success", value)
-        ]
+        lines += [f"{name}: {wilson.describe(rate)}" for name, rate in metrics.get("objects", {}).items()]
         return lines + [_on_backend(row) for row in metrics.get("backends", [])]
     if stage == "student":
         named = (("student_clean", "clean depth"), ("student_ddg", _own_depth(report)))

@@ -174,14 +174,11 @@ def chosen(rows: Sequence[str], tables: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(rows or (row for table in found for row in table.rows)))
 
 
-def shared_config(config: Config) -> Config:
-    """What teacher, demos, recordings and generator of all rows are made with.
-
-    Raises UserError if the students would start from one that has seen other depth than clean depth.
-    """
+def check_shared(config: Config) -> None:
+    """UserError if all rows cannot share `config`: their students would start from one that has seen other
+    depth than clean depth."""
     if start := config.student.init_from:
         _check_clean(start)
-    return config
 
 
 def _check_clean(start: str) -> None:
@@ -202,7 +199,7 @@ def _check_clean(start: str) -> None:
 
 
 def row_config(shared: Config, row: Row, paper_from: str = "") -> Config:
-    """`shared_config` with the row's differences; `paper_from`: see `paper_generator`.
+    """What the rows have in common, with the row's differences; `paper_from`: see `paper_generator`.
 
     Raises UserError if the row wants a ripple and the configuration has none.
     """

@@ -6,6 +6,7 @@ import mujoco
 from mujoco import mjx
 
 from ddgrasp.errors import UserError
+from ddgrasp.install import pip_install
 from mjx_envs import scene
 from mjx_envs.grasp_math import touch_from_sensors
 from mjx_envs.object_spec import SlotLayout
@@ -24,14 +25,12 @@ def require_gpu(what: str = "backend") -> None:
     from mujoco.mjx import warp as mjx_warp
 
     if not mjx_warp.WARP_INSTALLED:
-        raise UserError(
-            f"{what} 'warp' needs warp-lang, which is not installed: pip install 'ddgrasp[cuda,warp]'."
-        )
+        raise UserError(f"{what} 'warp' needs warp-lang, which is not installed: {pip_install('cuda,warp')}.")
     if not any(device.platform == "gpu" for device in jax.devices()):
         raise UserError(
             f"{what} 'warp' needs an NVIDIA GPU and JAX sees only {jax.devices()[0].platform}: choose "
-            f"{'cpu or jax' if what == 'backend' else 'jax'}, or on a machine with a GPU pip install "
-            "'ddgrasp[cuda,warp]'."
+            f"{'cpu or jax' if what == 'backend' else 'jax'}, or on a machine with a GPU "
+            f"{pip_install('cuda,warp')}."
         )
 
 

@@ -47,7 +47,7 @@ def visible_geoms(model: mujoco.MjModel) -> VisibleGeoms:
 
     Raises UserError for a type without an analytic intersection (mesh, height field, ellipsoid).
     """
-    rgba = _rgba(model)
+    rgba = rgba_of(model)
     ids = np.flatnonzero(np.isin(model.geom_group, VISIBLE_GROUPS) & (rgba[:, 3] > 0)).astype(np.int32)
     return VisibleGeoms(
         ids=ids,
@@ -57,7 +57,7 @@ def visible_geoms(model: mujoco.MjModel) -> VisibleGeoms:
     )
 
 
-def _rgba(model: mujoco.MjModel) -> np.ndarray:
+def rgba_of(model: mujoco.MjModel) -> np.ndarray:
     """(ngeom, 4) colours as MuJoCo's visualiser picks them: the material's unless the geom has its own."""
     rgba = np.array(model.geom_rgba)
     from_material = (model.geom_matid >= 0) & np.all(rgba == _DEFAULT_RGBA, axis=1)

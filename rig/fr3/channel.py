@@ -15,6 +15,8 @@ from ddgrasp.errors import UserError
 PORT = 1339
 """Beside the protocol's own: 1337 is the robot's, 1338 the gripper's."""
 CONNECT_S, ANSWER_S = 2.0, 20.0
+REFUSED = "refused"
+"""The key of an answer that is none: what was asked, and why not."""
 
 
 class ChannelLost(Exception):
@@ -45,7 +47,10 @@ class Channel:
             raise UserError(f"{error}: start it again, `ddgrasp rig fr3 --host {self._host}`.") from error
 
     def ask(self, what: str, **values: Any) -> dict[str, Any]:
-        """The answer to one request; see `rig.fr3.serve.Rig.answer`. Raises ChannelLost."""
+        """The answer to one request; see `rig.fr3.serve.Rig.answer`.
+
+        Raises ChannelLost; UserError for a request that the rig refuses, or if what answers is no rig.
+        """
         try:
             self._file.write(json.dumps({"ask": what, **values}) + "\n")
             self._file.flush()
@@ -55,11 +60,14 @@ class Channel:
         if not line:
             raise ChannelLost("the FR3 rig has gone")
         try:
-            return json.loads(line)
+            answer = json.loads(line)
         except json.JSONDecodeError:
             raise UserError(
                 "What answers there is no FR3 rig: name its address, on this machine --host 127.0.0.1."
             ) from None
+        if REFUSED in answer:
+            raise UserError(f"the FR3 rig refuses {answer[REFUSED]}: is it of another version?")
+        return answer
 
     @contextlib.contextmanager
     def time_held(self) -> Iterator[None]:

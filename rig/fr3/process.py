@@ -53,18 +53,18 @@ class Fr3Rig:
         self.host = host
         given = {"host": host, "seed": seed, "speed": speed, "q_rad": list(q_rad), "with_board": with_board}
         self._options = given | {"thing": asdict(thing), "bare": bare}
-        self._process: subprocess.Popen[str] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._channel: Channel | None = None
 
     def __enter__(self) -> "Fr3Rig":
         """Starts it and waits until it listens. Raises UserError if it does not."""
         command = [sys.executable, "-m", "rig.fr3.serve"]
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-        )
+            command, 0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+        )  # unbuffered: what `select` does not see is not there
         assert self._process.stdin is not None
         try:
-            self._process.stdin.write(json.dumps(self._options) + "\n")
+            self._process.stdin.write(json.dumps(self._options).encode() + b"\n")
             self._process.stdin.flush()
             self._wait_until_ready()
             self._channel = Channel(self.host)
@@ -127,7 +127,7 @@ class Fr3Rig:
         while time.monotonic() < deadline:
             if select.select([self._process.stdout], [], [], 0.2)[0]:
                 line = self._process.stdout.readline()
-                said = json.loads(line) if line.startswith("{") else {}
+                said = json.loads(line) if line.startswith(b"{") else {}
                 if "ready" in said:
                     return
                 if not line or "error" in said:

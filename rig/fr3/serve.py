@@ -5,6 +5,7 @@ whoever started it, however that ended.
 """
 
 import json
+import os
 import queue
 import socketserver
 import sys
@@ -73,6 +74,7 @@ class Rig:
             self._tick()  # whoever asks finds an arm that has a state
             with _listen(self._options.host, self.request):
                 print(json.dumps({"ready": self._options.host}), flush=True)
+                os.dup2(2, 1)  # nobody reads on: what a library prints may not fill the pipe
                 while not stop.is_set():
                     self._tick()
 
@@ -98,7 +100,7 @@ class Rig:
                 self._server.disconnect()
                 self._away_until_s = time.monotonic() + asked["seconds"]
                 return {}
-        return {"error": f"unknown request {asked['ask']!r}"}
+        return {channel.REFUSED: f"{asked!r}, which it does not know"}
 
     def _tick(self) -> None:
         while not self._requests.empty():
@@ -106,7 +108,7 @@ class Rig:
             try:
                 answer.put(self.answer(asked))
             except (KeyError, TypeError, ValueError) as error:  # a request may not take the arm down
-                answer.put({"error": f"{asked!r}: {error!r}"})
+                answer.put({channel.REFUSED: f"{asked!r} ({error!r})"})
         if time.monotonic() < self._away_until_s:
             self._server.hold_once()
             return

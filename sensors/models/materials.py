@@ -13,6 +13,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Float32
 
+from mjx_envs.render.visible_geoms import rgba_of
+
 Colour = Sequence[float | int] | Float[np.ndarray, " channels"]
 """Red, green and blue in [0, 1]; what follows them is ignored."""
 NEAR_INFRARED_RGB = (0.7, 0.2, 0.1)
@@ -129,10 +131,8 @@ def rig_materials(model: mujoco.MjModel, object_name: str = "") -> dict[int, Mat
 
 
 def geom_rgb(model: mujoco.MjModel) -> Float32[np.ndarray, "geoms 3"]:
-    """(ngeom, 3) colour of every geom, its MuJoCo material's where it has one."""
-    material = model.geom_matid
-    named = model.mat_rgba[np.maximum(material, 0)] if model.nmat else model.geom_rgba
-    return np.where((material >= 0)[:, None], named, model.geom_rgba)[:, :3].astype(np.float32)
+    """(ngeom, 3) colour of every geom, as MuJoCo's visualiser picks it."""
+    return rgba_of(model)[:, :3].astype(np.float32)
 
 
 def object_material(object_name: str, slot: str, rgb: Colour) -> Material:

@@ -135,7 +135,7 @@ def _own_meta(file: Path) -> dict[str, Any]:
     if not file.exists():
         return {}
     try:
-        meta = json.loads(file.read_text())
+        meta = json.loads(file.read_bytes())
     except (ValueError, OSError) as error:
         raise UserError(f"{file}: cannot be read ({error}); repair it, or take it away.") from None
     if not isinstance(meta, dict):

@@ -176,7 +176,7 @@ class Recording:
         file = self.color_files[index]
         bgr = cv2.imdecode(np.fromfile(file, np.uint8), COLOR_AS_STORED)
         if bgr is None:
-            raise UserError(f"{file}: cannot be decoded as JPEG; delete it or copy it again.")
+            raise UserError(f"{file}: cannot be decoded as a picture; delete it or copy it again.")
         return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
     def frames(self) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], UInt16[np.ndarray, "H W"]]]:
@@ -267,7 +267,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
             'if it is complete, add one, at least {"depth_unit_m": 0.001}.'
         )
     try:
-        meta = json.loads(file.read_text())
+        meta = json.loads(file.read_bytes())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{file}: not valid JSON ({error}); repair it or record again.") from error
     unit = meta.get("depth_unit_m") if isinstance(meta, dict) else None

@@ -155,7 +155,7 @@ def from_json(values: dict[str, Any]) -> Figures:
 def published() -> list[Figures]:
     """Figures of real cameras that come with the package (sensors/statistics/real_figures.json)."""
     file = Path(__file__).with_name("real_figures.json")
-    return [from_json(values) for values in json.loads(file.read_text())["figures"]]
+    return [from_json(values) for values in json.loads(file.read_bytes())["figures"]]
 
 
 def _plain(value: Any) -> Any:
