@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ddgrasp import contract
+from ddgrasp.config import DeployConfig
 from ddgrasp.errors import UserError
 from deploy.interfaces import Camera, CameraError, Clock, Frame, Robot, RobotError, RobotState
 from deploy.interrupts import unbroken
@@ -21,8 +23,8 @@ from deploy.safety import APPROACH, NonFiniteAction, SafetyFilter
 class LoopSettings:
     """Time keeping of a loop."""
 
-    period_s: float = 0.1
-    stale_periods: float = 2.0
+    period_s: float = contract.CONTROL_DT_S
+    stale_periods: float = DeployConfig.stale_periods
     """A frame older than this many periods is stale."""
     retry: bool = False
     """Whether a hand that stands still, or has closed on nothing, tries again (`deploy.retry`)."""

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ddgrasp import contract
+from ddgrasp.config import DeployConfig
 from ddgrasp.layout import ACTION, closes
 from deploy import kinematics
 
@@ -37,12 +38,11 @@ class SafetyLimits:
     braking_rad_s2: tuple[float, ...] | None = None
     """How hard a joint brakes before its position limit (`contract.Arm`); None for one that stops at once."""
     braking_reserve_rad_s: tuple[float, ...] = (0.0,) * 7
-    workspace_lower_m: tuple[float, float, float] = (0.15, -0.45, 0.012)
-    workspace_upper_m: tuple[float, float, float] = (0.80, 0.45, 0.80)
-    """Box for the point between the finger pads, robot base frame; at 12 mm an
-    upright hand's fingertips touch the table, the rig's; a Franka Hand's are 3 mm above it."""
-    arm_lower_m: tuple[float, float, float] = (-0.55, -0.80, 0.0)
-    arm_upper_m: tuple[float, float, float] = (0.95, 0.80, 1.30)
+    workspace_lower_m: tuple[float, float, float] = DeployConfig.workspace_lower_m
+    workspace_upper_m: tuple[float, float, float] = DeployConfig.workspace_upper_m
+    """Box for the point between the finger pads, robot base frame."""
+    arm_lower_m: tuple[float, float, float] = DeployConfig.arm_lower_m
+    arm_upper_m: tuple[float, float, float] = DeployConfig.arm_upper_m
     """Box that elbow, forearm, wrist, hand and open fingers stay inside: table and walls."""
     approach_below_m: float = 0.0
     """Below this height the grip point comes down slowly: the hand may land on something. 0: nowhere."""

@@ -160,7 +160,7 @@ def _write_mean(g: GraphBuilder, total: str, count: str, pixels: int) -> tuple[s
 
 
 def _write_resize(
-    g: GraphBuilder, relief: str, depth: str, valid: str, window: preprocess.Window
+    g: GraphBuilder, relief: str, depth: str, valid: str, window: preprocess.ResizeWindow
 ) -> tuple[str, str, str]:
     """resize(x * valid) / resize(valid), as `preprocess._resize_masked`."""
 

@@ -6,16 +6,15 @@ Board frame as OpenCV has it: origin at the pattern's upper left corner, x right
 import io
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Float64, Int32, UInt8
 
+from ddgrasp.config.sensors import MARKER_DICTIONARIES, MarkerDictionary
 from ddgrasp.errors import UserError
 
-Dictionary = Literal["DICT_4X4_50", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250", "DICT_APRILTAG_36h11"]
-DICTIONARIES: tuple[Dictionary, ...] = get_args(Dictionary)
 PAPERS_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0)}
 HELD_AT_M = 0.020
 """From the point between the finger pads to the pattern's upper edge: the plate's margin is between them."""
@@ -54,12 +53,14 @@ class CharucoBoard:
     square_m: float = 0.030
     marker_m: float = 0.022
     """Side of a square and of the marker inside it."""
-    dictionary: Dictionary = "DICT_4X4_50"
+    dictionary: MarkerDictionary = "DICT_4X4_50"
     """OpenCV's name of the set of markers."""
 
     def __post_init__(self) -> None:
-        if self.dictionary not in DICTIONARIES:
-            raise UserError(f"board dictionary {self.dictionary!r}: choose one of {', '.join(DICTIONARIES)}.")
+        if self.dictionary not in MARKER_DICTIONARIES:
+            raise UserError(
+                f"board dictionary {self.dictionary!r}: choose one of {', '.join(MARKER_DICTIONARIES)}."
+            )
         if min(self.columns, self.rows) < 3 or self.corner_count < MIN_CORNERS:
             raise UserError(f"a board of {self.columns} x {self.rows} squares: give at least 3 x 4.")
         if not 0 < self.marker_m < self.square_m:

@@ -40,7 +40,7 @@ class Axis(NamedTuple):
     """Resize matrix; None if the pixels are taken as they are."""
 
 
-class Window(NamedTuple):
+class ResizeWindow(NamedTuple):
     """The pixels of the full frame that the encoder sees, and how they are resized."""
 
     rows: Axis
@@ -67,9 +67,9 @@ def plan_axis(crop: int, out: int) -> Axis:
     return Axis(0, crop, resize_matrix(crop, out))
 
 
-def plan_window(profile: CameraProfile, config: StudentConfig) -> Window:
+def plan_window(profile: CameraProfile, config: StudentConfig) -> ResizeWindow:
     """The window of `profile` that becomes an input of `config`'s size."""
-    return Window(
+    return ResizeWindow(
         plan_axis(profile.crop_height_px, config.picture.height_px),
         plan_axis(profile.crop_width_px, config.picture.width_px),
     )
@@ -112,7 +112,7 @@ def crop_origin(
 
 
 def pixel_coordinates(
-    window: Window, stride: int
+    window: ResizeWindow, stride: int
 ) -> tuple[Float32[np.ndarray, " h"], Float32[np.ndarray, " w"]]:
     """Crop pixel coordinates, rows (h,) and columns (w,), of the centres of `stride`-sized input cells."""
 
@@ -224,7 +224,7 @@ def _sum_3x3(x: AnyArray) -> jax.Array:
 
 
 def _resize_masked(
-    relief: AnyArray, depth: AnyArray, valid: AnyArray, window: Window, need_depth: bool
+    relief: AnyArray, depth: AnyArray, valid: AnyArray, window: ResizeWindow, need_depth: bool
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """resize(x * valid) / resize(valid): what is invalid never bleeds into what is valid."""
 

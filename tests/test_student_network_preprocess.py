@@ -43,7 +43,7 @@ def test_table_depth_is_the_distance_along_the_axis_to_z_equals_zero():
 
 def test_cells_of_a_resized_window_lie_as_far_apart_as_what_they_see():
     """10 of 20 pixels in cells of two, each four pixels wide; 8 taken as they are, from the fourth on."""
-    window = preprocess.Window(preprocess.plan_axis(20, 10), preprocess.Axis(3, 8, None))
+    window = preprocess.ResizeWindow(preprocess.plan_axis(20, 10), preprocess.Axis(3, 8, None))
     rows, columns = preprocess.pixel_coordinates(window, 2)
     np.testing.assert_allclose(rows, [2, 6, 10, 14, 18])
     np.testing.assert_allclose(columns, [4, 6, 8, 10])

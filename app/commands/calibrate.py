@@ -10,12 +10,11 @@ from app.commands.base import say
 from app.commands.checks import check_file
 from ddgrasp.config import Config
 from ddgrasp.config.checks import Range
+from ddgrasp.config.sensors import MarkerDictionary
 from ddgrasp.errors import UserError
 
 if TYPE_CHECKING:
     from sensors.charuco_board import CharucoBoard
-
-Dictionary = Literal["DICT_4X4_50", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250", "DICT_APRILTAG_36h11"]
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class BoardOptions:
     """Side of a square."""
     marker_mm: float = 22.0
     """Side of a marker."""
-    dictionary: Dictionary = "DICT_4X4_50"
+    dictionary: MarkerDictionary = "DICT_4X4_50"
     """OpenCV's name of the set of markers."""
 
     def made(self) -> "CharucoBoard":

@@ -10,6 +10,11 @@ Sensor = Literal["ideal", "dextrah", "kinect", "stereo", "learned"]
 SENSORS: tuple[Sensor, ...] = get_args(Sensor)
 BY_COLOUR: tuple[Sensor, ...] = ("stereo",)
 """Those that tell materials by colour."""
+MarkerDictionary = Literal[
+    "DICT_4X4_50", "DICT_4X4_250", "DICT_5X5_100", "DICT_6X6_250", "DICT_APRILTAG_36h11"
+]
+"""OpenCV's names of the ArUco markers that a calibration board may have."""
+MARKER_DICTIONARIES: tuple[MarkerDictionary, ...] = get_args(MarkerDictionary)
 _Window = Annotated[int, Range(1, 255)]
 """Side of a window in pixels."""
 
