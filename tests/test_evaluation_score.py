@@ -11,6 +11,7 @@ import pytest
 
 from app import cli
 from ddg_jax import stage as ddg_stage
+from ddg_jax.prior import make_prior
 from ddg_jax.representation import LIMIT_PER_M
 from ddg_jax.sample import Generator
 from ddgrasp import artifacts
@@ -161,7 +162,8 @@ def test_pages_and_pictures_are_there_and_the_report_shows_them(scored):
     assert "Real vs real" in html and "table 1 depthfeat v1" in html
 
 
-def test_a_stopped_score_goes_on_to_the_same_figures(scored, run_dir, capsys):
+def test_a_stopped_score_goes_on_to_the_same_figures(scored, run_dir, tmp_path, capsys):
+    scored = shutil.copytree(scored, tmp_path / "out")  # of which others read on
     command = ["ddg", "score", *SIZES, "--out", str(scored), "--run-dir", str(run_dir)]
     before = (scored / "score" / "score.json").read_bytes()
     assert cli.main(command) == 2 and "--resume" in capsys.readouterr().err
@@ -361,6 +363,16 @@ def test_inpainting_fills_holes_and_touches_nothing_else():
     np.testing.assert_array_equal(filled[valid], real.sensed_mm[valid])
     assert (filled > 0).all()
     assert np.abs(filled.astype(int) - real.clean_mm)[:, 2:-2].max() < 40  # a row of the slope is 23 mm
+
+
+def test_holes_are_filled_from_as_far_as_is_configured():
+    real, filled = episode("real"), {}
+    for radius_px in (3.0, 9.0):
+        config = ScoreConfig(inpaint_radius_px=radius_px)
+        methods = Methods(config, 0, Generator(DDGConfig(), {}, make_prior(DDGConfig())))
+        filled[radius_px] = sense(methods, real, ["real_inpaint"])["real_inpaint"]
+        np.testing.assert_array_equal(filled[radius_px], inpainted(real.sensed_mm, radius_px))
+    assert (filled[3.0] != filled[9.0]).any()
 
 
 def test_domains_belong_to_one_side_and_depend_on_seed_and_episode_alone(run_dir):
