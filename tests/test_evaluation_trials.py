@@ -187,6 +187,19 @@ TRIAL = {"index": 0, "object_name": "cube", "realtime": False, "success": True, 
 TRIAL |= {"missed_deadlines": 0, "safety": {}, "events": [], **dict.fromkeys(TIMES, [])}
 
 
+def test_trials_that_came_out_otherwise_are_named(tmp_path):
+    outcomes = {"one": (True, True, False, False), "other": (True, False, True, False)}
+    found = []
+    for folder, won in outcomes.items():
+        trials = [TRIAL | {"index": 7000 + i, "success": success} for i, success in enumerate(won)]
+        (tmp_path / folder).mkdir()
+        lines = "".join(json.dumps(line) + "\n" for line in (HEADER, *trials))
+        (tmp_path / folder / rig_trials.TRIALS_FILE).write_text(lines)
+        found.append(trials_page.find(tmp_path / folder))
+    page = trials_page.write_comparison(found).read_text()
+    assert f"<td>{tmp_path / 'other'}</td><td>cube 7002</td><td>cube 7001</td>" in page
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -116,6 +116,7 @@ def write_comparison(all_trials: Sequence[Trials]) -> Path:
     picture = success_chart.draw({"trials": tables})
     shown = image(picture, "success with intervals, and by object")
     body = ["<h1>Trials side by side</h1>", *verdicts, note, table(header, rows, last_bold=True), shown]
+    body += _otherwise(*all_trials)
     path = all_trials[0].folder / COMPARISON_HTML
     atomic_write_bytes(path.with_name(COMPARISON_PNG), picture)
     atomic_write_text(path, page("Trials side by side: DiffuDepGrasp-JAX", body))
@@ -150,6 +151,26 @@ def _pairs(first: Trials, others: Sequence[Trials], of: Outcome) -> list[str]:
     adjusted = paired.holm([pair["p"] for pair in made if pair])
     holm = iter(adjusted if len(adjusted) > 1 else [None] * len(adjusted))
     return [_pair(pair, next(holm)) if pair else "other trials" for pair in made]
+
+
+def _otherwise(first: Trials, *others: Trials) -> list[str]:
+    """A table of the trials that came out otherwise than the first's, for those who look at films."""
+    before, rows = _outcomes(first, lambda result: result.success), []
+    for other in others:
+        if not differing(first.belong_to, other.belong_to):
+            after = _outcomes(other, lambda result: result.success)
+            rows.append((str(other.folder), _won(after, before), _won(before, after)))
+    header = (f"against {first.folder}", "won", "lost")
+    return ["<h2>Trials that came out otherwise</h2>", table(header, rows)] if rows else []
+
+
+def _won(one: Mapping[tuple[int, str], bool], other: Mapping[tuple[int, str], bool]) -> str:
+    """Trials that one won and the other lost, by object, with the numbers that films have."""
+    of: dict[str, list[str]] = {}
+    for index, name in sorted(one.keys() & other.keys()):
+        if one[index, name] and not other[index, name]:
+            of.setdefault(name, []).append(str(index))
+    return "; ".join(f"{name} {', '.join(numbers)}" for name, numbers in of.items())
 
 
 def _compared(first: Trials, other: Trials, of: Outcome) -> dict[str, Any] | None:
