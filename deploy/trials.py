@@ -262,6 +262,7 @@ def run_trials(
     waiting: set[Future] = set()
     try:
         with held_back(signal.SIGINT, signal.SIGHUP):  # workers leave them to this process
+            # multiprocessing's tracker, whose start would let them through, came with the executor
             waiting |= {executor.submit(_run_in_worker, trial) for trial in trials}
         for future in as_completed(waiting):
             waiting.discard(future)  # its film is megabytes

@@ -236,7 +236,7 @@ def test_fingers_that_are_stuck_and_say_so_are_told_again_and_then_an_error():
         hand = FrankaHand(gripper, (KeyError,), 20.0)
         hand.set(False)
         if answers[-1]:
-            until(lambda told=told: not told.__length_hint__())
+            until(lambda told=told, hand=hand: not told.__length_hint__() and not hand._busy)
             assert hand.width_m() == 0.04
         else:
             until(lambda hand=hand: hand._error is not None)

@@ -30,6 +30,7 @@ from ddgrasp.errors import UserError
 from ddgrasp.layout import QPOS
 from ddgrasp.progress import Progress
 from ddgrasp.shipped import PRETRAINED
+from ddgrasp.signals import held_back
 from deploy import stage, trial_log
 from deploy import trials as rig_eval
 from deploy.clock import SimClock
@@ -348,6 +349,14 @@ def test_ctrl_c_is_not_for_workers_even_while_they_start(tmp_path):
     spared = (tmp_path / "spared").read_text()
     assert "SIGINT" in spared and "SIGHUP" in spared and "SIGTERM" not in spared
     assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
+
+
+def test_ctrl_c_while_workers_start_is_not_lost(ctrl_c):
+    reached = False
+    with pytest.raises(KeyboardInterrupt), held_back(signal.SIGINT):
+        os.kill(os.getpid(), signal.SIGINT)
+        reached = True
+    assert reached
 
 
 def test_ctrl_c_while_one_is_kept_costs_no_trial_that_runs(tmp_path, ctrl_c):

@@ -63,7 +63,7 @@ def sense(render, seed: int = 0, materials=GREY, **config) -> np.ndarray:
         ("dot_radius_mrad", 2.0), ("speckle_contrast", 0.6), ("refine_window_px", 5),
     ],
 )  # fmt: skip
-def test_every_setting_of_the_camera_is_used(name, value):
+def test_a_setting_of_matching_or_light_is_used(name, value):
     """A user sets them to a camera of his own."""
     scene = wall(0.8, 0.6, 0.1)
     assert getattr(StereoConfig(), name) != value

@@ -62,9 +62,11 @@ class Channel:
         try:
             answer = json.loads(line)
         except json.JSONDecodeError:
+            answer = None
+        if not isinstance(answer, dict):
             raise UserError(
                 "What answers there is no FR3 rig: name its address, on this machine --host 127.0.0.1."
-            ) from None
+            )
         if REFUSED in answer:
             raise UserError(f"the FR3 rig refuses {answer[REFUSED]}: is it of another version?")
         return answer

@@ -60,12 +60,11 @@ class Fr3Rig:
         """Starts it and waits until it listens. Raises UserError if it does not."""
         command = [sys.executable, "-m", "rig.fr3.serve"]
         self._process = subprocess.Popen(
-            command, 0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+            command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         )  # unbuffered: what `select` does not see is not there
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(json.dumps(self._options).encode() + b"\n")
-            self._process.stdin.flush()
             self._wait_until_ready()
             self._channel = Channel(self.host)
         except BaseException:

@@ -4,6 +4,7 @@ Its options are the first line of its standard input. It lives as long as that i
 whoever started it, however that ended.
 """
 
+import contextlib
 import json
 import os
 import queue
@@ -74,7 +75,8 @@ class Rig:
             self._tick()  # whoever asks finds an arm that has a state
             with _listen(self._options.host, self.request):
                 print(json.dumps({"ready": self._options.host}), flush=True)
-                os.dup2(2, 1)  # nobody reads on: what a library prints may not fill the pipe
+                with contextlib.suppress(OSError):  # without a stderr
+                    os.dup2(2, 1)  # nobody reads on: what a library prints may not fill the pipe
                 while not stop.is_set():
                     self._tick()
 
