@@ -18,6 +18,7 @@ from ddgrasp.config.checks import has_sections
 from ddgrasp.config_hash import check_same, config_hash
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_write_json, read_json, to_json, to_tuples
+from ddgrasp.stages import MADE_BY
 from ddgrasp.versions import library_versions
 
 MANIFEST = "manifest.json"
@@ -191,7 +192,10 @@ def require(run_dir: Path | str, stage: str, config: Config) -> Artifact:
     """The finished `stage` of the run in `run_dir`, made with this configuration; UserError otherwise."""
     directory = Path(run_dir) / stage
     if not is_finished(directory):
-        raise UserError(f"{run_dir} has no finished stage {stage!r}: run it first, into the same directory.")
+        raise UserError(
+            f"{run_dir} has no finished stage {stage!r}: make it first, `ddgrasp {MADE_BY.get(stage, 'run')} "
+            f"--out {run_dir}`."
+        )
     artifact = read_artifact(directory)
     check_config(artifact, config)
     return artifact

@@ -79,6 +79,12 @@ CHECKPOINTS = {"teacher": "policy.msgpack", "ddg": "params.msgpack", "student": 
 """File that a folder a stage starts from must hold, itself or in a folder named after the stage. Named here
 too, since the stages' own modules import JAX."""
 
+MADE_BY = {
+    "teacher": "teacher train", "demos": "demos collect", "record": "record", "ddg": "ddg fit",
+    "student": "student train", "export": "export",
+}  # fmt: skip
+"""Stage -> the command that makes it alone."""
+
 _BY_NAME = {stage.name: stage for stage in (*STAGES, *ON_REQUEST)}
 
 

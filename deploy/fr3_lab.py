@@ -69,7 +69,7 @@ class Fr3Lab:
                 if self._is_up() and not any(sign in lost for sign in OF_THE_MACHINE):
                     raise
             self.close()
-        raise Trouble(f"{lost} ({ATTEMPTS} times): use fewer --workers, or end what else runs here.")
+        raise Trouble(f"{lost} ({ATTEMPTS} times): end what else runs here, or use fewer --workers.")
 
     def close(self) -> None:
         """Ends the rig."""

@@ -212,8 +212,8 @@ class ControlLoop:
         problem = self._policy.check_fit(frame.depth) or self._policy.check_unit(frame.depth)
         if problem:
             raise UserError(
-                f"{problem}: set the camera to what {self._policy.path} takes, or export the policy for it "
-                "(world.camera_scale, export.depth_dtype)."
+                f"{problem}: set the camera to what {self._policy.path} takes, or take a policy for it "
+                "(exported with another --export.depth-dtype, or trained at another world.camera_scale)."
             )
 
     def _command(self, state: RobotState, action: np.ndarray, paced: bool) -> tuple[np.ndarray | None, str]:

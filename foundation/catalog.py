@@ -54,7 +54,8 @@ ENTRIES = {
                 size,
                 f"Hugging Face, depth-anything/Depth-Anything-V2-{size.capitalize()}",
                 f"depth_anything_v2_vit{size[0]}.pth",
-                "the generator's prior (--ddg.prior.source depth_anything_v2)",
+                "the generator's prior (--ddg.prior.source depth_anything_v2), `ddg score --monocular`, "
+                "--student.depth-source monocular, `deploy trials --depth monocular`",
             )
             for size in SIZES
         ),

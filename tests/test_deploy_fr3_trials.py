@@ -245,7 +245,7 @@ def test_a_connection_lost_again_and_again_is_the_machine_s_fault():
     def lost():
         raise RobotError(f"{LOST} 127.0.0.2 is lost")
 
-    with pytest.raises(Trouble, match=r"is lost \(3 times\): use fewer --workers"):
+    with pytest.raises(Trouble, match=r"is lost \(3 times\): end what else runs here"):
         Fr3Lab("mesh").repeated(lost)
 
 

@@ -143,7 +143,7 @@ def test_non_finite_joints_hold(tmp_path):
 @pytest.mark.parametrize("bad", ["shape", "dtype"])
 def test_camera_that_never_fits_is_refused_before_anything_moves(tmp_path, bad):
     loop, robot, camera = make_loop(tmp_path, [BAD[bad]])
-    with pytest.raises(UserError, match="wrong depth.*export the policy for it"):
+    with pytest.raises(UserError, match="wrong depth.*take a policy for it"):
         loop.run(max_steps=3)
     assert robot.calls == ["start", "stop"] and camera.stopped
 

@@ -393,7 +393,9 @@ def test_a_manifest_of_other_values_than_this_project_writes_is_named(tmp_path, 
 
 
 def test_an_absent_stage_is_named_with_the_remedy(tmp_path):
-    with pytest.raises(UserError, match="has no finished stage 'teacher': run it first"):
+    with pytest.raises(
+        UserError, match="has no finished stage 'teacher': make it first, `ddgrasp teacher train --out"
+    ):
         artifacts.require(tmp_path, "teacher", CONFIG)
 
 

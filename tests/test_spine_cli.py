@@ -98,11 +98,20 @@ def test_help_shows_a_command_s_own_options_and_help_all_every_value(encoding):
     assert "--teacher.num-envs" in texts[HELP_ALL] and "--hosts.process " in texts[HELP_ALL]
 
 
+def test_an_arm_is_driven_and_calibrated_by_a_file_as_trials_are(tmp_path):
+    file = tmp_path / "camera.yaml"
+    file.write_text("preset: demo\ndeploy: {film_every: 3}\n")
+    for name, args in (("deploy", ["--policy", "pretrained/student/policy.onnx"]), ("calibrate", [])):
+        assert parse(name, [*args, "--config", str(file)]).config.deploy.film_every == 3
+        with pytest.raises(UserError, match="--preset"):
+            parse(name, [*args, "--config", str(file), "--preset", "demo"])
+
+
 def test_help_of_deploy_says_what_each_camera_is_and_whose_configuration_counts():
     words = " ".join(ddgrasp("deploy", "--help").stdout.replace("│", " ").split())
     described = words.split("--camera {", 1)[1].split("}", 1)[1].split("--recording")[0]
     assert all(camera in described for camera in CAMERAS)
-    assert "Without --preset the configuration of its run counts" in words
+    assert "Without --preset the configuration is that of the run that the policy lies in" in words
 
 
 def test_help_of_a_command_may_stand_before_it():
@@ -140,7 +149,10 @@ WRONG = [
         ("export", "--export.depth-dtype", "uint8"),
         "Unknown export.depth_dtype 'uint8'. Known: float32_m",
     ),
-    (("demos", "collect", "--out", "nowhere"), "nowhere has no finished stage 'teacher': run it first"),
+    (
+        ("demos", "collect", "--out", "nowhere"),
+        "nowhere has no finished stage 'teacher': make it first, `ddgrasp teacher train --out nowhere`",
+    ),
     (
         ("teacher", "eval", "nowhere"),
         "RUN-DIR is nowhere, which does not exist: give a run that has made teac",

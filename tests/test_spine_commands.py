@@ -9,6 +9,7 @@ import pytest
 
 from app.commands import COMMANDS, parse
 from ddgrasp.errors import UserError
+from ddgrasp.stages import MADE_BY, STAGES
 
 ROOT = Path(__file__).parents[1]
 FILES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "pretrained").rglob("README.md"))
@@ -89,3 +90,8 @@ def test_the_table_of_what_they_leave_has_every_command():
     page = (ROOT / "docs" / "commands.md").read_text()
     table = page.split("## What each reads and leaves")[1].split("\n## ")[0]
     assert COMMANDS.keys() <= set(re.findall(r"`([a-z0-9 ]+)`", table))
+
+
+def test_every_stage_of_a_run_has_the_command_that_errors_name():
+    assert MADE_BY.keys() == {stage.name for stage in STAGES} - {"deploy"}
+    assert {name: COMMANDS[command].stage for name, command in MADE_BY.items()} == {n: n for n in MADE_BY}

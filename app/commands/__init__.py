@@ -123,9 +123,11 @@ def parse(name: str, args: Sequence[str]) -> Command:
         options["default"] = replace(default, ddg=preset.ddg) if isinstance(default, DDGScore) else default
     elif cls is Deploy:
         policy = shipped(_option(args, "--policy") or DEFAULT_POLICY)
-        options["default"] = Deploy(config=config_of(policy, _option(args, "--preset")), policy=policy)
+        file = _option(args, "--config")
+        config = config_of(policy, _option(args, "--preset"), Path(file) if file else None)
+        options["default"] = Deploy(config=config, policy=policy)
     elif cls is Calibrate:
-        options["default"] = Calibrate(get_preset(_option(args, "--preset") or DEFAULT_PRESET))
+        options["default"] = Calibrate(_base(args, DEFAULT_PRESET))
     elif cls is TeacherEval:
         options["default"] = with_world_of(_teacher_s_run(args))
     program, whole = f"ddgrasp {name}", HELP_ALL in args
@@ -215,8 +217,8 @@ _PRESET_HELP = (
     "Presets (--preset): debug (tests; teacher from the pretrained one), demo (teacher from the scripted",
     "guide, student from the pretrained one; 19 to 28 minutes on two cores), laptop (random first weights,",
     "teacher from the guide, twelve training objects; 50 to 81 minutes), ppo and ppo_paper (laptop with a",
-    "teacher by PPO from nothing, six), camera (laptop, the generator for short recordings of a real",
-    "camera), student_paper (laptop with the paper's own student, six), paper (PPO from nothing, one GPU).",
+    "teacher by PPO from nothing, six), camera (laptop, the generator for a real camera that moves),",
+    "student_paper (laptop with the paper's own student, six), paper (PPO from nothing, one GPU).",
     "Any value can be given, for example --teacher.num-envs 64. --scale 0.001 makes all its counts that much",
     "smaller, never its networks or pictures: a trial run, whose figures mean nothing.",
     'Commands and options are completed after  eval "$(ddgrasp completion bash)"  (or zsh).',

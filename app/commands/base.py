@@ -35,7 +35,8 @@ class FromPreset:
     config: Annotated[Config, tyro.conf.arg(name="")]
     """Values of the preset; any of them can be given on its own, for example --seed 1."""
     out: Path
-    """Directory of the run."""
+    """Directory of the run: what is needed of it is read there, and what is made becomes a folder there. Give
+    every stage of a run the same --preset, --config and values."""
     resume: bool = False
     """Continue what is there; finished stages are not redone."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None

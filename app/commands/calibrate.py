@@ -43,14 +43,15 @@ class BoardOptions:
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Hand-eye calibration: the robot shows the fixed camera a ChArUco board that its gripper holds."""
+    """Hand-eye calibration: a Franka shows the fixed camera a ChArUco board that its gripper holds.
+
+    --preset (or values) is what the policy was trained for: the measured place is compared with it.
+    """
 
     config: Annotated[Config, tyro.conf.arg(name="")]
-    """Values of the preset; what the policy was trained for is compared with what is measured."""
+    """Values that can be given on their own."""
     camera: Literal["realsense", "rig"] = "realsense"
     """realsense (its left infrared imager), or rig (the FR3 rig at --host, `ddgrasp rig fr3 --board`)."""
-    robot: Literal["franka"] = "franka"
-    """franka."""
     host: str = ""
     """Address of the robot's control unit; empty takes deploy.franka.host, or 127.0.0.1 with camera rig."""
     board: BoardOptions = BoardOptions()
@@ -65,6 +66,8 @@ class Calibrate:
     out: Path | None = None
     """What deploy reads; a picture lies beside it. By default runs/calibration/calibration.json, unless that
     is of another camera or robot."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    """YAML file to take instead of --preset."""
 
     def run(self) -> None:
         """Drives the poses, prints the errors, writes the calibration."""

@@ -15,7 +15,8 @@ class DemosExport:
     """Turn demonstrations, deployments or recorded trials into a LeRobot dataset."""
 
     source: tyro.conf.Positional[Path]
-    """A run with demonstrations, or its folder demos; a deployment, or the folder of all of them."""
+    """A run with demonstrations, or its folder demos; a deployment, or the folder of all of them; a
+    folder of `ddgrasp deploy trials --record`."""
     out: Path
     """Folder of the dataset; one that exists is never written to."""
     episodes: Annotated[int, Range(0, 1_000_000)] = 0

@@ -22,7 +22,7 @@ from ddgrasp.stages import get_stage
 
 @dataclass(frozen=True)
 class DDGFit(OneStage):
-    """Fit the depth noise model on recordings: the run's own, or any in --data."""
+    """Fit the depth generator on recordings: the run's own, or any in --data."""
 
     data: Path | None = None
     """A recording, or a folder of them (color/, depth/, meta.json); none takes the run's recordings."""
@@ -42,10 +42,10 @@ class DDGFit(OneStage):
 
 @dataclass(frozen=True)
 class DDGSample:
-    """Draw recorded frames beside what a fitted noise model makes of them, as a PNG."""
+    """Draw recorded frames beside what a fitted generator makes of them, as a PNG."""
 
     model: Path
-    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
+    """A run with a fitted generator, its folder ddg, or pretrained/ddg."""
     data: Path
     """A recording, or a folder of them."""
     out: Path = Path()
@@ -68,16 +68,17 @@ class DDGSample:
 
 @dataclass(frozen=True)
 class DDGDistil:
-    """Distil a fitted noise model to few network evaluations per map."""
+    """Distil a fitted generator to few network evaluations per map."""
 
     model: Path
-    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
+    """A run with a fitted generator, its folder ddg, or pretrained/ddg."""
     data: Path
     """The recordings it was fitted on: a recording, or a folder of them."""
     out: Path
     """Directory of a run; the distilled model goes to its folder ddg."""
     evaluations: Count = 4
-    """Network evaluations per map; those passed on the way (4 and 2 before 1) are kept too."""
+    """Network evaluations per map: 8, 4, 2 or 1 of a generator whose ddg.training.distil_from is 16; those
+    passed on the way (8, 4 and 2 before 1) are kept too."""
     steps: Steps | None = None
     """Optimiser steps per halving; none takes the model's ddg.training.distil_steps."""
     resume: bool = False
@@ -112,10 +113,11 @@ class DDGDistil:
 
 @dataclass(frozen=True)
 class DDGGenerate:
-    """Give all demos the camera's artefacts: a stream in constant memory, over all devices."""
+    """Give all demos the camera's artefacts, for `ddgrasp demos export --noisy`; training makes its own. A
+    stream in constant memory, over all devices."""
 
     model: Path
-    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
+    """A run with a fitted generator, its folder ddg, or pretrained/ddg."""
     demos: Path
     """A run with collected demos, or its folder demos."""
     out: Path
@@ -152,10 +154,10 @@ class DDGGenerate:
 
 @dataclass(frozen=True)
 class DDGThresholds:
-    """Holes, flicker and error over thresholds of a fitted noise model's mask: a table, JSON, a PNG."""
+    """Holes, flicker and error over thresholds of a fitted generator's mask: a table, JSON, a PNG."""
 
     model: Path
-    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
+    """A run with a fitted generator, its folder ddg, or pretrained/ddg."""
     data: Path
     """A recording, or a folder of them; its last frames are used."""
     out: Path = Path()
@@ -179,10 +181,10 @@ class DDGThresholds:
 
 @dataclass(frozen=True)
 class DDGExport:
-    """Write a fitted noise model as one ONNX file for any simulator: clean depth in, a camera's depth out."""
+    """Write a fitted generator as one ONNX file for any simulator: clean depth in, a camera's depth out."""
 
     model: Path
-    """A run with a fitted model, its folder ddg, or pretrained/ddg."""
+    """A run with a fitted generator, its folder ddg, or pretrained/ddg."""
     out: Path = Path("generator.onnx")
     """The file."""
     data: Path | None = None

@@ -45,7 +45,7 @@ class WeightsList:
     """List networks with published weights: where to get them, their licence, what is installed."""
 
     out: Path = WEIGHTS_DIR
-    """Folder of converted weights."""
+    """Folder of converted weights to look in."""
 
     def run(self) -> None:
         """Prints an entry per network."""

@@ -48,7 +48,8 @@ class Play:
     policy: Path | None = None
     """ONNX file that `ddgrasp export` wrote; without it the student under pretrained/."""
     objects: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--object",))] = ("apple", "banana", "can")
-    """Names, or all (`ddgrasp objects list` has them)."""
+    """Names (`ddgrasp objects list`, on rig fr3 with --meshes), or all: the paper's twelve, on rig fr3 six
+    more."""
     rig: Literal["development", "fr3"] = "development"
     """development (MuJoCo's Franka, seconds a trial) or fr3 (the test rig: another arm behind Franka's own
     protocol, meshes; a minute or so a trial)."""

@@ -21,7 +21,8 @@ class RigFr3:
     """Serve an FR3 with table, wall, clutter and one object on this machine, until Ctrl-C."""
 
     object_name: str = "cube"
-    """What lies on the table; `ddgrasp objects list --meshes` names them."""
+    """What lies on the table: `ddgrasp objects list --meshes` names them (with --shapes primitive `ddgrasp
+    objects list`)."""
     shapes: Literal["mesh", "primitive"] = "mesh"
     """mesh, or the development rig's primitives."""
     host: str = RIG_HOST

@@ -30,13 +30,14 @@ class Scoring:
     """A command that scores generated depth: options of the preset's `score` section, without prefix."""
 
     score: Annotated[ScoreConfig, tyro.conf.arg(name="")]
-    """How to score; the rest of the configuration is the run's own."""
+    """How to score."""
     preset: str
     """Preset whose sizes to take."""
     out: Path
     """Directory of the result, a folder in it; usually the run's."""
     run_dir: Path | None = None
-    """Run whose teacher and generator to use; none takes --out."""
+    """Run whose teacher, generator and configuration (for `curve` recordings, too) to use; none takes
+    --out."""
     seed: Seed = 0
     """Seed of trajectories, noise and resampling."""
     resume: bool = False

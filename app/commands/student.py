@@ -17,7 +17,6 @@ from ddgrasp.errors import UserError
 from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.presets import get_preset
 from ddgrasp.shipped import NAME, shipped
-from ddgrasp.trained import policy_objects
 
 DEFAULT_POLICY = Path("runs") / DEFAULT_PRESET / "export" / POLICY_FILE
 
@@ -93,7 +92,7 @@ class StudentPerception:
     generator: Path = Path("pretrained/ddg/generator.onnx")
     """What `ddgrasp ddg export` wrote, for camera generator."""
     objects: tuple[str, ...] = ("all",)
-    """Names, or all."""
+    """Names (`ddgrasp objects list`), or all: the paper's twelve."""
     trials: Count = 6
     """How many with every object."""
     number: Annotated[int, Range(0, 999)] = 0
@@ -130,12 +129,16 @@ class Export(OneStage):
 
 @dataclass(frozen=True)
 class Deploy:
-    """Run an exported policy on a robot and a camera at 10 Hz."""
+    """Run an exported policy on a robot and a camera at 10 Hz.
+
+    Without --preset the configuration is that of the run that the policy lies in. Of the values seed,
+    world.*, record.* and deploy.* count: the policy's own are in its file.
+    """
 
     config: Annotated[Config, tyro.conf.arg(name="")]
-    """Without --preset: the configuration of the run that the policy lies in."""
+    """Values that can be given on their own."""
     policy: Path
-    """ONNX file that `ddgrasp export` wrote. Without --preset the configuration of its run counts."""
+    """ONNX file that `ddgrasp export` wrote."""
     robot: Robot = "sim"
     """sim (the development rig) or franka."""
     host: str = ""
@@ -152,11 +155,13 @@ class Deploy:
     dry_run: bool = False
     """Everything but the motion: what would be sent is printed and drawn."""
     yes: bool = False
-    """Move without asking first, nor for success at the end."""
+    """Move without asking first, and do not ask at the end whether it succeeded."""
     out: Path = Path("runs/deployments")
     """Folder that every run leaves its report in."""
     calibration: Path | None = None
     """What `ddgrasp calibrate` wrote, if it is not runs/calibration/calibration.json."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    """YAML file to take instead of --preset, as `ddgrasp deploy trials` takes it."""
 
     def run(self) -> None:
         """Runs the loop until the time is over, Ctrl-C or a fault, and prints how it kept time.
@@ -175,6 +180,9 @@ class Deploy:
             check_objects(self.config.world)
         _check_policy(self.policy)
         check_folder("--out", self.out)
+        preset = None if self.config.preset == DEFAULT_PRESET else self.config.preset
+        if note := unknown_origin(self.policy, preset, self.config_file):
+            say(note)
         report = deploy(self.config, self.policy, options, say)
         say(describe(report))
         if report.fault:
@@ -211,8 +219,6 @@ def unknown_origin(policy: Path, preset: str | None, file: Path | None) -> str:
     """What is to be said of a policy beside which nothing says what made it, where nobody else does."""
     if preset is not None or file is not None or artifacts.is_finished(policy.parent):
         return ""
-    seen = ", ".join(policy_objects(policy, get_preset(DEFAULT_PRESET)))
     return (
-        f"no manifest.json beside {policy}: the configuration is that of preset {DEFAULT_PRESET} (--preset), "
-        f"and {seen} count as what the policy was trained on"
+        f"no manifest.json beside {policy}: the configuration is that of preset {DEFAULT_PRESET} (--preset)"
     )

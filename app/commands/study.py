@@ -1,5 +1,6 @@
 """ddgrasp study: Table II with its ablations, and where a policy loses, by cause."""
 
+import sys
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +30,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StudyTable2(FromPreset):
-    """Train one student per depth source, all else equal, and try them on the same trials: Table II."""
+    """Train one student per depth source, all else equal, and try them on the same trials: Table II.
+
+    A row sets by itself student.depth_source, student.picture.fill_holes, student.dextrah_*,
+    student.ellipse_dropout and, unless it has ripple, noise by hand: what is given for these does not count.
+    """
 
     rows: tuple[str, ...] | None = None
     """Rows by name instead of the whole tables of --table, made in the order in which they are given: sim_gt,
@@ -39,12 +44,14 @@ class StudyTable2(FromPreset):
     rand_noise_ellipses_filled, paper_ddg_no_graft, paper_ddg."""
     table: tuple[str, ...] = ("main",)
     """main (hand-made noise off), ripple (off and on), filled (holes as recorded and filled by the student;
-    filled, with ripple made or holes cut by hand), formulas (with pixels of the picture's size, and twice as
-    large), ellipses (holes cut by hand, off and on), grafting (with the paper's own generator)."""
+    filled, with ripple made or holes cut by hand), formulas (with pixels of the picture's size, twice as
+    large, and along normals), ellipses (holes cut by hand, off and on), grafting (with the paper's own
+    generator)."""
     trials: Count = 50
     """How many with every object, the same for every row."""
     objects: tuple[str, ...] = ("all",)
-    """Names, or all."""
+    """Names (`ddgrasp objects list`, on rig fr3 with --meshes), or all: the paper's twelve, on rig fr3 six
+    more."""
     paper_generator: str = ""
     """Folder with the paper's own generator, for example `paper` of another study, which rows
     paper_ddg_no_graft and paper_ddg take as it is; without it the study fits one on its recordings."""
@@ -129,7 +136,7 @@ class StudyCauses:
     generator_holes, generator_values, full_size, meshes, off_2mm, off_10mm, furniture, dark_table,
     other_tables, spring, fr3, test_rig. What they are compared with is tried too."""
     objects: tuple[str, ...] = ("all",)
-    """Names, or all."""
+    """Names (`ddgrasp objects list`), or all: the paper's twelve."""
     trials: Count = 10
     """How many with every object, the same for every row."""
     number: Annotated[int, Range(0, 999)] = 0
@@ -150,7 +157,7 @@ class StudyCauses:
 
     def run(self) -> None:
         """Runs what is missing and prints the table."""
-        from app.commands.student import config_of
+        from app.commands.student import config_of, unknown_origin
         from evaluation import causes
         from evaluation.rig_trials import Series
 
@@ -163,6 +170,8 @@ class StudyCauses:
             there.names()
         check_folder("--out", self.out)
         config = config_of(self.policy, self.preset, self.config_file)
+        if note := unknown_origin(self.policy, self.preset, self.config_file):
+            print(note, file=sys.stderr)
         causes.run(config, self.policy, rows, series, self.out, self.workers, self.generator)
         print(self.out / causes.JSON_FILE, self.out / causes.TABLE_FILE, sep="\n")
         print((self.out / causes.TABLE_FILE).read_text(encoding="utf-8"))

@@ -22,7 +22,8 @@ class DeployTrials:
     """fr3 (the test rig: another arm behind Franka's protocol, mesh objects, a D455 as it is run) or
     development (the rig that everything was tuned on)."""
     objects: tuple[str, ...] = ("all",)
-    """Names, or all."""
+    """Names (`ddgrasp objects list`, on rig fr3 with --meshes), or all: the paper's twelve, on rig fr3 six
+    more."""
     trials: Count = 10
     """How many with every object."""
     split: Literal["development", "test"] = "development"
@@ -41,7 +42,8 @@ class DeployTrials:
     """On rig fr3: newtons at the hand, and newton metres there, at which the arm stops itself; without it
     what the configuration has, 30 as deploy begins. The joints' torque is in proportion."""
     depth: Literal["recorded", "inpaint", "monocular"] = "recorded"
-    """What the policy sees: recorded, inpaint (holes filled on line), or monocular (a network on colour)."""
+    """What the policy sees: recorded, inpaint (holes filled on line), or monocular (a network on
+    colour, `ddgrasp weights list`)."""
     retry: bool = True
     """A hand that stands still or has closed on nothing tries again, unless the configuration's deploy.retry
     is off; --no-retry lets the policy alone act."""
@@ -61,6 +63,7 @@ class DeployTrials:
         """Runs what is missing and prints the table."""
         from app.commands.student import config_of, unknown_origin
         from ddgrasp.progress import Progress
+        from ddgrasp.trained import policy_objects
         from evaluation import rig_trials
 
         if self.rig == "fr3":
@@ -83,7 +86,8 @@ class DeployTrials:
         config = config_of(self.policy, self.preset, self.config_file)
         progress = Progress(name="deploy trials")
         if note := unknown_origin(self.policy, self.preset, self.config_file):
-            progress.note(note)
+            trained = ", ".join(policy_objects(self.policy, config))
+            progress.note(f"{note}, and {trained} count as what the policy was trained on")
         table = rig_trials.run(
             config, self.policy, series, self.out, self.workers, progress, record=self.record
         )

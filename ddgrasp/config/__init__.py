@@ -92,7 +92,7 @@ class Config(Section):
     """Everything a run needs; a preset is one value of this."""
 
     preset: Text
-    """Name of the preset that the values started from."""
+    """The preset that values start from; any of them can be given besides."""
     seed: Seed = 0
     """Seed of all random numbers."""
     scale: Annotated[float, Range(0, 1, above=True)] = 1.0

@@ -83,8 +83,8 @@ class GraftConfig(Section, name="ddg.graft"):
     """The paper's: below it a generated pixel is a hole. Holes are -1, surfaces 1 (depth: 0 to 1, which
     needs a negative one, for example -0.2; docs/generator.md)."""
     deviation_threshold: Annotated[float, Range(0, 100)] = 0.0005
-    """Smallest deviation of inverse depth, 1/m, that is an artefact and grafted: 1/32 px of disparity, here a
-    D455's; 0.0016 for a D435 at 640x480 (deviation only). 1 grafts holes alone."""
+    """Smallest deviation of inverse depth, 1/m, that is an artefact and grafted: 1/32 px of disparity of a
+    D455 at 1280x720; 0.0016 is a D435's at 640x480 (representation deviation alone). 1 grafts holes alone."""
     window_px: Annotated[float, Range(0, 20)] = 0.0
     """Size of the window over which the camera's matching mixes surfaces, pixels of simulated depth, which is
     blurred by it before anything else (ddg_jax/window.py): the standard deviation of a Gaussian, the width of

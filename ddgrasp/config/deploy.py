@@ -39,9 +39,9 @@ class FrankaConfig(Section, name="deploy.franka"):
     contact_force_n: Annotated[float, Range(1, 100)] = 30.0
     """Force at the hand, in newtons, and torque, in newton metres, at which the arm stops itself."""
     give_way: Annotated[float, Range(0, 1, above=True)] = 0.5
-    """Share of these two at which the arm brakes and stands until the next command; where it comes down
-    softly until one that leads up, or the contact has gone. So it presses no harder on what it has met.
-    1: not before it stops itself."""
+    """At this share of contact_torque_nm or contact_force_n the arm brakes and stands until the next command.
+    Where it comes down softly (below approach_below_m) it stands until one leads up or the contact has gone,
+    so that it presses no harder. 1: not before it stops itself."""
     approach_m_s: Annotated[float, Range(0, 2, above=True)] = 0.06
     """How fast the hand may come down below `approach_below_m`. An arm that is stopped by what it lands on
     presses on it in proportion to the speed that it was to have."""

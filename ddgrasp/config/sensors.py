@@ -86,7 +86,7 @@ class StereoConfig(Section, name="record.stereo"):
     flat_noise_px: Annotated[float, Range(0, 10)] = 0.08
     """Disparity noise that filter takes away, standard deviation: larger relief stays. 0 switches it off."""
     subpixel_steps: Annotated[int, Range(1, 4096)] = 32
-    """Disparity is reported in 1/32 of a pixel, as D4xx cameras do."""
+    """A pixel of disparity is reported in so many steps; a D4xx has 32."""
 
     def finer(self, factor: float) -> "StereoConfig":
         """For pictures of the same camera with `factor` times the pixels per side: larger windows."""

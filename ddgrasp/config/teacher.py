@@ -98,9 +98,9 @@ class TeacherConfig(Section, name="teacher"):
     """Iterations in which the critic alone learns, so that it does not mislead a policy that was cloned or
     loaded; its own start is random."""
     eval_every: Count = 20
-    """Updates between deterministic evaluations; there is one after the last too."""
+    """Iterations between deterministic evaluations; there is one after the last too."""
     checkpoint_every: Count = 20
-    """Updates between whole-state checkpoints."""
+    """Iterations between whole-state checkpoints."""
     stop_at: Share = 1.0
     """End early once two evaluations in a row reach this success rate."""
 

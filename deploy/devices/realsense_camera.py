@@ -58,7 +58,8 @@ class RealSenseCamera:
         if profile.width_px > stream.width_px or profile.height_px > stream.height_px:
             raise UserError(
                 f"the policy takes {profile.width_px}x{profile.height_px} depth, more than the stream's "
-                f"{stream.width_px}x{stream.height_px}: export it with world.camera_scale 0.5 or less."
+                f"{stream.width_px}x{stream.height_px}: take a policy that was trained at "
+                "world.camera_scale 0.66 or less."
             )
         self._clock, self._profile, self._serial, self._say = clock, profile, serial, say
         self._pipeline: Any = None
