@@ -360,7 +360,7 @@ KEPT = PRETRAINED / "table2" / "trials"
                                              "sim_gt": (469, 8)}),
         ("development-9", {"sim_gt": (499, 3), "rand_noise": (62, 37), "inpaint": (141, 28),
                            "ddg_no_graft": (26, 34), "upper_bound": (24, 42)}),
-        ("fr3-test-10", {"rand_noise": (5, 3), "inpaint": (8, 3)}),
+        ("fr3-test-10", {"sim_gt": (51, 1), "rand_noise": (5, 3), "inpaint": (8, 3)}),
         ("fr3-test-3", {"sim_gt": (51, 3), "rand_noise": (4, 3), "inpaint": (10, 5),
                         "ddg_no_graft": (9, 3), "upper_bound": (7, 3)}),
     ],
