@@ -94,7 +94,8 @@ def test_help_shows_a_command_s_own_options_and_help_all_every_value(encoding):
     texts = {option: ddgrasp("teacher", "train", option, encoding=encoding).stdout for option in options}
     assert ("╭" in texts["--help"]) == (encoding == "utf-8")
     assert "--resume" in texts["--help"] and "--teacher." not in texts["--help"]
-    assert texts["--help"].endswith("score, hosts): ddgrasp teacher train --help-all\n")
+    assert texts["--help"].endswith("score): ddgrasp teacher train --help-all\n")
+    assert "--hosts.process " in texts["--help"]
     assert "--teacher.num-envs" in texts[HELP_ALL] and "--hosts.process " in texts[HELP_ALL]
 
 
@@ -105,6 +106,18 @@ def test_an_arm_is_driven_and_calibrated_by_a_file_as_trials_are(tmp_path):
         assert parse(name, [*args, "--config", str(file)]).config.deploy.film_every == 3
         with pytest.raises(UserError, match="--preset"):
             parse(name, [*args, "--config", str(file), "--preset", "demo"])
+
+
+def test_help_shows_a_command_s_own_options_and_none_that_it_refuses(capsys):
+    shown = {}
+    for name in ("calibrate board", "ddg score", "ddg curve"):
+        with pytest.raises(SystemExit):
+            parse(name, ["--help"])
+        shown[name] = capsys.readouterr().out
+    assert "--board.square-mm" in shown["calibrate board"]
+    assert "--columns" in shown["ddg score"] and "--curve-steps" not in shown["ddg score"]
+    assert "--columns" not in shown["ddg curve"] and "--curve-steps" in shown["ddg curve"]
+    assert "--ddg.unet" not in shown["ddg score"]
 
 
 def test_help_of_deploy_says_what_each_camera_is_and_whose_configuration_counts():

@@ -110,9 +110,8 @@ def parse(name: str, args: Sequence[str]) -> Command:
     that are wrong raise UserError."""
     cls = COMMANDS[name]
     check_words(cls, args)
-    unused = _SCALE if cls in (Deploy, Calibrate) else ""
-    if unused and _option(args, unused) is not None:
-        raise UserError(f"{unused} makes nothing smaller that `ddgrasp {name}` does: leave it out.")
+    if cls in (Deploy, Calibrate) and _option(args, _SCALE) is not None:
+        raise UserError(f"{_SCALE} makes nothing smaller that `ddgrasp {name}` does: leave it out.")
     options: dict[str, Any] = {}
     if issubclass(cls, FromPreset):
         base = _base(args, cls.default_preset())
@@ -133,9 +132,16 @@ def parse(name: str, args: Sequence[str]) -> Command:
     program, whole = f"ddgrasp {name}", HELP_ALL in args
     given = ["--help" if arg == HELP_ALL else arg for arg in args]
     read = partial(tyro.cli, cls, prog=program, args=given, **options)
-    command = _found(parsed(read, program, whole, unused))
+    command = _found(parsed(read, program, whole, _unread(cls)))
     check_options(command)
     return command
+
+
+def _unread(cls: type) -> tuple[str, ...]:
+    """Options that the command refuses: help does not show them."""
+    if issubclass(cls, Scoring):
+        return tuple(f"--{name.replace('_', '-')}" for name in cls.unread)
+    return (_SCALE,) if cls in (Deploy, Calibrate) else ()
 
 
 def _found(command: Any) -> Any:

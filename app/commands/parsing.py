@@ -4,9 +4,11 @@ import contextlib
 import io
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import TypeVar
 
+from ddgrasp.config import Config
 from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.presets import PRESETS
 
@@ -17,6 +19,8 @@ HELP_ALL = "--help-all"
 
 _SECTION = re.compile(r"^(?:╭─ | )(?:(?P<name>\S+) )?options(?: ─+╮)?\s*$")
 """First line of a section of help, with a frame or, on a terminal without UTF-8, without one."""
+_OF_A_RUN = {field.name for field in fields(Config)}
+"""Sections that help shows with HELP_ALL alone."""
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _RULE = re.compile(r"^[─-]{4,}$")
 _CHOICE = re.compile(r"invalid choice '(?P<value>.*)' for argument '-*(?P<option>\S+)'\. Expected one of \(")
@@ -26,11 +30,11 @@ _NUMBER = re.compile(
 )
 
 
-def parsed(parse: Callable[[], T], command: str, whole: bool, unused: str = "") -> T:
+def parsed(parse: Callable[[], T], command: str, whole: bool, unread: Sequence[str] = ()) -> T:
     """What `parse`, a call of tyro, returns; UserError in one line for options that it refuses.
 
     Help is printed, without the sections of the run's configuration unless the `whole` is asked for, and ends
-    with SystemExit(0). It does not show the option `unused`.
+    with SystemExit(0). It does not show the options `unread`.
     """
     told = io.StringIO()
     helped = io.TextIOWrapper(io.BytesIO(), sys.stdout.encoding, "backslashreplace", newline="")
@@ -40,7 +44,7 @@ def parsed(parse: Callable[[], T], command: str, whole: bool, unused: str = "") 
     except SystemExit as stop:
         if stop.code != 2:
             helped.seek(0)
-            text = _without(unused, helped.read()) if unused else helped.read()
+            text = _without(unread, helped.read())
             sys.stdout.write(
                 "\n".join([text.rstrip("\n"), *_presets(text), ""]) if whole else shortened(text, command)
             )
@@ -54,8 +58,9 @@ def shortened(text: str, command: str) -> str:
     kept, hidden, hiding = [], {}, False
     for line in text.splitlines():
         if (match := _SECTION.match(_COLOUR.sub("", line))) is not None:
-            hiding = match["name"] is not None
-            hidden |= {match["name"].split(".")[0]: None} if hiding else {}
+            section = (match["name"] or "").split(".")[0]
+            hiding = section in _OF_A_RUN
+            hidden |= {section: None} if hiding else {}
         if not hiding:
             kept.append(line.rstrip())
     more = [f"Every value of the run ({', '.join(hidden)}): {command} {HELP_ALL}"] if hidden else []
@@ -67,9 +72,11 @@ def _presets(text: str) -> list[str]:
     return [f"Presets: {', '.join(PRESETS)} (ddgrasp --help says more)"] if " --preset " in text else []
 
 
-def _without(option: str, text: str) -> str:
-    """Help `text` without the lines of `option`."""
-    return re.sub(rf"^[│ ] {option} .*\n(?:[│ ] {{3,}}.*\n)*", "", text, flags=re.MULTILINE)
+def _without(options: Sequence[str], text: str) -> str:
+    """Help `text` without the lines of `options`."""
+    for option in options:
+        text = re.sub(rf"^[│ ] {option}[ ,].*\n(?:[│ ] {{3,}}.*\n)*", "", text, flags=re.MULTILINE)
+    return text
 
 
 def refused(box: str, command: str) -> UserError:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import tyro
 
@@ -43,6 +43,9 @@ class Scoring:
     resume: bool = False
     """Continue what is there."""
 
+    unread: ClassVar[tuple[str, ...]]
+    """Fields of `ScoreConfig` that the command does not read, and refuses."""
+
     def _refuse(self, ignored: Sequence[str], command: str) -> None:
         """UserError for an option of scores that `command` does not read."""
         usual = get_preset(self.preset).score
@@ -50,11 +53,11 @@ class Scoring:
             if getattr(self.score, name) != getattr(usual, name):
                 raise UserError(f"--{name.replace('_', '-')}: {command} does nothing with it; leave it out.")
 
-    def _make(self, stage_name: str, ignored: Sequence[str]) -> None:
+    def _make(self, stage_name: str) -> None:
         """Makes the stage from the run's own parts, and prints its table."""
         from evaluation.depth_score.page import print_result
 
-        self._refuse(ignored, f"`ddgrasp ddg {stage_name}`")
+        self._refuse(self.unread, f"`ddgrasp ddg {stage_name}`")
         if stage_name != "score" and len(self.score.features) > 1:
             raise UserError(
                 f"--features {' '.join(self.score.features)}: `ddgrasp ddg {stage_name}` scores by one of "
@@ -86,11 +89,13 @@ class DDGScore(Scoring):
     score_frames: Count = 40
     """Frames that --real is scored on, the last ones; 16 or more."""
 
+    unread = _OF_CURVE
+
     def run(self) -> None:
         """Scores the run's generator on the rig, or one fitted on a real camera."""
         if self.real is None:
             self._refuse_options_of_real()
-            self._make("score", _OF_CURVE)
+            self._make("score")
             return
         from evaluation.depth_score.page import print_result
         from evaluation.depth_score.real import real_config
@@ -105,7 +110,7 @@ class DDGScore(Scoring):
                 f"--ddg.init-from {self.ddg.init_from} with --real: what is scored is fitted on the first "
                 "frames, and a generator from elsewhere may have seen the last ones; leave one of them out."
             )
-        self._refuse((*_OF_RIG, *_OF_CURVE), "a score with --real")
+        self._refuse((*_OF_RIG, *self.unread), "a score with --real")
         recordings = recordings_in("--real", self.real)
         check_score(self.score)
         preset = replace(get_preset(self.preset), ddg=self.ddg, score=self.score, seed=self.seed)
@@ -131,18 +136,22 @@ class DDGScore(Scoring):
 class DDGCurve(Scoring):
     """Fit and score the generator on 5, 10, 20, ... recorded trajectories: the data-efficiency curve."""
 
+    unread = (*_OF_TABLE, *_OF_REPEATS)
+
     def run(self) -> None:
         """Fits and scores each point that is not there yet."""
-        self._make("curve", (*_OF_TABLE, *_OF_REPEATS))
+        self._make("curve")
 
 
 @dataclass(frozen=True)
 class DDGSamplers(Scoring):
     """Score every sampler of the generator: what fewer network evaluations cost, and frames per second."""
 
+    unread = (*_OF_TABLE, *_OF_CURVE)
+
     def run(self) -> None:
         """Scores each sampler on the same trajectories."""
-        self._make("samplers", (*_OF_TABLE, *_OF_CURVE))
+        self._make("samplers")
 
 
 @dataclass(frozen=True)
