@@ -440,6 +440,10 @@ def test_a_fitted_generator_is_found_in_a_run_and_in_its_folder(tmp_path):
         ("ddg fit --data {}/a.bag", "--data is {}/a.bag, a file: give a recording or a folder of them"),
         ("ddg fit --data {}/a.bag", "`ddgrasp record import {}/a.bag` makes one"),
         ("ddg distil --model pretrained/ddg --data {}", "--data is {}, which holds no recording"),
+        (
+            "ddg distil --model pretrained/ddg --data {} --evaluations 16",
+            "--evaluations is 16; expected 8, 4, 2, 1: the generator's ddg.training.distil_from, 16, halved",
+        ),
         ("ddg score --real {}", "--real is {}, which holds no recording"),
         ("ddg generate --model pretrained/ddg --demos pretrained/student", "is of stage 'student': give a"),
         ("ddg generate --model pretrained/ddg --demos {}", "{}/demos/episodes.zarr is no episode store"),

@@ -15,8 +15,10 @@ from app.commands.checks import (
     tell_fit,
 )
 from ddgrasp import artifacts
+from ddgrasp.config import CROSS_ENTROPY, DDGTrainingConfig
 from ddgrasp.config.checks import Count, Seed, Steps, Text
 from ddgrasp.config.ddg import HALVED_SPACINGS, PROGRESSIVE, Sampler
+from ddgrasp.errors import UserError
 from ddgrasp.stages import get_stage
 
 
@@ -88,10 +90,11 @@ class DDGDistil:
         """Distils the model into the run's folder ddg."""
         from ddgrasp.progress import Progress
 
-        inputs = recordings_in("--data", self.data)
         fitted = artifacts.read_artifact(_fitted(self.model))
         config = artifacts.config_from_json(fitted.manifest.config)
         training, spacing = config.ddg.training, config.ddg.sampling.spacing
+        self._check_halves(training)
+        inputs = recordings_in("--data", self.data)
         if spacing not in HALVED_SPACINGS:
             Progress(name="ddg distil").note(
                 f"the model's steps are {spacing}, which cannot be halved: the distilled one's are quadratic"
@@ -109,6 +112,22 @@ class DDGDistil:
         inputs["model"] = fitted.hash
         tell_fit(config, self.data, self.out / "ddg")
         pipeline.make(get_stage("ddg"), config, self.out, resume=self.resume, parents={}, inputs=inputs)
+
+    def _check_halves(self, training: DDGTrainingConfig) -> None:
+        """UserError unless the generator in `model` can be halved to so many evaluations."""
+        if training.hole_loss == CROSS_ENTROPY:
+            raise UserError(
+                f"--model {self.model} was fitted with ddg.training.hole_loss {CROSS_ENTROPY}, which cannot "
+                "be distilled: give one that was fitted with squared."
+            )
+        possible = [training.distil_from]
+        while possible[-1] % 2 == 0:
+            possible.append(possible[-1] // 2)
+        if self.evaluations not in possible[1:]:
+            raise UserError(
+                f"--evaluations is {self.evaluations}; expected {', '.join(map(str, possible[1:]))}: the "
+                f"generator's ddg.training.distil_from, {training.distil_from}, halved and halved again."
+            )
 
 
 @dataclass(frozen=True)
