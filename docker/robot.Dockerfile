@@ -3,6 +3,7 @@
 #   docker run -it --network host --cap-add SYS_NICE --ulimit rtprio=99 --ulimit memlock=-1 --device /dev/bus/usb \
 #     -v "$PWD/runs:/data/runs" ddgrasp-robot deploy --robot franka --camera realsense --host 172.16.0.2 \
 #     --policy pretrained/student/policy.onnx --dry-run
+# Only runs/ is kept: calibrate board --out runs/board.pdf
 FROM python:3.12-slim-bookworm AS wheel
 ARG VERSION=
 WORKDIR /source

@@ -22,6 +22,8 @@ OUTSIDE = {
     "CHANGELOG.md": "changelog.md",
     "pretrained/README.md": "pretrained.md",
     "pretrained/ddg/README.md": "pretrained_ddg.md",
+    "pretrained/d435/README.md": "pretrained_d435.md",
+    "pretrained/table2/README.md": "pretrained_table2.md",
 }
 """Pages that lie outside docs/: file in the repository, page of the site."""
 _SOURCE = {page: file for file, page in OUTSIDE.items()}
