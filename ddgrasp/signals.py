@@ -16,7 +16,8 @@ def ending() -> list[signal.Signals]:
 
 @contextlib.contextmanager
 def held_back(*numbers: signal.Signals) -> Iterator[None]:
-    """These come once the block has ended; processes that it starts never get them."""
+    """Processes that the block starts never get these. This one does, once the block has ended, or at once
+    where another of its threads takes them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield

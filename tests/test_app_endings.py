@@ -208,7 +208,7 @@ sys.exit(cli.main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize("command", ["deploy --policy x.onnx", "calibrate"])
+@pytest.mark.parametrize("command", ["deploy --policy x.onnx --preset debug", "calibrate"])
 def test_a_pipe_has_every_event_of_an_arm_as_it_happens(command):
     """As `| tee log` wants it, and whoever reads along."""
     line = [sys.executable, "-c", SPEAKS, *command.split()]
