@@ -28,7 +28,7 @@ class TrialLog:
 
         Args:
             header: what the trials belong to: the policy and the configuration, whose hash may be several,
-              of which a new log has the first, one that is there its own (`config_hashes`).
+                of which a new log has the first, one that is there its own (`config_hashes`).
         """
         there, results = read_log(path)
         self._path, self._header = path, _as_had(header, there)
