@@ -120,13 +120,12 @@ class DDGDistil:
                 f"--model {self.model} was fitted with ddg.training.hole_loss {CROSS_ENTROPY}, which cannot "
                 "be distilled: give one that was fitted with squared."
             )
-        possible = [training.distil_from]
-        while possible[-1] % 2 == 0:
-            possible.append(possible[-1] // 2)
-        if self.evaluations not in possible[1:]:
+        whole = training.distil_from
+        halves = [whole // 2**k for k in range(1, whole.bit_length()) if whole % 2**k == 0]
+        if self.evaluations not in halves:
             raise UserError(
-                f"--evaluations is {self.evaluations}; expected {', '.join(map(str, possible[1:]))}: the "
-                f"generator's ddg.training.distil_from, {training.distil_from}, halved and halved again."
+                f"--evaluations is {self.evaluations}; expected {', '.join(map(str, halves)) or 'none'}: the "
+                f"generator's ddg.training.distil_from, {whole}, halved and halved again."
             )
 
 
