@@ -28,6 +28,7 @@ from ddgrasp.config import (
 from ddgrasp.errors import UserError
 from ddgrasp.presets import get_preset
 from ddgrasp.progress import Progress, read_curves
+from ddgrasp.shipped import PRETRAINED
 from job_support import make_job
 from learning.params import load_params
 from recording_support import flat, write_depth
@@ -272,11 +273,45 @@ def test_a_model_whose_steps_cannot_be_halved_is_distilled_to_quadratic_ones(
 
 def test_the_page_s_fit_of_log_odds_is_the_one_that_its_table_scores():
     """That preset `laptop` has planes, positions and linspace steps since then does not change it."""
-    page = (Path(__file__).parents[1] / "docs" / "generator.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "generator_log.md").read_text()
     command = re.findall("`ddgrasp ddg fit ([^`]*--ddg.training.hole-loss[^`]*)`", page)[0]
     scored = DDGConfig(training=DDGTrainingConfig(steps=1200, hole_loss="cross_entropy"))
     assert parse("ddg fit", command.split()).config.ddg == scored
     assert (scored.sampling.sampler, scored.sampling.steps) == ("dpm_solver", 4)  # the table's first row
+
+
+def shown_settings(ddg: DDGConfig) -> list[str]:
+    """A column of docs/generator.md's table, below its head."""
+    least, most = ddg.training.snr_limits
+    sampling, graft = ddg.sampling, ddg.graft
+    window = f"{graft.window_px:g}" + (f", `{graft.window_shape}`" if graft.window_px else "")
+    holes = ddg.training.hole_loss.replace("_", "-")
+    return [
+        f"`{ddg.depth.surface}`",
+        f"`{ddg.prior.source}`",
+        "yes" if ddg.unet.position else "no",
+        f"{holes}, {least:g} to {most:g}",
+        f"{ddg.training.steps:,} x {ddg.training.batch_size}",
+        f"`{sampling.sampler}`, `{sampling.spacing}`, {sampling.steps}, {sampling.eta:g}",
+        f"{sampling.frame_correlation:g}, {sampling.deviation_correlation:g}",
+        f"{graft.noise_threshold:g}",
+        f"{graft.deviation_threshold:g}",
+        window,
+    ]
+
+
+def test_the_page_s_table_has_the_presets_settings_and_the_shipped_generator_s():
+    page = (Path(__file__).parents[1] / "docs" / "generator.md").read_text()
+    table = [line.split("|")[2:5] for line in page.splitlines() if line.startswith("| `ddg.")]
+    laptop, shipped, camera = ([cell.strip() for cell in column] for column in zip(*table, strict=True))
+    demo = shown_settings(get_preset("demo").ddg)
+    assert laptop == [
+        was if was == now else f"{was.split(' ')[0]} (`demo`), {now}"
+        for was, now in zip(demo, shown_settings(get_preset("laptop").ddg), strict=True)
+    ]
+    assert shipped == shown_settings(Generator.load(PRETRAINED / "ddg").config)
+    as_shown = [cell.removesuffix(" for 80 frames") for cell in camera]
+    assert as_shown == shown_settings(get_preset("camera").ddg)
 
 
 def test_flicker_is_counted_within_recordings_only():
