@@ -185,7 +185,8 @@ CAMERA = replace(
         graft=GraftConfig(deviation_threshold=0.0016),
     ),
 )
-"""`laptop` with a generator for a real camera that moves, chosen on 80 of its frames (docs/generator_log.md)."""
+"""`laptop` with a generator for a real camera that moves, chosen on 80 of its frames
+(docs/generator_log.md)."""
 
 STUDENT_PAPER = replace(
     LAPTOP,
