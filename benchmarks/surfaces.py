@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.command import one_line
-from ddg_jax.data import surfaces
+from ddg_jax.geometry import surfaces
 from ddgrasp.config import SURFACES
 from ddgrasp.depth import inverse_depth, to_metres, to_millimetres
 from ddgrasp.errors import UserError

@@ -10,14 +10,14 @@ from typing import overload
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Float16, Float32, Int
+from jaxtyping import Bool, Float16, Float32, Int
 
-from ddg_jax.piecewise import piecewise_smooth
+from ddg_jax.geometry import UsableFrames, understand
 from ddg_jax.prior import Prior
 from ddg_jax.representation import encode
 from ddgrasp import artifacts
-from ddgrasp.config import PIECEWISE, PLANES, DDGConfig
-from ddgrasp.depth import crop_nearest, inverse_depth, window
+from ddgrasp.config import DDGConfig
+from ddgrasp.depth import crop_nearest, window
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from learning import memory
@@ -29,8 +29,6 @@ from sensors.recordings.recording import (
     recording_folders,
     unfinished,
 )
-from sensors.statistics.holes import fill_from_background, smooth_surface
-from sensors.statistics.planes import on_planes
 
 LEAST_KEPT = 0.98
 """Share of a frame below which it is said that the generator sees a window of it."""
@@ -171,36 +169,47 @@ def _loaded(
     most = sys.maxsize if max_frames is None else max_frames
     for folder in unfinished(root):
         progress.note(f"left out: {folder} has no {META_FILE}, so it is unfinished or no recording")
-    depth, priors, apart, skipped, refused = _read_all(
-        folders, config, prior, seed, progress, most, first_number
-    )
-    if not depth:
+    read, refused = _read_all(folders, config, prior, progress, most, first_number)
+    noisy = _side_by_side(read)
+    surface, c, useless = understand(read, noisy, config.depth.surface, prior, seed, progress)
+    if useless and len(folders) == 1:
+        raise useless[0][1]
+    refused += [error for _, error in useless]
+    if not (read := [r for r in read if r.number not in {number for number, _ in useless}]):
         raise UserError(
             f"{root}: none of its {len(folders)} recording(s) can be used. The first: {refused[0]}"
         )
-    if skipped or refused:
+    if (skipped := sum(r.left_out for r in read)) or refused:
         progress.note(f"left out {skipped} frame(s), and {len(refused)} of {len(folders)} recording(s)")
-    index = np.concatenate([np.full(len(frames), number) for number, frames in depth.items()])
-    noisy = np.concatenate(list(depth.values()))
-    depth.clear()  # as large as all that follows
-    surface = surfaces(noisy, config.depth.surface, progress)
-    return Frames(noisy, surface, np.concatenate(priors), index, skipped, len(refused), frozenset(apart))
+    _tell_of_sensors(read, progress)
+    if useless:
+        kept = np.concatenate([np.arange(len(noisy))[r.rows] for r in read])
+        noisy, surface, c = noisy[kept], surface[kept], c[kept]
+    index = np.concatenate([np.full(len(r.depth_m), r.number) for r in read])
+    apart = frozenset(r.number for r in read if not r.consecutive)
+    return Frames(noisy, surface, c, index, skipped, len(refused), apart)
+
+
+def _side_by_side(read: Sequence[UsableFrames]) -> Float32[np.ndarray, "N H W"]:
+    """All frames in one array, of which those of each recording are a part from then on."""
+    if not read:
+        return np.zeros((0, 0, 0), np.float32)
+    if len(read) == 1:
+        return read[0].depth_m
+    all_m = np.concatenate([r.depth_m for r in read])
+    first = 0
+    for r in read:
+        r.first = first
+        r.depth_m = all_m[r.rows]
+        first = r.rows.stop
+    return all_m
 
 
 def _read_all(
-    folders: list[Path],
-    config: DDGConfig,
-    prior: Prior,
-    seed: int,
-    progress: Progress,
-    left: int,
-    first_number: int,
-) -> tuple[dict[int, np.ndarray], list[np.ndarray], set[int], int, list[UserError]]:
-    """Depth of each recording that can be used, by its number, among the first `left` frames; their priors;
-    those whose frames do not follow each other; number of frames left out of them; why the other recordings
-    were."""
-    depth, priors, skipped, refused, sizes, sensors = {}, [], 0, [], set(), Counter()
-    apart: set[int] = set()
+    folders: list[Path], config: DDGConfig, prior: Prior, progress: Progress, left: int, first_number: int
+) -> tuple[list[UsableFrames], list[UserError]]:
+    """Each recording that can be used, among the first `left` frames; why the others cannot."""
+    read, refused, sizes = [], [], set()
     for number, folder in enumerate(progress.track(folders, "reading recordings"), first_number):
         if not left:
             break
@@ -211,43 +220,22 @@ def _read_all(
             if (size := (recording.height_px, recording.width_px)) not in sizes:  # each crop is told once
                 sizes.add(size)
                 _tell_of_crop(recording, config, progress)
-            frames, rgb, left_out, consecutive = _read(recording, count, config, prior, progress)
-            rng = np.random.default_rng((seed, number))
-            c = prior.from_recording(frames, rgb, rng, consecutive)  # reads colour as it goes
+            read.append(_read(number, recording, count, config, prior, progress))
         except UserError as error:
             if len(folders) == 1:
                 raise
             refused.append(error)
             progress.note(f"left out: {error}")
-            continue
-        skipped += left_out
-        priors.append(c.astype(np.float16))
-        depth[number] = frames
-        if not consecutive:
-            apart.add(number)
-        sensors[str(recording.meta.get("sensor", "unnamed"))] += 1
+    return read, refused
+
+
+def _tell_of_sensors(read: Sequence[UsableFrames], progress: Progress) -> None:
+    sensors = Counter(r.sensor for r in read)
     if len(sensors) > 1:
         progress.note(
             "recordings of several sensors, which one generator will mix: "
             + ", ".join(f"{name} ({count})" for name, count in sorted(sensors.items()))
         )
-    return depth, priors, apart, skipped, refused
-
-
-def surfaces(
-    depth_m: Float[np.ndarray, "N H W"], kind: str, progress: Progress | None = None
-) -> Float[np.ndarray, "N H W"]:
-    """Recorded depth (N, H, W) metres -> the same with holes filled and noise smoothed away, frame by frame;
-    `kind` as in `ddg.depth.surface`.
-    """
-    made = np.empty(depth_m.shape, np.float32)  # a list of them would take as much again
-    for i, frame in enumerate(depth_m if progress is None else progress.track(depth_m, "surfaces")):
-        if kind == PIECEWISE:
-            smooth = piecewise_smooth(inverse_depth(frame))
-        else:
-            smooth = smooth_surface(fill_from_background(inverse_depth(frame)))
-        made[i] = inverse_depth(on_planes(smooth) if kind == PLANES else smooth)
-    return made
 
 
 def _folders(root: Path) -> list[Path]:
@@ -258,11 +246,9 @@ def _folders(root: Path) -> list[Path]:
 
 
 def _read(
-    recording: Recording, count: int, config: DDGConfig, prior: Prior, progress: Progress
-) -> tuple[np.ndarray, Sequence[np.ndarray] | None, int, bool]:
-    """The usable ones of the first `count` frames: (depth (T, H, W) in metres at the generator's size, rgb
-    (T of (h, w, 3)) if the prior wants it, number of frames left out, whether they follow each other).
-    """
+    number: int, recording: Recording, count: int, config: DDGConfig, prior: Prior, progress: Progress
+) -> UsableFrames:
+    """The usable ones of the first `count` frames, at the generator's size."""
     if recording.skipped:
         progress.note(recording.skipped_summary())
     if prior.needs_rgb and not recording.color_aligned:
@@ -287,7 +273,8 @@ def _read(
     rgb = _Colour(recording, usable) if prior.needs_rgb else None
     no_gap = bool(seen[usable[0] : usable[-1] + 1].all())  # a frame that came again is none
     left_out = len(recording.skipped) + len(frames) - len(usable)
-    return frames[usable], rgb, left_out, recording.consecutive and no_gap
+    sensor = str(recording.meta.get("sensor", "unnamed"))
+    return UsableFrames(number, frames[usable], rgb, recording.consecutive and no_gap, sensor, left_out)
 
 
 class _Colour(Sequence[np.ndarray]):

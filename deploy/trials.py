@@ -1,17 +1,9 @@
 """Trials of an exported policy on the development rig, through the very loop that would drive a robot."""
 
-import atexit
 import contextlib
-import os
-import signal
-import threading
-import time
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -20,8 +12,7 @@ from jaxtyping import Float, UInt8
 
 from ddgrasp import contract
 from ddgrasp.config import Config
-from ddgrasp.errors import Trouble, UserError
-from ddgrasp.signals import held_back
+from ddgrasp.workers import spread
 from deploy.changes import AS_IT_IS, Change
 from deploy.clock import RealClock, SimClock
 from deploy.devices.rig_camera import StereoCamera
@@ -241,44 +232,10 @@ def run_trials(
 ) -> Generator[tuple[TrialResult, Film], None, None]:
     """Results of `trials` as they come, from `workers` fresh processes (0: all in this one).
 
-    `make` makes what every process tries them on.
+    `make` makes what every process tries them on. See `ddgrasp.workers.spread`.
     """
-    if not trials:
-        return
-    if workers == 0:
-        bench = make(config, policy_path)
-        try:
-            for trial in trials:
-                yield bench.run(trial)
-        finally:
-            bench.close()
-        return
-    executor = ProcessPoolExecutor(
-        min(workers, len(trials)),
-        mp_context=get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(config, policy_path, make, os.getpid()),
-    )
-    waiting: set[Future] = set()
-    try:
-        with held_back(signal.SIGINT, signal.SIGHUP):  # workers leave them to this process
-            # multiprocessing's tracker, whose start would let them through, came with the executor
-            waiting |= {executor.submit(_run_in_worker, trial) for trial in trials}
-        for future in as_completed(waiting):
-            waiting.discard(future)  # its film is megabytes
-            yield future.result()
-    except BrokenProcessPool:
-        raise Trouble(
-            "a worker was killed, often for want of memory: finished trials are kept, the same command (with "
-            "--resume where it has one) goes on; fewer workers need less."
-        ) from None
-    except (UserError, KeyboardInterrupt):  # those that run come to their end, and are kept
-        signal.setitimer(signal.ITIMER_REAL, 0)  # a stage's interrupt comes again until it has surfaced
-        executor.shutdown(wait=True, cancel_futures=True)
-        yield from (future.result() for future in waiting if _has_ended_well(future))
-        raise
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
+    started = partial(make, config, policy_path)
+    return spread(started, trials, workers, remedy="fewer workers need less")
 
 
 def keep_results(
@@ -295,10 +252,6 @@ def keep_results(
             for result, film in made:
                 keep(result, film)
         raise
-
-
-def _has_ended_well(future: Future) -> bool:
-    return future.done() and not future.cancelled() and future.exception() is None
 
 
 class Filming:
@@ -356,33 +309,3 @@ def result(
         **seconds,
         object_pos_m=[list(place) for place in object_pos_m if np.isfinite(place).all()],
     )
-
-
-# --- worker processes --------------------------------------------------------------------------
-
-_bench: Bench | None = None
-_make_bench: Callable[[], Bench]
-
-
-def _start_worker(
-    config: Config, policy_path: Path, make: Callable[[Config, Path], Bench], parent: int
-) -> None:
-    """Go when the parent has gone."""
-    global _make_bench
-    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
-    _make_bench = partial(make, config, policy_path)
-
-
-def _leave_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
-
-
-def _run_in_worker(trial: Trial) -> tuple[TrialResult, Film]:
-    # The bench is built here, not in the initialiser, so that its errors reach the parent as they are.
-    global _bench
-    if _bench is None:
-        _bench = _make_bench()
-        atexit.register(_bench.close)
-    return _bench.run(trial)

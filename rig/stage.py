@@ -4,7 +4,8 @@ The teacher moves the rig's robot, the active-stereo camera looks on from a slig
 every trajectory. Only pictures are kept: no pose, no CAD model, no clean depth.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from ddgrasp.contract import CameraProfile
 from ddgrasp.job import Job
 from ddgrasp.layout import CONTROLS, closes
 from ddgrasp.progress import Progress
+from ddgrasp.workers import spread, worth
 from mjx_envs.camera import nominal_camera
 from mjx_envs.grasp_math import controls
 from rig.camera import RigCamera, jittered_pose, make_camera
@@ -26,6 +28,8 @@ from sensors.recordings.recording import Recording, is_recording
 from sensors.recordings.writer import RecordingWriter
 from sensors.statistics import stats
 
+FRAMES_A_PROCESS = 240
+"""So many are worth a process: they take ten times as long as it takes to begin."""
 STATIC_FRAMES = 10
 """Frames of a standing scene behind the temporal statistics."""
 
@@ -35,23 +39,43 @@ Policy = Callable[[Float[np.ndarray, "40"]], Float[np.ndarray, "8"]]
 
 def run(job: Job) -> Artifact:
     """Record `config.record.trajectories` episodes; finished recordings are kept on resume."""
+    config, directory, progress = job.config, job.directory, job.progress
+    paths = [directory / f"rig_{index:04d}" for index in range(config.record.trajectories)]
+    missing = [(index, path) for index, path in enumerate(paths) if not is_recording(path)]
+    with progress.task("trajectories", len(paths)) as task:
+        task.start_at(len(paths) - len(missing))
+        for _ in record_all(config, job.parents["teacher"].directory, missing):
+            task.advance()
+    recordings = [Recording.open(path) for path in paths]
+    _show(recordings, progress)
+    return job.finish({**_summary(recordings), "static": _static_statistics(config)})
+
+
+def record_all(config: Config, teacher: Path, trajectories: Sequence[tuple[int, Path]]) -> Iterator[None]:
+    """Records trajectories, each by its number into a folder, on all cores where that is worth it; comes back
+    after each. `teacher` is the folder of the stage."""
     from ppo import policy as teacher_policy
 
-    config, directory, progress = job.config, job.directory, job.progress
-    policy = teacher_policy.load(job.parents["teacher"].directory)
-    world = make_world(config.world)
-    camera = make_camera(config, world)
-    with progress.task("trajectories", config.record.trajectories) as task:
-        for index in range(config.record.trajectories):
-            path = directory / f"rig_{index:04d}"
-            if is_recording(path):
-                task.start_at(index + 1)
-                continue
-            record_trajectory(config, index, path, world, camera, policy)
-            task.advance()
-    recordings = [Recording.open(directory / f"rig_{i:04d}") for i in range(config.record.trajectories)]
-    _show(recordings, progress)
-    return job.finish({**_summary(recordings), "static": _static_statistics(config, world, camera)})
+    started = partial(Recorder, config, teacher_policy.load(teacher))
+    return spread(started, trajectories, worth(len(trajectories) * config.record.frames // FRAMES_A_PROCESS))
+
+
+class Recorder:
+    """World and camera, made once, and the teacher that moves one episode after the other before them."""
+
+    def __init__(self, config: Config, policy: Policy):
+        self._config, self._policy = config, policy
+        self._world = make_world(config.world)
+        self._camera = make_camera(config, self._world)
+
+    def run(self, trajectory: tuple[int, Path]) -> None:
+        """Records one by its number, into a folder."""
+        index, path = trajectory
+        record_trajectory(self._config, index, path, self._world, self._camera, self._policy)
+
+    def close(self) -> None:
+        """See `ddgrasp.workers.Worker`."""
+        self._camera.close()
 
 
 def record_trajectory(
@@ -107,11 +131,13 @@ def _summary(recordings: list[Recording]) -> dict[str, Any]:
     }
 
 
-def _static_statistics(config: Config, world: RigWorld, camera: RigCamera) -> dict[str, float]:
+def _static_statistics(config: Config) -> dict[str, float]:
     """Noise over time needs a scene that stands still: the robot at rest, the nominal camera."""
     rng = np.random.default_rng([config.seed, config.record.trajectories])
     name = config.world.objects[0]
+    world = make_world(config.world)
     world.reset(config.seed, name)
+    camera = make_camera(config, world)
     T_world_cam = nominal_camera(config.world.profile).T_world_cam
     frames = [camera.depth_mm(world.data, T_world_cam, rng, name) for _ in range(STATIC_FRAMES)]
     return stats.measure(np.stack(frames)).as_dict()

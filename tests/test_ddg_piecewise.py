@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ddg_jax.data import surfaces
+from ddg_jax.geometry import surfaces
 from ddg_jax.piecewise import piecewise_smooth
 from ddg_jax.prior import make_prior
 from ddgrasp.config import PIECEWISE, DDGConfig, DDGDepthConfig, PriorConfig

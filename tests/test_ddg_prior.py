@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from ddg_jax import data, prior
-from ddgrasp import artifacts
+from ddg_jax import data, geometry, prior
+from ddgrasp import artifacts, machine
 from ddgrasp.config import DDGConfig, DDGDepthConfig, DDGTrainingConfig, PriorConfig, UNetConfig
 from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
@@ -180,9 +180,9 @@ def test_the_held_out_frames_alone_are_those_that_all_of_them_hold_out(recording
     _, held = data.load_frames(*given).split(fraction)
     read, plainly = [], data._read
 
-    def noted(recording, *given):
+    def noted(number, recording, *given):
         read.append(recording.path.name)
-        return plainly(recording, *given)
+        return plainly(number, recording, *given)
 
     monkeypatch.setattr(data, "_read", noted)
     alone = data.load_held_out(*given)
@@ -402,6 +402,16 @@ def test_more_recordings_than_memory_are_refused_before_any_is_read(recordings, 
         UserError, match=r"ddg needs about .* on the host, .*: lower the number of recordings"
     ):
         load(recordings)
+
+
+def test_priors_of_several_processes_are_those_of_one(recordings, monkeypatch):
+    config = replace(WIDE, depth=replace(WIDE.depth, surface="planes"))
+    monkeypatch.setattr(machine, "cores", lambda: 2)
+    here, _ = load(recordings, config)
+    monkeypatch.setattr(geometry, "FRAMES_A_PROCESS", 2)
+    spread, _ = load(recordings, config)
+    for name in ("depth_m", "surface_m", "prior", "recording"):
+        np.testing.assert_array_equal(getattr(spread, name), getattr(here, name))
 
 
 def test_one_long_recording_takes_what_is_said_of_it(tmp_path):

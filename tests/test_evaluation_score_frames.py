@@ -154,14 +154,17 @@ def test_a_column_more_than_the_paper_has_is_drawn(monkeypatch):
     assert draw_embedding(flat, {"sim_gt": column, "mine": column}, 1.0).startswith(b"\x89PNG")
 
 
-def test_what_is_scored_is_no_trajectory_that_a_stage_records():
+def test_what_is_scored_is_no_trajectory_that_a_stage_records(monkeypatch, tmp_path):
     class World:
         def reset(self, seed, name):
             raise LookupError(seed)
 
+    recorder = score_data._RigRecorder(PRESETS["debug"], lambda observation: observation[:8], False)
+    monkeypatch.setattr(recorder, "_world", World())
+
     def world_of(number: int) -> int:
         with pytest.raises(LookupError) as drawn:
-            score_data._record(PRESETS["debug"], "real", number, World(), None, None, False)
+            recorder.run((number, "real", tmp_path / "episode.npz"))
         return drawn.value.args[0]
 
     recorded = {int(np.random.default_rng([PRESETS["debug"].seed, i]).integers(2**31)) for i in range(100)}

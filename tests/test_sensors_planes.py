@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ddg_jax.data import surfaces
+from ddg_jax.geometry import surfaces
 from ddg_jax.prior import make_prior
 from ddgrasp.config import FILTERED, PLANES, DDGConfig, DDGDepthConfig, PriorConfig
 from ddgrasp.config.ddg import Surface

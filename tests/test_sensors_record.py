@@ -5,12 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ddgrasp import contract
+from ddgrasp import contract, machine
 from ddgrasp.config import RandomConfig
 from ddgrasp.presets import get_preset
+from ddgrasp.shipped import PRETRAINED
+from rig import stage
 from rig import world as rig
 from rig.camera import make_camera
-from rig.stage import act, record_trajectory
+from rig.stage import act, record_all, record_trajectory
 from sensors.recordings.recording import Recording
 
 
@@ -80,3 +82,20 @@ def test_action_is_scaled_and_clipped_to_the_joint_limits(config):
     assert 0.5 < after[0] - before[0] <= 10 * contract.ACTION_SCALE_RAD * 1.05
     assert np.all(after <= np.array(contract.JOINT_UPPER_RAD) + 0.02)
     assert width_m < 0.03
+
+
+def test_recordings_of_several_processes_are_those_of_one(config, tmp_path, monkeypatch):
+    teacher = PRETRAINED / "teacher"
+    monkeypatch.setattr(machine, "cores", lambda: 2)
+    for name, frames in (("here", 240), ("spread", 4)):
+        monkeypatch.setattr(stage, "FRAMES_A_PROCESS", frames)
+        (tmp_path / name).mkdir()
+        assert (
+            list(record_all(config, teacher, [(i, tmp_path / name / str(i)) for i in range(3)])) == [None] * 3
+        )
+    for i in range(3):
+        here, spread = (Recording.open(tmp_path / name / str(i)) for name in ("here", "spread"))
+        assert here.meta["object"] == spread.meta["object"]
+        for frame in range(4):
+            np.testing.assert_array_equal(here.depth_mm(frame), spread.depth_mm(frame))
+            np.testing.assert_array_equal(here.rgb(frame), spread.rgb(frame))

@@ -154,17 +154,11 @@ def _frames(
 
 def _record_more(config: Config, teacher: Path, numbers: range, directory: Path, progress: Progress) -> None:
     """Trajectories that the run's record stage would have recorded next; finished ones are kept."""
-    from ppo import policy as teacher_policy
-    from rig.camera import make_camera
-    from rig.stage import record_trajectory
-    from rig.world import make_world
+    from rig.stage import record_all
     from sensors.recordings.recording import is_recording
 
-    missing = [n for n in numbers if not is_recording(directory / f"rig_{n:04d}")]
-    if not missing:
-        return
-    policy = teacher_policy.load(teacher)
-    world = make_world(config.world)
-    camera = make_camera(config, world)
-    for number in progress.track(missing, "more trajectories"):
-        record_trajectory(config, number, directory / f"rig_{number:04d}", world, camera, policy)
+    folders = [(number, directory / f"rig_{number:04d}") for number in numbers]
+    missing = [(number, folder) for number, folder in folders if not is_recording(folder)]
+    with progress.task("more trajectories", len(missing)) as task:
+        for _ in record_all(config, teacher, missing):
+            task.advance()

@@ -5,10 +5,11 @@ geometry, on which every method draws its depth; what the camera itself would ha
 it is the real-vs-real floor, and the reference of paired measures. No method sees it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,11 +21,8 @@ from ddgrasp.config import PIECEWISE, Config
 from ddgrasp.errors import UserError
 from ddgrasp.files import atomic_path, read_npz
 from ddgrasp.progress import Progress
+from ddgrasp.workers import spread, worth
 from sensors.recordings.recording import Recording, find_recordings
-
-if TYPE_CHECKING:
-    import rig.camera
-    import rig.world
 
 REAL, SIM = SIDES = ("real", "sim")
 MADE_ANEW = "delete it and run again with --resume"
@@ -84,15 +82,12 @@ def record_rig(
     names = [
         (side, directory / f"{side}_{i:04d}.npz") for side in SIDES for i in range(config.score.trajectories)
     ]
-    missing = [file for _, file in names if not file.exists()]
+    missing = [(number, side, file) for number, (side, file) in enumerate(names) if not file.exists()]
     _check_colour([file for _, file in names if file.exists()], with_rgb)
-    record = _rig_recorder(config, teacher, with_rgb) if missing else None
     with progress.task("rig trajectories", len(names)) as task:
         task.start_at(len(names) - len(missing))
-        for number, (side, file) in enumerate(names):
-            if record is not None and not file.exists():
-                _save(file, record(side, number))
-                task.advance()
+        for _ in _recorded(config, teacher, with_rgb, missing):
+            task.advance()
     return [file for _, file in names]
 
 
@@ -106,47 +101,65 @@ def _check_colour(files: Sequence[Path], with_rgb: bool) -> None:
             )
 
 
-def _rig_recorder(config: Config, teacher: Path, with_rgb: bool) -> Callable[[str, int], Episode]:
+def _recorded(
+    config: Config, teacher: Path, with_rgb: bool, missing: Sequence[tuple[int, str, Path]]
+) -> Iterator[None]:
     from ppo import policy as teacher_policy
-    from rig.camera import make_camera
-    from rig.world import make_world
+    from rig.stage import FRAMES_A_PROCESS
 
-    policy = teacher_policy.load(teacher)
-    world = make_world(config.world)
-    camera = make_camera(config, world)
-    return lambda side, number: _record(config, side, number, world, camera, policy, with_rgb)
+    started = partial(_RigRecorder, config, teacher_policy.load(teacher), with_rgb)
+    return spread(started, missing, worth(len(missing) * config.score.frames // FRAMES_A_PROCESS))
 
 
-def _record(
-    config: Config, side: str, number: int, world: "rig.world.RigWorld", camera: "rig.camera.RigCamera",
-    policy: Callable[[np.ndarray], np.ndarray], with_rgb: bool,
-) -> Episode:  # fmt: skip
-    from rig.camera import jittered_pose
-    from rig.stage import act
+class _RigRecorder:
+    """World and camera, made once, and the teacher that moves one episode after the other before them."""
 
-    score = config.score
-    rng = np.random.default_rng([config.seed, SEED_OFFSET + number])
-    of_side = number % score.trajectories  # both sides show the same objects
-    name = config.world.objects[of_side % len(config.world.objects)]
-    world.reset(int(rng.integers(2**31)), name)
-    T_world_cam = jittered_pose(config.record, rng)
-    for _ in range(rng.integers(max(1, config.record.frames - score.frames + 1))):
-        act(world, policy(world.observation()))
-    repeated = side == SIM and number - score.trajectories < score.repeat_scenes
-    repeats = [camera.depth_mm(world.data, T_world_cam, rng, name) for _ in range(repeated * score.repeats)]
-    sensed, clean, rgb = [], [], []
-    for _ in range(score.frames):
-        sensed.append(camera.depth_mm(world.data, T_world_cam, rng, name))
-        clean.append(camera.clean_mm(world.data, T_world_cam))
-        if with_rgb:
-            rgb.append(camera.rgb(world.data, T_world_cam))
-        act(world, policy(world.observation()))
-    profile = config.world.profile
-    return Episode(
-        side, number, number, np.stack(sensed), np.stack(clean),
-        np.stack(repeats) if repeats else np.zeros((0, *sensed[0].shape), np.uint16),
-        np.stack(rgb) if rgb else None, profile.fx_px, profile.baseline_m,
-    )  # fmt: skip
+    def __init__(self, config: Config, policy: Callable[[np.ndarray], np.ndarray], with_rgb: bool):
+        from rig.camera import make_camera
+        from rig.world import make_world
+
+        self._config, self._policy, self._with_rgb = config, policy, with_rgb
+        self._world = make_world(config.world)
+        self._camera = make_camera(config, self._world)
+
+    def run(self, missing: tuple[int, str, Path]) -> None:
+        """Records one of a number and side, into a file."""
+        number, side, file = missing
+        _save(file, self._episode(side, number))
+
+    def close(self) -> None:
+        """See `ddgrasp.workers.Worker`."""
+        self._camera.close()
+
+    def _episode(self, side: str, number: int) -> Episode:
+        from rig.camera import jittered_pose
+        from rig.stage import act
+
+        config, world, camera, policy = self._config, self._world, self._camera, self._policy
+        score, profile = config.score, config.world.profile
+        rng = np.random.default_rng([config.seed, SEED_OFFSET + number])
+        of_side = number % score.trajectories  # both sides show the same objects
+        name = config.world.objects[of_side % len(config.world.objects)]
+        world.reset(int(rng.integers(2**31)), name)
+        T_world_cam = jittered_pose(config.record, rng)
+        for _ in range(rng.integers(max(1, config.record.frames - score.frames + 1))):
+            act(world, policy(world.observation()))
+        repeated = side == SIM and number - score.trajectories < score.repeat_scenes
+        repeats = [
+            camera.depth_mm(world.data, T_world_cam, rng, name) for _ in range(repeated * score.repeats)
+        ]
+        sensed, clean, rgb = [], [], []
+        for _ in range(score.frames):
+            sensed.append(camera.depth_mm(world.data, T_world_cam, rng, name))
+            clean.append(camera.clean_mm(world.data, T_world_cam))
+            if self._with_rgb:
+                rgb.append(camera.rgb(world.data, T_world_cam))
+            act(world, policy(world.observation()))
+        return Episode(
+            side, number, number, np.stack(sensed), np.stack(clean),
+            np.stack(repeats) if repeats else np.zeros((0, *sensed[0].shape), np.uint16),
+            np.stack(rgb) if rgb else None, profile.fx_px, profile.baseline_m,
+        )  # fmt: skip
 
 
 def _save(file: Path, episode: Episode) -> None:
@@ -277,7 +290,7 @@ def real_episodes(frames: RealFrames, with_rgb: bool) -> list[Episode]:
 
     Raises UserError if colour is wanted that is not aligned to depth.
     """
-    from ddg_jax.data import surfaces
+    from ddg_jax.geometry import surfaces
 
     check_colour(frames, with_rgb)
     depth_mm, rgb = frames.depth_mm, frames.rgb
