@@ -48,7 +48,8 @@ def run(
     check_place(config, run_dir, resume=resume, stages=stages)
     for stage in stages:
         make(stage, config, run_dir, resume=resume, quiet=quiet)
-        config_file.write(config, run_dir / config_file.CONFIG_FILE)
+        if not config_file.is_of_a_person(run_dir / config_file.CONFIG_FILE):
+            config_file.write(config, run_dir / config_file.CONFIG_FILE)
     return importlib.import_module("evaluation.report.stage").write_report(run_dir)
 
 

@@ -21,6 +21,8 @@ from ddgrasp.presets import PRESETS, get_preset
 from ddgrasp.scaling import scaled
 
 CONFIG_FILE = "config.yaml"
+_FIRST_LINE = "ddgrasp run --config"
+"""What those that `write` makes begin with, as a comment."""
 _PRESET = "preset"
 _MERGE = "tag:yaml.org,2002:merge"
 """YAML's `<<`."""
@@ -38,13 +40,21 @@ def write(config: Config, path: Path) -> None:
         preset = replace(scaled(preset, config.scale), scale=1.0)
     different = _differences(to_json(preset), to_json(config), "")
     head = [
-        f"ddgrasp run --config {path.name}",
+        f"{_FIRST_LINE} {path.name}",
         f"Preset {config.preset} but for:" if different else f"Preset {config.preset} as it is.",
         *(f"  {name}: {json.dumps(value)}" for name, value in different.items()),
     ]
     values = {_PRESET: config.preset, upgrades.VERSION_FIELD: upgrades.VERSION, **to_json(config)}
     text = yaml.dump(values, Dumper=_dumper(), sort_keys=False, allow_unicode=True, width=110)
     atomic_write_text(path, "".join(f"# {line}\n" for line in head) + text)
+
+
+def is_of_a_person(path: Path) -> bool:
+    """Whether somebody wrote the file by hand: `write` would take their comments away."""
+    try:
+        return not path.read_bytes().startswith(f"# {_FIRST_LINE}".encode())
+    except OSError:
+        return False
 
 
 def read(path: Path) -> Config:

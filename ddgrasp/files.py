@@ -6,11 +6,13 @@ Every file goes to a temporary name in the same directory, reaches the disk (fsy
 
 import contextlib
 import dataclasses
+import errno
 import io
 import json
 import os
 import secrets
 import shutil
+import stat
 import tempfile
 import zipfile
 import zlib
@@ -80,7 +82,10 @@ def replace_folder(folder: Path, path: Path) -> None:
         if old.exists() and not path.exists():
             os.replace(old, path)
         raise
-    shutil.rmtree(old, ignore_errors=True)
+    if old.is_symlink():
+        old.unlink()
+    else:
+        shutil.rmtree(old, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -112,7 +117,10 @@ def _name(error: BaseException, temporary: Path, path: Path) -> None:
 
 
 def user_cache(name: str) -> Path:
-    """Where what can be made again is kept: `name` in DDGRASP_CACHE, or in ddgrasp/ of the user's caches."""
+    """Where what can be made again is kept: `name` in DDGRASP_CACHE, or in ddgrasp/ of the user's caches.
+
+    UserError for a user without a home, if others may write to the folder that stands in for one.
+    """
     if own := os.environ.get("DDGRASP_CACHE"):
         return Path(own) / name
     if caches := os.environ.get("XDG_CACHE_HOME"):
@@ -120,7 +128,17 @@ def user_cache(name: str) -> Path:
     try:
         return Path.home() / ".cache" / "ddgrasp" / name
     except RuntimeError:  # in a container, for a user whom nobody knows
-        return Path(tempfile.gettempdir()) / f"ddgrasp-{os.getuid()}" / name
+        return _own(Path(tempfile.gettempdir()) / f"ddgrasp-{os.getuid()}") / name
+
+
+def _own(folder: Path) -> Path:
+    """`folder` of a place that everybody writes to, made if it is not there: compiled programs of others are
+    not to be run. UserError if others may write to it."""
+    folder.mkdir(mode=0o700, exist_ok=True)
+    known = folder.lstat()
+    if known.st_uid != os.getuid() or known.st_mode & 0o022 or not stat.S_ISDIR(known.st_mode):
+        raise UserError(f"{folder} may be written to by others: delete it, or set DDGRASP_CACHE to a folder.")
+    return folder
 
 
 def atomic_write_bytes(path: Path | str, data: bytes) -> None:
@@ -203,5 +221,8 @@ def _fsync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:  # of a folder, on a shared one of a virtual machine
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():
+            raise
     finally:
         os.close(descriptor)

@@ -31,7 +31,7 @@ from rig.camera import jittered_pose
 from rig.fr3 import scene
 from rig.stage import describe_recording
 from sensors.recordings.recording import Recording, is_recording
-from sensors.recordings.writer import RecordingWriter
+from sensors.recordings.writer import RecordingWriter, check_place
 
 SETTINGS_FILE = "record.json"
 CONTACT = 100.0
@@ -63,12 +63,14 @@ class Takes:
 def record(config: Config, takes: Takes, out: Path, progress: Progress) -> list[Recording]:
     """`config.record.trajectories` recordings in `out`; those that are there are kept.
 
-    UserError if `out` has recordings that were made otherwise.
+    UserError if `out` has recordings that were made otherwise, or something else where one is to be.
     """
     takes.names()
+    paths = [out / f"fr3_{index:04d}" for index in range(config.record.trajectories)]
+    for path in paths:
+        check_place(path)
     _begin(config, takes, out)
     lab = Fr3Lab(takes.shapes)
-    paths = [out / f"fr3_{index:04d}" for index in range(config.record.trajectories)]
     try:
         with progress.task("trajectories", len(paths)) as task:
             for index, path in enumerate(paths):

@@ -53,13 +53,14 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR) -> Path:
 
     An earlier conversion of the same network is replaced once the new one is complete.
 
-    Raises UserError for a file that is damaged or does not fit a known network.
+    Raises UserError for a file that is damaged or does not fit a known network, or where other files are.
     """
     from foundation.checkpoint_files import read_checkpoint
     from foundation.convert import convert, recognise
 
     arrays = read_checkpoint(file)
     network = recognise({key: tuple(array.shape) for key, array in arrays.items()})
+    _check_place(weights_dir / network)
     _check_version(file, network)
     _check_relative(file, network)
     variables = convert(network, arrays)
@@ -80,6 +81,16 @@ def convert_file(file: Path, weights_dir: Path = WEIGHTS_DIR) -> Path:
         _save(folder / CHECKPOINT, variables)
         atomic_write_json(folder / MANIFEST, asdict(manifest))
     return weights_dir / network
+
+
+def _check_place(folder: Path) -> None:
+    """UserError if an earlier conversion is not all that is there: it would go away with it."""
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if others := sorted(names - {MANIFEST, CHECKPOINT}):
+        raise UserError(
+            f"{folder} holds {others[0]}, which is no part of converted weights and would be deleted: move "
+            "it, or give another --out."
+        )
 
 
 def read_manifest(directory: Path) -> WeightsManifest:

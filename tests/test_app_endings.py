@@ -268,6 +268,7 @@ def test_a_place_is_tried_and_left_as_it_was(tmp_path):
         ("folder", "a folder: name a file, in it or elsewhere."),
         ("a" * 250, "where nothing can be written (File name too long): name a file elsewhere."),
         (f"{'a' * 300}/a.png", "where nothing can be written (File name too long): name a file elsewhere."),
+        ("/dev/null", "a device or pipe, which a file would replace: name another."),
         ("/proc/a.png", "where nothing can be written ("),
         ("/proc/b/a.png", "where nothing can be written ("),
     ],

@@ -111,6 +111,16 @@ def test_unknown_objects_are_named_before_anything_runs(tmp_path, takes, message
     assert not (tmp_path / "out").exists()
 
 
+def test_what_is_no_recording_stays_where_one_was_to_be(tmp_path):
+    pytest.importorskip("manifold3d", reason="needs pip install -e '.[fr3]'")
+    notes = tmp_path / "out" / "fr3_0001" / "notes.txt"
+    notes.parent.mkdir(parents=True)
+    notes.write_text("mine")
+    with pytest.raises(UserError, match="fr3_0001 is no recording"):
+        fr3_record.record(CONFIG, Takes(0, ("cube",)), tmp_path / "out", Progress(quiet=True))
+    assert notes.read_text() == "mine" and not (tmp_path / "out" / fr3_record.SETTINGS_FILE).exists()
+
+
 def test_recordings_before_one_table_and_before_many_do_not_mix(tmp_path):
     takes = Takes(0, ("cube",))
     many = replace(CONFIG, record=replace(CONFIG.record, other_tables=True))

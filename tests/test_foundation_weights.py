@@ -231,6 +231,18 @@ def test_conversion_is_stored_with_its_origin_and_loads_back(tmp_path, resnet18)
         store.load(directory)
 
 
+def test_a_conversion_takes_no_file_away_that_is_not_its_own(tmp_path, resnet18):
+    file = tmp_path / "weights" / "resnet18" / "resnet18.pth"  # in the very folder
+    file.parent.mkdir(parents=True)
+    files.write_pth(file, resnet18)
+    with pytest.raises(UserError, match=r"resnet18 holds resnet18\.pth, which is no part of converted"):
+        store.convert_file(file, tmp_path / "weights")
+    assert [path.name for path in file.parent.iterdir()] == ["resnet18.pth"]
+    elsewhere = file.replace(tmp_path / "resnet18.pth")
+    for _ in range(2):  # an earlier conversion is replaced
+        assert store.convert_file(elsewhere, tmp_path / "weights") == tmp_path / "weights" / "resnet18"
+
+
 @pytest.mark.parametrize(
     ("network", "name"),
     [

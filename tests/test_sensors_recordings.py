@@ -16,7 +16,7 @@ from ddgrasp.presets import PRESETS
 from recording_support import set_meta
 from sensors.recordings import writer as writer_module
 from sensors.recordings.recording import Recording, contents, depth_picture_count, find_recordings
-from sensors.recordings.writer import RecordingWriter
+from sensors.recordings.writer import RecordingWriter, check_place
 
 REAL = Path(__file__).parents[2] / "shared" / "real_depth"
 
@@ -90,6 +90,36 @@ def test_interrupted_writer_keeps_the_previous_recording(tmp_path):
         raise KeyboardInterrupt
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
     assert len(Recording.open(path)) == 2
+
+
+def test_what_is_no_recording_is_not_to_be_replaced_by_one(tmp_path):
+    notes = tmp_path / "a" / "notes.txt"
+    notes.parent.mkdir()
+    notes.write_text("mine")
+    with pytest.raises(UserError, match=r"a is no recording \(meta.json is missing\): move it"):
+        check_place(tmp_path / "a")
+    (tmp_path / "b").write_text("mine")
+    (tmp_path / "c").symlink_to(tmp_path / "nowhere")
+    for name, kind in (("b", "no folder"), ("c", "a link to nothing")):
+        with pytest.raises(UserError, match=f"{name} is {kind}: delete it"):
+            check_place(tmp_path / name)
+    (tmp_path / "empty").mkdir()
+    check_place(tmp_path / "empty")
+    check_place(_write(tmp_path / "again"))
+
+
+def test_frames_that_come_but_once_are_not_recorded_over(tmp_path):
+    """By whichever command: a killed import's come again, a killed camera's do not."""
+    for name, keep in (("import", False), ("live", True)):
+        killed = RecordingWriter(tmp_path / name, {}, keep=keep)
+        killed.__enter__()
+        killed.add(*_frame(1))
+        killed._alone.close()  # as the system does
+    assert len(Recording.open(_write(tmp_path / "import", frames=2))) == 2
+    for _ in range(2):
+        with pytest.raises(UserError, match=r"\.live\.partial has 1 frames of a recording that did not end"):
+            _write(tmp_path / "live")
+    assert len(list((tmp_path / ".live.partial" / "depth").iterdir())) == 1
 
 
 def test_two_writers_of_one_name_do_not_meet(tmp_path):

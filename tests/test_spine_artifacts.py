@@ -1,9 +1,11 @@
 """Artefacts survive a full disk and an interruption, and refuse what does not fit."""
 
 import dataclasses
+import errno
 import json
 import os
 import resource
+import stat
 import subprocess
 import sys
 import tempfile
@@ -112,6 +114,61 @@ def test_a_folder_is_replaced_by_a_whole_one_or_stays(tmp_path):
     assert [there.name for there in path.parent.iterdir()] == ["set"]
 
 
+def test_a_link_to_a_folder_is_replaced_and_what_it_leads_to_stays(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "file").write_text("kept")
+    (tmp_path / "sets").mkdir()
+    (tmp_path / "sets" / "set").symlink_to(tmp_path / "elsewhere")
+    with replaced_folder(tmp_path / "sets" / "set") as temporary:
+        temporary.mkdir()
+    assert [there.name for there in (tmp_path / "sets").iterdir()] == ["set"]
+    assert not (tmp_path / "sets" / "set").is_symlink()
+    assert (tmp_path / "elsewhere" / "file").read_text() == "kept"
+
+
+def test_a_folder_that_cannot_be_synced_costs_no_file(tmp_path, monkeypatch):
+    """As shared folders of virtual machines."""
+    sync = os.fsync
+
+    def of_files_alone(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", of_files_alone)
+    atomic_write_text(tmp_path / "file", "whole")
+    assert (tmp_path / "file").read_text() == "whole"
+
+    def full(descriptor):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="Input/output error"):
+        atomic_write_text(tmp_path / "other", "half")
+    assert [there.name for there in tmp_path.iterdir()] == ["file"]
+
+
+def test_programs_that_others_may_have_written_are_not_run(tmp_path, monkeypatch):
+    for name in ("DDGRASP_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def nowhere():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", nowhere)
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
+    (cache := user_cache("jax").parent).chmod(0o777)
+    assert cache == tmp_path / f"ddgrasp-{os.getuid()}"
+    with pytest.raises(UserError, match="may be written to by others: delete it, or set DDGRASP_CACHE"):
+        user_cache("jax")
+    cache.chmod(0o700)
+    assert user_cache("jax") == cache / "jax"
+    monkeypatch.setattr(os, "getuid", lambda: cache.lstat().st_uid + 1)
+    (tmp_path / f"ddgrasp-{os.getuid()}").mkdir()  # somebody else's
+    with pytest.raises(UserError, match="may be written to by others"):
+        user_cache("jax")
+
+
 def test_who_is_interrupted_between_two_renames_keeps_the_old_folder(tmp_path, monkeypatch):
     path, rename, renames = tmp_path / "set", os.replace, []
 
@@ -137,7 +194,6 @@ def test_who_is_interrupted_between_two_renames_keeps_the_old_folder(tmp_path, m
         ({"XDG_CACHE_HOME": "/b"}, "/b/ddgrasp/jax"),
         ({"HOME": "/c"}, "/c/.cache/ddgrasp/jax"),
         ({"XDG_CACHE_HOME": "", "DDGRASP_CACHE": "", "HOME": "/c"}, "/c/.cache/ddgrasp/jax"),
-        ({}, "/tmp/ddgrasp-1234/jax"),
     ],
 )
 def test_caches_are_where_the_environment_says(environment, expected, monkeypatch):
@@ -145,14 +201,6 @@ def test_caches_are_where_the_environment_says(environment, expected, monkeypatc
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(os, "getuid", lambda: 1234)
-    monkeypatch.setattr(tempfile, "gettempdir", lambda: "/tmp")
-    if "HOME" not in environment:  # as in a container whose user has no home
-
-        def nowhere():
-            raise RuntimeError("Could not determine home directory.")
-
-        monkeypatch.setattr(Path, "home", nowhere)
     assert user_cache("jax") == Path(expected)
 
 

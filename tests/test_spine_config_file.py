@@ -157,3 +157,12 @@ def test_a_file_that_is_not_there_and_two_beginnings_are_refused(tmp_path):
     for option, value in (("--preset", "demo"), ("--scale", "0.5")):
         with pytest.raises(UserError, match=f"x.yaml and {option} {value} both say where to begin"):
             parse("run", ["--config", "x.yaml", option, value])
+
+
+def test_a_file_that_somebody_wrote_into_the_run_s_folder_stays(tmp_path):
+    path = tmp_path / "config.yaml"
+    assert not config_file.is_of_a_person(path)
+    config_file.write(PRESETS["debug"], path)
+    assert not config_file.is_of_a_person(path)
+    path.write_text("# mine\npreset: debug\n")
+    assert config_file.is_of_a_person(path) and config_file.read(path) == PRESETS["debug"]

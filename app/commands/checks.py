@@ -91,9 +91,11 @@ def check_tried(series: "Series") -> None:
 
 
 def check_file(option: str, path: Path) -> None:
-    """UserError if `path` cannot become a file: it is a folder, or nothing can be written there."""
+    """UserError if `path` cannot become a file: it is a folder or device, or nothing can be written there."""
     if os.path.isdir(path):
         raise UserError(f"{option} is {path}, a folder: name a file, in it or elsewhere.")
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise UserError(f"{option} is {path}, a device or pipe, which a file would replace: name another.")
     _try_writing(option, path, path.absolute().parent, "a file")
 
 

@@ -60,7 +60,7 @@ def write(
 
 def check_free(out: Path) -> None:
     """UserError if there is something at `out` already."""
-    if out.exists():
+    if os.path.lexists(out):
         raise UserError(f"{out} exists: choose another --out, or delete it.")
 
 

@@ -70,7 +70,7 @@ def import_recording(source: Source, path: Path) -> Imported:
             frames are.
         OSError: a frame could not be written, and `source` keeps none then, or it was the first.
     """
-    if path.exists():
+    if os.path.lexists(path):
         raise UserError(f"{source.path}: {path} exists already: delete it, or give another --out.")
     skipped, medians_m, frames, gaps, last = [], [], 0, source.has_gaps, False
     loss, marked, unlike = "", 0, ""

@@ -5,6 +5,7 @@ Run on librealsense's software device (pyrealsense2 2.59, synthetic frames); not
 
 import contextlib
 import math
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from ddgrasp.progress import Progress, Task
 from ddgrasp.signals import ending, forget_terminal
 from sensors.recordings.importers import Imported, RawFrame, Source, import_recording
 from sensors.recordings.realsense import describe, load_pyrealsense2, project, raw_frame
-from sensors.recordings.writer import partial_folder
+from sensors.recordings.writer import check_left
 
 STREAM_HZ = 30
 """The camera's own rate; a recording keeps every frame or every n-th."""
@@ -114,13 +115,8 @@ def new_path(out: Path, name: str) -> Path:
     of a recording of that name are left that was killed."""
     if not name or name.startswith(".") or Path(name).name != name:
         raise UserError(f"--name is {name!r}; expected a folder's name, for example desk (--out says where).")
-    if not (out / name).exists():
-        partial = partial_folder(out / name)
-        if left := len(list((partial / "depth").glob("*"))):
-            raise UserError(
-                f"{partial} has {left} frames of a recording that did not end, or has not yet: choose "
-                f"another --name, keep them by `ddgrasp record import {partial}`, or delete that folder."
-            )
+    if not os.path.lexists(out / name):
+        check_left(out / name, always=True)
         return out / name
     free = next(i for i in range(2, 10**6) if not (out / f"{name}_{i}").exists())
     raise UserError(f"{out / name} exists already: choose another, for example --name {name}_{free}.")

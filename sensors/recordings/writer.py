@@ -19,6 +19,8 @@ from sensors.recordings.recording import META_FILE
 
 BEGUN_FILE = "begun.json"
 """What is known of a recording before it is complete: the meta.json of one that was killed."""
+_COMES_ONCE = "frames_come_once"
+"""In BEGUN_FILE of a recording whose frames nobody can make again."""
 JPEG_QUALITY = 95
 PNG_COMPRESSION = 3
 
@@ -26,6 +28,35 @@ PNG_COMPRESSION = 3
 def partial_folder(path: Path) -> Path:
     """Where the frames of the recording `path` are until it is complete."""
     return path.parent / f".{path.name}.partial"
+
+
+def check_left(path: Path, always: bool = False) -> None:
+    """UserError if a recording `path` that was killed has left frames that come but once, or, with `always`,
+    any."""
+    partial = partial_folder(path)
+    left = len(list((partial / "depth").glob("*")))
+    if left and (always or _comes_once(partial / BEGUN_FILE)):
+        raise UserError(
+            f"{partial} has {left} frames of a recording that did not end, or has not yet: choose another "
+            f"name, keep them by `ddgrasp record import {partial}`, or delete that folder."
+        )
+
+
+def _comes_once(begun: Path) -> bool:
+    try:
+        known = json.loads(begun.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(known, dict) and bool(known.get(_COMES_ONCE))
+
+
+def check_place(path: Path) -> None:
+    """UserError if a recording `path` would take the place of something else."""
+    if os.path.lexists(path) and not path.is_dir():
+        kind = "a link to nothing" if path.is_symlink() and not path.exists() else "no folder"
+        raise UserError(f"{path} is {kind}: delete it, or choose another name.")
+    if path.is_dir() and not (path / META_FILE).exists() and any(path.iterdir()):
+        raise UserError(f"{path} is no recording ({META_FILE} is missing): move it, or choose another name.")
 
 
 class RecordingWriter:
@@ -40,7 +71,8 @@ class RecordingWriter:
     With `keep`, for frames that come but once, the hidden folder stays if it has any, but where they are
     refused (UserError). Leaving by an error raises Trouble then, which says where they are.
 
-    Raises UserError on entering if another one is at work under that name.
+    Raises UserError on entering if another one is at work under that name, or if frames that come but once
+    are left there of one that was killed.
     """
 
     def __init__(self, path: str | os.PathLike, meta: dict[str, Any], keep: bool = False):
@@ -55,12 +87,18 @@ class RecordingWriter:
 
     def __enter__(self) -> "RecordingWriter":
         self._lock()
+        try:
+            check_left(self.path)
+        except UserError:
+            self._alone.close()
+            raise
         for folder in ("color", "depth"):  # what a killed process has left goes
             shutil.rmtree(self._temporary / folder, ignore_errors=True)
             (self._temporary / folder).mkdir()
         # What would be lost by a kill; whether frames follow each other is known at the end alone.
         known = {name: value for name, value in self.meta.items() if name != "consecutive_frames"}
-        begun = json.dumps({"depth_unit_m": DEPTH_UNIT_M, **known}, indent=1) + "\n"
+        once = {_COMES_ONCE: True} if self._keep else {}
+        begun = json.dumps({"depth_unit_m": DEPTH_UNIT_M, **known, **once}, indent=1) + "\n"
         _write(self._temporary / BEGUN_FILE, begun.encode(), sync=True)
         return self
 
