@@ -17,8 +17,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ddg_jax import piecewise, representation, sample
 from ddg_jax import programs as ddg
-from ddg_jax import representation, sample
 from ddg_jax.sensor import make_sensor
 from ddgrasp import contract
 from ddgrasp.config import (
@@ -38,7 +38,8 @@ from foundation.depth_feature_data import MEASURED
 from learning.programs import Program, key, shape
 from mjx_envs import devices
 from mjx_envs.grasp_env import AutoReset, GraspEnv
-from ppo import evaluate, policy, rollout, train
+from mjx_envs.render.visual import Viewer
+from ppo import evaluate, policy, rollout, train, warmup
 from student_jax import act, depth_source, device_frames
 from student_jax import programs as student
 from student_jax.data import Window
@@ -71,6 +72,18 @@ def _ppo(config: Config) -> dict[str, Program]:
 def ppo(piece: str, config: Config) -> Program:
     """A part of an iteration of PPO, by its name in `ppo.train.programs`."""
     return _ppo(config)[piece]
+
+
+def cloning(config: Config) -> Program:
+    """The optimiser steps of a round of cloning the guide."""
+    return warmup.program(config.teacher, jax.eval_shape(train.initial(config, _training_env(config))))
+
+
+def object_pixels(config: Config) -> Program:
+    """Pixels of the object in the student's crop, for as many scenes as demos are drawn together."""
+    _, drawn = _roller("depth", config)
+    layout = GraspEnv(_on_jax(config).world).table.layout
+    return jax.jit(Viewer(config.world.profile, layout, "jax").object_pixels), drawn
 
 
 def control_step(config: Config) -> Program:
@@ -197,6 +210,7 @@ def feature_step(config: Config) -> Program:
 
 
 PROGRAMS: dict[str, Callable[[Config], Program]] = {
+    "cloning the guide": cloning,
     "PPO: new episodes": partial(ppo, "refresh"),
     "PPO: experience": partial(ppo, "collect"),
     "PPO: gradient steps": partial(ppo, "improve"),
@@ -208,6 +222,10 @@ PROGRAMS: dict[str, Callable[[Config], Program]] = {
     "rendering: geometry": partial(_roller, "pose"),
     "rendering: depth": partial(_roller, "depth"),
     "rendering: colour": partial(_roller, "rgb"),
+    "rendering: object pixels": object_pixels,
+    "generator: piecewise surfaces": lambda config: piecewise.program(
+        config.ddg.depth.height_px, config.ddg.depth.width_px
+    ),
     "generator: batch": lambda config: ddg.encode(config.ddg),
     "generator: train step": lambda config: ddg.train_step(config.ddg),
     "generator: distillation step": distil_step,

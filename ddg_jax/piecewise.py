@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from learning.programs import Program, shape
 from sensors.statistics.holes import fill_from_background
 
 FIDELITY = 0.5
@@ -36,8 +37,13 @@ def piecewise_smooth(inverse: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H 
     """(H, W) inverse depth in 1/m, 0 = unknown -> without unknowns, noise and blurred edges; 0 if all are."""
     start = fill_from_background(inverse)
     fidelity = FIDELITY * (inverse > 0).astype(np.float32)
-    solved = _minimise(jnp.asarray(start) / _UNIT_PER_M, jnp.asarray(fidelity), jnp.asarray(_edges(start)))
+    solved = _solved(jnp.asarray(start) / _UNIT_PER_M, jnp.asarray(fidelity), jnp.asarray(_edges(start)))
     return np.where(start > 0, np.maximum(np.asarray(solved) * _UNIT_PER_M, start.min()), 0)
+
+
+def program(height_px: int, width_px: int) -> Program:
+    """What solves a picture of that size."""
+    return _solved, (shape(height_px, width_px),) * 3
 
 
 def _edges(inverse: np.ndarray) -> np.ndarray:
@@ -66,7 +72,6 @@ class _State(NamedTuple):
     q: tuple[Array, Array, Array]
 
 
-@jax.jit
 def _minimise(u_0: Array, fidelity: Array, weight: Array) -> Array:
     """First-order primal-dual iterations (Chambolle & Pock 2011, algorithm 1)."""
 
@@ -91,6 +96,10 @@ def _minimise(u_0: Array, fidelity: Array, weight: Array) -> Array:
     o = jnp.zeros_like(u_0)
     first = _State(u_0, (o, o), u_0, (o, o), (o, o), (o, o, o))
     return jax.lax.fori_loop(0, ITERATIONS, iterate, first).u
+
+
+_solved = jax.jit(_minimise)
+"""`_minimise` as one program."""
 
 
 def _next(u: Array, axis: int) -> Array:

@@ -9,10 +9,12 @@ import numpy as np
 import optax
 from brax.training.acme import running_statistics
 
+from ddgrasp import contract
 from ddgrasp.config import TeacherConfig
 from ddgrasp.errors import UserError
 from ddgrasp.layout import ACTION
 from ddgrasp.progress import Progress
+from learning.programs import Program, shape
 from mjx_envs.grasp_env import GraspEnv
 from mjx_envs.physics.interface import warn_of_dropped
 from ppo import learner
@@ -36,14 +38,11 @@ def clone_guide(
     policy, normalizer = jax.tree.map(
         lambda x: jnp.asarray(np.asarray(x)), (state.params.policy, state.normalizer)
     )
-    optimizer = optax.adam(
-        optax.cosine_decay_schedule(LEARNING_RATE, config.clone_rounds * config.clone_steps)
-    )
-    opt_state = optimizer.init(policy)
+    opt_state = _optimizer(config).init(policy)
     observations, labels = [], []
     rng = np.random.default_rng([seed, _SEED])
     collect = Collector(env, config.clone_envs)
-    fit = jax.jit(partial(_fit, optimizer))
+    fit, _ = program(config, state)
     with progress.task("cloning the guide", config.clone_rounds) as task:
         for i in range(config.clone_rounds):
             share = guide_share(i, config.clone_rounds)
@@ -65,6 +64,20 @@ def clone_guide(
             progress.scalars(i, clone_loss=float(loss))
             task.advance(loss=float(loss))
     return policy, normalizer
+
+
+def program(config: TeacherConfig, state: learner.LearnerState) -> Program:
+    """The optimiser steps of a round, from a learner's state, of which shapes will do."""
+    optimizer, policy = _optimizer(config), state.params.policy
+    seen, wanted = (
+        shape(config.clone_steps, BATCH, size) for size in (contract.OBSERVATION_SIZE, contract.ACTION_SIZE)
+    )
+    opt_state = jax.eval_shape(optimizer.init, policy)
+    return jax.jit(partial(_fit, optimizer)), (state.normalizer, policy, opt_state, seen, wanted)
+
+
+def _optimizer(config: TeacherConfig) -> optax.GradientTransformation:
+    return optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, config.clone_rounds * config.clone_steps))
 
 
 def guide_share(number: int, rounds: int) -> float:

@@ -1,6 +1,8 @@
 """Memory told beforehand: against XLA's own analysis, and refused in one line."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -50,6 +52,14 @@ def test_estimates_are_near_what_xla_needs(name):
     compiled = compiled_bytes(jitted.lower(*arguments).compile())
     assert compiled is not None
     assert 0.9 < traced_bytes(program) / compiled < 2
+
+
+@pytest.mark.parametrize("name", ["student: train step", "student: features"])
+def test_the_page_says_what_the_student_of_paper_takes(name):
+    """Those of its rows that changes of the network alter."""
+    page = (Path(__file__).parents[1] / "docs" / "accelerators.md").read_text()
+    (said,) = re.findall(rf"^\| {name}(?:, batch)? ?,? ?256 \| ([0-9.]+) \|", page, re.MULTILINE)
+    assert said == f"{traced_bytes(PROGRAMS[name](PRESETS['paper'])) / 1e9:.1f}"
 
 
 def test_frames_of_the_paper_need_a_disk_not_memory():

@@ -14,7 +14,7 @@ from ddgrasp.presets import PRESETS
 PLATFORMS = ("cuda", "tpu")
 PLACES = (
     "PPO: new episodes", "control step", "demo rollout: begin", "demo rollout: advance",
-    "rendering: geometry", "rendering: depth", "rendering: colour",
+    "rendering: geometry", "rendering: depth", "rendering: colour", "rendering: object pixels",
 )  # fmt: skip
 """Programs of physics and geometry alone."""
 ROUNDED = re.compile(r"dot_general.*DEFAULT")
@@ -40,6 +40,17 @@ def test_it_lowers_for_every_accelerator_without_calling_the_host(name):
         assert "func.func public @main" in module
         assert not HOST_CALL.search(module)
         assert name not in PLACES or not ROUNDED.search(module)
+
+
+@pytest.mark.parametrize(
+    ("preset", "name"),
+    [("camera", "generator: train step"), ("student_paper", "student: train step")],
+)
+def test_what_paper_does_not_have_lowers_too(preset, name):
+    """Holes as log odds; the mean of features, and actions' loss alone."""
+    for platform in PLATFORMS:
+        module = lower(PROGRAMS[name](PRESETS[preset]), platform).as_text()
+        assert "func.func public @main" in module and not HOST_CALL.search(module)
 
 
 def test_a_network_s_products_are_rounded():
