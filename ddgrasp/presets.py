@@ -215,8 +215,8 @@ STUDENT_PAPER = replace(
 """`laptop` with the paper's student (III-C) and six objects: ResNet-18 on depth alone, end to end, behaviour
 cloning on 1,200 demos, one action from Gaussian noise; no privileged losses, hand view, DAgger or noise by
 hand. A sample takes 42 ms forward and backward on two Intel Xeon cores, so that its training is about 67
-minutes; after 1,300 steps of 32 it does not look yet, after 24,350 of 64 it has its demos by heart
-(docs/table2.md). Not the paper's: group norm for batch norm, random first weights
+minutes; after 24,350 steps of 64 on stretches of demos it has them by heart (docs/table2.md); as it is here
+it has not been trained. Not the paper's: group norm for batch norm, random first weights
 (--student.encoder.weights weights/resnet18), 112 x 144 pixels, a quarter of its 450 x 580 each way, from a
 window around a known place, 1,500 steps of 64 (it names neither), a ninth number of state (how the hand's
 width changes), demos of a perturbed teacher (--demos.noise-share 0), a closing of the hand that lasts
