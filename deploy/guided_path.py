@@ -23,7 +23,6 @@ GRIP_STEPS = 12
 ABOVE_M, PUT_M = 0.12, 0.006
 """The grip's height above a grasp before it goes down; above it when the object is let go."""
 WANDER_Z_M = (0.12, 0.35)
-_TRIES = 20
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ They hold what a finished network is used by; `learning/checkpoints.py` holds wh
 """
 
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +27,8 @@ def save_params(path: Path | str, pytree: Any) -> None:
     atomic_write_bytes(path, _MAGIC + hashlib.sha256(payload).digest() + payload)
 
 
-def load_params(
-    path: Path | str, target: Any = None, upgrade: Callable[[Any], Any] = lambda params: params
-) -> Any:
-    """What `save_params` wrote: nested dicts of NumPy arrays, or shaped like `target` if one is given, after
-    `upgrade` has made them what this version expects.
+def load_params(path: Path | str, target: Any = None) -> Any:
+    """What `save_params` wrote: nested dicts of NumPy arrays, or shaped like `target` if one is given.
 
     Raises UserError if the file is absent, not ours, damaged, or does not fit `target`.
     """
@@ -50,9 +46,8 @@ def load_params(
     if target is None:
         return state
     try:
-        given = upgrade(state)
-        restored = serialization.from_state_dict(target, given)
-        if more := _names(given) - _names(serialization.to_state_dict(target)):  # which Flax drops
+        restored = serialization.from_state_dict(target, state)
+        if more := _names(state) - _names(serialization.to_state_dict(target)):  # which Flax drops
             raise ValueError(f"{min(more)} is in the file, not in the network")
         if difference := _shape_difference(restored, target):
             raise ValueError(difference)

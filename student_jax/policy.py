@@ -183,21 +183,6 @@ def init_params(key: Key[jax.Array, ""], config: StudentConfig, profile: CameraP
     return dict(StudentPolicy(config, profile).init(key, depth, state, action, k)["params"])
 
 
-def told_the_change(config: StudentConfig, params: dict) -> dict:
-    """`params`, or those of a student from before it was told how its hand's width changes: told, and not yet
-    listening to it.
-    """
-    stream, hidden = params["state_stream"], params["aux_hidden"]
-    if len(stream["first"]["kernel"]) == contract.POLICY_STATE_SIZE:
-        return params
-    first = np.insert(stream["first"]["kernel"], contract.STATE_SIZE, 0.0, axis=0)
-    aux = np.insert(hidden["kernel"], feature_count(config) + contract.STATE_SIZE, 0.0, axis=0)
-    return params | {
-        "state_stream": stream | {"first": stream["first"] | {"kernel": first}},
-        "aux_hidden": hidden | {"kernel": aux},
-    }
-
-
 def param_shapes(config: StudentConfig, profile: CameraProfile) -> dict:
     """Tree of jax.ShapeDtypeStruct: what `init_params` would give, without computing it. Traced once."""
     return init_params.eval_shape(jax.random.key(0), config, profile)

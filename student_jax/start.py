@@ -1,6 +1,5 @@
 """What a student starts from (`student.init_from`): a run or a folder with its parameters."""
 
-from functools import partial
 from operator import attrgetter
 from pathlib import Path
 
@@ -9,7 +8,7 @@ from ddgrasp.config import Config, StudentConfig
 from ddgrasp.errors import UserError
 from ddgrasp.shipped import holding, shipped
 from learning.params import Params, load_params
-from student_jax.policy import PARAMS_FILE, param_shapes, told_the_change
+from student_jax.policy import PARAMS_FILE, param_shapes
 
 _THE_SAME = (
     "picture.channels", "picture.height_px", "picture.width_px", "picture.min_depth_m", "picture.max_depth_m",
@@ -27,7 +26,7 @@ def load(config: StudentConfig, network: Params) -> Params:
 
     Raises UserError if they do not fit it.
     """
-    return load_params(_folder(config) / PARAMS_FILE, network, partial(told_the_change, config))
+    return load_params(_folder(config) / PARAMS_FILE, network)
 
 
 def check(config: Config) -> None:

@@ -60,7 +60,6 @@ class Arm(KinematicRobot):
     """Its own time passes whenever it is asked for: nobody waits."""
 
     fails_at = 10**9
-    slack_rad = 0.0
 
     def __init__(self):
         super().__init__(SimpleNamespace(now=lambda: 0.0))

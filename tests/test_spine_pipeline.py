@@ -25,7 +25,6 @@ from ddgrasp.progress import Progress, read_curves
 from ddgrasp.stages import STAGES, Stage, config_fields
 
 CONFIG = Config(preset="debug")
-ROOT = Path(__file__).parents[1]
 
 STAGE = """
 def run(job):

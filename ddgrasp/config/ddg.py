@@ -31,7 +31,7 @@ NoiseSchedule = Literal["cosine", "linear"]
 HoleLoss = Literal["squared", "cross_entropy"]
 SQUARED, CROSS_ENTROPY = HOLE_LOSSES = get_args(HoleLoss)
 LossWeight = Literal["uniform", "truncated"]
-UNIFORM, TRUNCATED = get_args(LossWeight)
+UNIFORM, _ = get_args(LossWeight)
 Sampler = Literal["dpm_solver", "ddim", "ddpm", "progressive"]
 DPM_SOLVER, DDIM, DDPM, PROGRESSIVE = SAMPLERS = get_args(Sampler)
 Spacing = Literal["leading", "trailing", "linspace", "quadratic"]
