@@ -16,6 +16,7 @@ from ddgrasp.progress import Progress
 from deploy.trials import TrialResult
 from evaluation.report import html, trials_page
 from evaluation.rig_trials import TRIALS_FILE
+from recording_support import claiming
 
 CONFIG = Config(preset="debug")
 
@@ -125,8 +126,9 @@ def test_a_log_of_something_else_is_named(tmp_path, content):
         parse("report", [str(tmp_path)]).run()
 
 
-def test_a_film_cut_short_is_named(trials):
-    (trials / "cube-0-success.png").write_bytes(b"PNG")
+@pytest.mark.parametrize("content", [b"PNG", b"", claiming(70_000, 70_000)], ids=["cut", "empty", "huge"])
+def test_a_film_that_is_no_whole_picture_is_named(trials, content):
+    (trials / "cube-0-success.png").write_bytes(content)
     assert "cube-0-success.png cannot be shown" in trials_page.write(trials_page.find(trials)).read_text()
 
 

@@ -84,11 +84,15 @@ def film_file(strip: Path, alt: str) -> str:
     """`film` of a PNG on disk, smaller; a line where it is no whole one."""
     import cv2
 
-    picture = cv2.imread(str(strip))
+    from sensors.recordings.pictures import decoded
+
+    # OpenCV is given no names: one that is no UTF-8 ends the process.
+    stored = strip.read_bytes() if strip.is_file() else b""
+    picture = decoded(stored)
     if picture is None:
         return f"<p>{escape(strip.name)} cannot be shown: it is no whole PNG.</p>"
     if max(picture.shape) > _WEBP_MOST_PX:
-        return film(strip.read_bytes(), alt)
+        return film(stored, alt)
     _, data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
     return film(data.tobytes(), alt, "webp")
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ddgrasp.contract import DEPTH_UNIT_M
 from ddgrasp.errors import UserError
+from sensors.recordings.pictures import decoded
 from sensors.recordings.recording import COLOR_AS_STORED, META_FILE, UNIT_IS_CERTAIN, check_fields
 from sensors.recordings.sources import (
     COLOR_SUFFIXES,
@@ -180,7 +181,6 @@ def _read_rgb(file: Path) -> np.ndarray | None:
 def _read_picture(file: Path, how: int) -> np.ndarray | None:
     """None of what cannot be read: a folder of that name, a bad disk, no permission, no picture."""
     try:
-        data = np.fromfile(file, np.uint8)
+        return decoded(file.read_bytes(), how)
     except OSError:
         return None
-    return cv2.imdecode(data, how) if data.size else None

@@ -8,13 +8,16 @@ import zlib
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from ddgrasp.errors import UserError
+from sensors.recordings.pictures import decoded
 from sensors.recordings.sources import COLOR_SUFFIXES, in_time
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_GREY = 0
+_IHDR_BYTES = 13
+_MOST_PIXELS = 64_000_000
+"""A picture of a recording has no more: a file of 1 MB can claim, and be decoded to, far more."""
 
 
 def find_depth(path: Path) -> list[Path]:
@@ -66,7 +69,8 @@ def inspect_frame(depth_file: Path, color_file: Path) -> tuple[str, tuple[int, i
 
 
 def _png_header(data: bytes) -> tuple[int, int, int, int] | None:
-    """(height, width, bit depth, colour type) of an intact PNG, None if any chunk is damaged."""
+    """(height, width, bit depth, colour type) of an intact PNG, None if any chunk is damaged, or its size is
+    no camera's."""
     if data[:8] != _PNG_SIGNATURE:
         return None
     offset, header = 8, None
@@ -78,7 +82,11 @@ def _png_header(data: bytes) -> tuple[int, int, int, int] | None:
         if zlib.crc32(memoryview(data)[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
             return None
         if kind == b"IHDR":
+            if length != _IHDR_BYTES:
+                return None
             width, height, bits, color = struct.unpack_from(">IIBB", data, offset + 8)
+            if height * width > _MOST_PIXELS:
+                return None
             header = (height, width, bits, color)
         if kind == b"IEND":
             return header
@@ -98,5 +106,5 @@ def _all_invalid(data: bytes, height: int, width: int) -> bool:
     # Only constant pictures shrink this far, so only they need decoding here.
     if len(data) > 200 + height * width / 50:
         return False
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    image = decoded(data, cv2.IMREAD_UNCHANGED)
     return image is None or not image.any()

@@ -22,6 +22,7 @@ from ddgrasp import depth
 from ddgrasp.contract import CONTRACT_VERSION, D455, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
 from sensors.recordings.integrity import find_color, find_depth, inspect_frame
+from sensors.recordings.pictures import decoded
 from sensors.recordings.sources import in_time
 
 META_FILE = "meta.json"
@@ -166,7 +167,7 @@ class Recording:
 
     def _counts(self, index: SupportsIndex) -> UInt16[np.ndarray, "H W"]:
         file = self.depth_files[index]
-        raw = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
+        raw = decoded(file.read_bytes(), cv2.IMREAD_UNCHANGED)
         if raw is None:
             raise UserError(f"{file}: cannot be decoded as PNG; delete it or copy it again.")
         return raw
@@ -174,7 +175,7 @@ class Recording:
     def rgb(self, index: SupportsIndex) -> UInt8[np.ndarray, "h w 3"]:
         """(h, w, 3) uint8 colour at the colour camera's own size."""
         file = self.color_files[index]
-        bgr = cv2.imdecode(np.fromfile(file, np.uint8), COLOR_AS_STORED)
+        bgr = decoded(file.read_bytes(), COLOR_AS_STORED)
         if bgr is None:
             raise UserError(f"{file}: cannot be decoded as a picture; delete it or copy it again.")
         return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
