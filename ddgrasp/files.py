@@ -148,8 +148,8 @@ def atomic_write_bytes(path: Path | str, data: bytes) -> None:
 
 
 def atomic_write_text(path: Path | str, text: str) -> None:
-    """`atomic_write_bytes` of `text` in UTF-8."""
-    atomic_write_bytes(path, text.encode())
+    """`atomic_write_bytes` of `text` in UTF-8; \\udcff for a byte of a file's name that is no UTF-8."""
+    atomic_write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def atomic_write_json(path: Path | str, value: Any) -> None:

@@ -1,8 +1,11 @@
 """What of a folder of deployments counts as success, and what the page says of the rest."""
 
 import json
+import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from evaluation.report import deployments
@@ -97,3 +100,22 @@ def test_the_page_says_what_counts(tmp_path):
     page = deployments.write(tmp_path, deployments.find(tmp_path)).read_text()
     assert "Success 0.0 % of 1" in page
     assert "those that a fault ended, which failed unless report.json says otherwise" in page
+
+
+def test_a_folder_s_name_may_be_no_utf8(tmp_path):
+    """OpenCV, given it, ended the process."""
+    folder = Path(os.fsdecode(bytes(tmp_path) + b"/x\xff"))
+    folder.mkdir()
+    (folder / "steps.jsonl").touch()
+    (folder / "report.json").write_text(json.dumps(deployment(True).report))
+    film = cv2.imencode(".png", np.full((4, 6, 3), 90, np.uint8))[1].tobytes()
+    (folder / "film.png").write_bytes(film)
+    page = deployments.write(tmp_path, deployments.find(tmp_path)).read_text()
+    assert r"<td>x\udcff</td>" in page and "data:image/webp" in page
+
+
+def test_a_film_that_is_a_folder_is_named(tmp_path):
+    (tmp_path / "steps.jsonl").touch()
+    (tmp_path / "report.json").write_text(json.dumps(deployment(True).report))
+    (tmp_path / "film.png").mkdir()
+    assert "film.png cannot be shown" in deployments.render(deployments.find(tmp_path))

@@ -1,6 +1,7 @@
 """The pages that people look at, as a browser shows them, and the page of a series of trials."""
 
 import json
+import os
 from dataclasses import asdict
 
 import cv2
@@ -136,6 +137,17 @@ def test_a_folder_s_name_is_no_html(tmp_path):
     folder = _trials(tmp_path / "a<b>", [("cube", True)])
     assert "<code>a&lt;b&gt;</code>" in trials_page.write(trials_page.find(folder)).read_text()
     assert "a<b>" not in trials_page.write_comparison([trials_page.find(folder)] * 2).read_text()
+
+
+def test_a_folder_s_name_that_is_no_utf8_is_shown_as_its_bytes(tmp_path):
+    (tmp_path / "a").mkdir()
+    for name in ("a/a", "b"):
+        _trials(tmp_path / name, [("cube", True)])
+    foreign = (tmp_path / "a" / "a").rename(os.fsdecode(bytes(tmp_path / "a") + b"/x\xff"))
+    page = trials_page.write(trials_page.find(foreign)).read_text()
+    assert r"<code>x\udcff</code>" in page and "data:image/webp" in page
+    pair = [trials_page.find(folder) for folder in (foreign, tmp_path / "b")]
+    assert r"/x\udcff</th>" in trials_page.write_comparison(pair).read_text()
 
 
 def test_a_missed_deadline_is_red(tmp_path):

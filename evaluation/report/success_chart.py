@@ -34,14 +34,19 @@ def objects(rows: Rows) -> list[str]:
     return sorted(found, key=lambda name: order.index(name) if name in order else len(order))
 
 
+def _drawn(name: str) -> str:
+    """A folder's name as text that Matplotlib draws: $ is its sign of a formula, and it has no letters for
+    what is no UTF-8."""
+    return name.replace("$", r"\$").encode(errors="backslashreplace").decode()
+
+
 def _draw_bars(axes: Axes, rows: Rows) -> None:
     total = [made["all"] for made in rows.values()]
     rates = np.array([success["rate"] for success in total])
     whiskers = np.abs(np.array([[s["low"], s["high"]] for s in total]).T - rates)
     places = np.arange(len(rows))
     axes.barh(places, 100 * rates, xerr=100 * whiskers, height=0.6, color="#7a9cc6", capsize=3)
-    names = [name.replace("$", r"\$") for name in rows]  # matplotlib's sign of a formula
-    axes.set_yticks(places, names, fontsize=8)
+    axes.set_yticks(places, [_drawn(name) for name in rows], fontsize=8)
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlim(0, 100)
     axes.set_xlabel("%", fontsize=8)
