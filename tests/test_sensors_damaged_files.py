@@ -1,5 +1,6 @@
 """Files of a recording that claim what they do not hold, or are no files: named, never waited for."""
 
+import os
 import struct
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from ddgrasp.errors import UserError
 from recording_support import claiming, png, write_depth
 from sensors.recordings import integrity
 from sensors.recordings.pictures import decoded
-from sensors.recordings.recording import Recording
+from sensors.recordings.recording import Recording, contents, find_recordings
 
 TOO_MANY = claiming(70_000, 70_000)
 """More than OpenCV's 2^30 pixels."""
@@ -76,3 +77,15 @@ def test_pictures_that_claim_too_much_once_a_recording_is_open_are_named(tmp_pat
     files[0].write_bytes(TOO_MANY)
     with pytest.raises(UserError, match=f"{folder}/000000.* cannot be decoded"):
         recording.depth_mm(0) if folder == "depth" else recording.rgb(0)
+
+
+def test_names_that_are_no_utf8_are_told_apart_and_others_keep_their_hash(tmp_path):
+    folder = write_depth(tmp_path / "a" / "tür", [_depth(0)])
+    (folder / "meta.json").write_text('{"depth_unit_m": 0.001}')
+    assert contents(tmp_path / "a") == "1 recordings of 1 pictures, 6b0bfebe"
+    told = set()
+    for name in (b"\xff", b"\xfe"):
+        folder = folder.rename(os.fsdecode(bytes(tmp_path / "a") + b"/" + name))
+        assert len(find_recordings(tmp_path / "a")[0].rgb(0)) == 24
+        told.add(contents(tmp_path / "a"))
+    assert len(told) == 2

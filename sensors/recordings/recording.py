@@ -230,8 +230,8 @@ def contents(root: str | os.PathLike) -> str:
     folders, digest, pictures = recording_folders(root), hashlib.sha256(), 0
     for folder in folders:
         count = sum(1 for _ in (folder / "depth").iterdir())
-        name, meta = folder.relative_to(root), folder / META_FILE
-        digest.update(f"{name}\0{count}\0".encode() + (meta.read_bytes() if meta.is_file() else b""))
+        name, meta = os.fsencode(folder.relative_to(root)), folder / META_FILE
+        digest.update(name + f"\0{count}\0".encode() + (meta.read_bytes() if meta.is_file() else b""))
         pictures += count
     return f"{len(folders)} recordings of {pictures} pictures, {digest.hexdigest()[:8]}"
 
