@@ -1,6 +1,7 @@
 """Files of a recording that claim what they do not hold, or are no files: named, never waited for."""
 
 import os
+import signal
 import struct
 from pathlib import Path
 
@@ -89,3 +90,25 @@ def test_names_that_are_no_utf8_are_told_apart_and_others_keep_their_hash(tmp_pa
         assert len(find_recordings(tmp_path / "a")[0].rgb(0)) == 24
         told.add(contents(tmp_path / "a"))
     assert len(told) == 2
+
+
+@pytest.fixture
+def soon():
+    """Fails what takes 20 s: a pipe without a writer is waited for until a signal comes."""
+
+    def waited(*_) -> None:
+        raise AssertionError("waited")
+
+    before = signal.signal(signal.SIGALRM, waited)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("name", ["depth/000001.png", "depth/000001.npy", "color/000001.png"])
+def test_a_pipe_among_the_pictures_is_not_waited_for(tmp_path, soon, name):
+    root = _folder(tmp_path / "desk")
+    (root / name).with_suffix(".png").unlink()
+    os.mkfifo(root / name)
+    assert len(_imported(root)) == 2

@@ -166,7 +166,7 @@ def _colors(folder: Path) -> list[Path]:
 def _read_depth(file: Path) -> np.ndarray | None:
     if file.suffix.lower() == ".npy":
         try:
-            array = np.load(file, allow_pickle=False)
+            array = np.load(file, allow_pickle=False) if file.is_file() else None
         except (ValueError, EOFError, OSError, MemoryError):  # the last of a header that claims too much
             return None
         return array if isinstance(array, np.ndarray) else None  # several under one name are no picture
@@ -179,8 +179,8 @@ def _read_rgb(file: Path) -> np.ndarray | None:
 
 
 def _read_picture(file: Path, how: int) -> np.ndarray | None:
-    """None of what cannot be read: a folder of that name, a bad disk, no permission, no picture."""
+    """None of what cannot be read: a folder or a pipe of that name, a bad disk, no permission, no picture."""
     try:
-        return decoded(file.read_bytes(), how)
+        return decoded(file.read_bytes(), how) if file.is_file() else None  # a pipe would be waited for
     except OSError:
         return None
