@@ -72,7 +72,7 @@ def read(path: Path) -> Config:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "no text"
         raise UserError(f"--config {path} cannot be read ({reason}).") from None
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: seed: 2026-13-45
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: seed: 2026-13-45
         raise UserError(f"--config {path} is no YAML: {' '.join(str(error).split())}.") from None
     if not isinstance(values, dict) or not isinstance(values.get(_PRESET), str):
         raise UserError(f"--config {path} names no preset: its first line is to be `preset: demo`.")

@@ -157,6 +157,8 @@ def atomic_write_json(path: Path | str, value: Any) -> None:
     atomic_write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
 
 
+DAMAGED_JSON = (ValueError, RecursionError)
+"""What `json.loads` raises: of no JSON, no UTF-8, a number of thousands of digits; of too deep a nesting."""
 DAMAGED_NPZ = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error)
 """What `np.load`, and reading the arrays that it gives, raise for a damaged or truncated .npz."""
 
@@ -168,7 +170,7 @@ def read_json(path: Path | str) -> Any:
         return json.loads(path.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{path} does not exist.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except DAMAGED_JSON as error:
         raise UserError(
             f"{path} is not valid JSON ({error}): mend it, or delete it and make it again."
         ) from None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ddgrasp.errors import UserError
+from ddgrasp.files import DAMAGED_JSON
 
 METADATA_KEY = "ddgrasp_generator"
 """metadata_props key whose value is a JSON object of `GeneratorMetadata`."""
@@ -93,7 +94,7 @@ def read(properties: Mapping[str, str], source: str) -> GeneratorMetadata:
         raw = json.loads(properties[METADATA_KEY])
         known = {one.name for one in dataclasses.fields(GeneratorMetadata)}
         metadata = GeneratorMetadata(**{key: value for key, value in raw.items() if key in known})
-    except (AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, TypeError, *DAMAGED_JSON) as error:
         raise UserError(f"{source} has damaged metadata ({error}): {REMEDY}.") from None
     if metadata.format != FORMAT:
         raise UserError(

@@ -11,7 +11,7 @@ from ddgrasp import contract
 from ddgrasp.config import DEPTH_DTYPES, Config, ExportConfig, StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
-from ddgrasp.files import to_tuples
+from ddgrasp.files import DAMAGED_JSON, to_tuples
 
 POLICY_FILE = "policy.onnx"
 """As the stage `export` names it."""
@@ -183,7 +183,7 @@ def validate_shapes(
 def _parse(text: str, source: str) -> dict[str, Any]:
     try:
         raw = json.loads(text)
-    except json.JSONDecodeError as error:
+    except DAMAGED_JSON as error:
         raise UserError(f"{source} has damaged metadata ({error}): {REMEDY}.") from None
     if not isinstance(raw, dict):
         raise UserError(f"{source} has metadata {text[:40]!r}, expected a JSON object: {REMEDY}.")

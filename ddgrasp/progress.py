@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ddgrasp.events import ScalarEvents
-from ddgrasp.files import atomic_path, atomic_write_json, to_json
+from ddgrasp.files import DAMAGED_JSON, atomic_path, atomic_write_json, to_json
 
 CURVES = "curves.jsonl"
 EVENTS = "tb"
@@ -231,7 +231,7 @@ class Progress:
             return 0.0
         try:
             return float(json.loads((self.directory / _CLOCK).read_text())["seconds"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except (*DAMAGED_JSON, OSError, KeyError, TypeError):
             return 0.0
 
 
@@ -249,7 +249,7 @@ def read_curves(directory: Path | str) -> dict[str, list[tuple[int, float]]]:
         try:
             point = json.loads(line)
             step = point.pop("step")
-        except (ValueError, KeyError, AttributeError, TypeError):
+        except (*DAMAGED_JSON, KeyError, AttributeError, TypeError):
             continue
         for name, value in point.items():
             if value is not None:

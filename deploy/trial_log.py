@@ -9,7 +9,7 @@ from typing import Any
 
 from ddgrasp.config_hash import differences
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_text
+from ddgrasp.files import DAMAGED_JSON, atomic_write_text
 from deploy.trials import TrialResult
 
 CONFIG_HASH = "config_hash"
@@ -116,7 +116,7 @@ def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
     for number, text in enumerate(lines, 1):
         try:
             yield json.loads(text)
-        except json.JSONDecodeError:
+        except DAMAGED_JSON:
             if number == len(lines):
                 return
             raise UserError(

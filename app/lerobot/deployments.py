@@ -11,6 +11,7 @@ import numpy as np
 from app.lerobot.episode import Episode, Picture, Source
 from app.lerobot.steps import BY_POLICY
 from ddgrasp.errors import UserError, unknown_name
+from ddgrasp.files import DAMAGED_JSON
 from ddgrasp.gripper import CLOSE
 from ddgrasp.layout import ACTION, STATE
 from deploy.record import STEPS_FILE
@@ -149,7 +150,7 @@ def _steps(path: Path) -> list[dict[str, Any]]:
         rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         if lacking := next((name for row in rows for name in _NEEDED if name not in row), ""):
             raise ValueError(f"a step lacks {lacking}")
-    except (ValueError, OSError, TypeError) as error:
+    except (*DAMAGED_JSON, OSError, TypeError) as error:
         raise UserError(f"{path} is damaged ({error}): move its folder elsewhere.") from None
     return rows
 

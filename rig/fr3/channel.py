@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from ddgrasp.errors import UserError
+from ddgrasp.files import DAMAGED_JSON
 
 PORT = 1339
 """Beside the protocol's own: 1337 is the robot's, 1338 the gripper's."""
@@ -61,7 +62,7 @@ class Channel:
             raise ChannelLost("the FR3 rig has gone")
         try:
             answer = json.loads(line)
-        except json.JSONDecodeError:
+        except DAMAGED_JSON:
             answer = None
         if not isinstance(answer, dict):
             raise UserError(

@@ -12,6 +12,7 @@ import numpy as np
 
 from ddgrasp.contract import DEPTH_UNIT_M
 from ddgrasp.errors import UserError
+from ddgrasp.files import DAMAGED_JSON
 from sensors.recordings.pictures import decoded
 from sensors.recordings.recording import COLOR_AS_STORED, META_FILE, UNIT_IS_CERTAIN, check_fields
 from sensors.recordings.sources import (
@@ -137,7 +138,7 @@ def _own_meta(file: Path) -> dict[str, Any]:
         return {}
     try:
         meta = json.loads(file.read_bytes())
-    except (ValueError, OSError) as error:
+    except (*DAMAGED_JSON, OSError) as error:
         raise UserError(f"{file}: cannot be read ({error}); repair it, or take it away.") from None
     if not isinstance(meta, dict):
         raise UserError(f"{file}: is a {type(meta).__name__}; expected a recording's fields: take it away.")

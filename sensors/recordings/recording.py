@@ -21,6 +21,7 @@ from jaxtyping import Float32, UInt8, UInt16
 from ddgrasp import depth
 from ddgrasp.contract import CONTRACT_VERSION, D455, DEPTH_UNIT_M
 from ddgrasp.errors import UserError
+from ddgrasp.files import DAMAGED_JSON
 from sensors.recordings.integrity import find_color, find_depth, inspect_frame
 from sensors.recordings.pictures import decoded
 from sensors.recordings.sources import in_time
@@ -269,7 +270,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
         )
     try:
         meta = json.loads(file.read_bytes())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except DAMAGED_JSON as error:
         raise UserError(f"{file}: not valid JSON ({error}); repair it or record again.") from error
     unit = meta.get("depth_unit_m") if isinstance(meta, dict) else None
     if not isinstance(unit, int | float) or not 1e-5 <= unit <= 1e-2:
