@@ -13,12 +13,13 @@ import os
 import secrets
 import shutil
 import stat
+import sys
 import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from ddgrasp.errors import UserError
 
@@ -174,6 +175,12 @@ def read_json(path: Path | str) -> Any:
         raise UserError(
             f"{path} is not valid JSON ({error}): mend it, or delete it and make it again."
         ) from None
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Whether a value that was read from JSON is a number that a float can be: no infinity, true or false."""
+    is_one = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_one and abs(value) <= sys.float_info.max
 
 
 def read_npz(path: Path, remedy: str) -> dict[str, Any]:

@@ -2,12 +2,12 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from ddgrasp.errors import UserError
-from ddgrasp.files import DAMAGED_JSON
+from ddgrasp.files import DAMAGED_JSON, is_number
 
 METADATA_KEY = "ddgrasp_generator"
 """metadata_props key whose value is a JSON object of `GeneratorMetadata`."""
@@ -31,6 +31,9 @@ ASPECT_TOLERANCE = 0.02
 FARTHEST_SANE_M = 200.0
 """Simulated depth beyond this is in another unit."""
 REMEDY = "make one with `ddgrasp ddg export`"
+_MOST = {"height_px": 4096, "width_px": 4096, "channels": 2, "most_steps": 1000}
+"""Whole numbers from 1 on, and the most that each may be: the noise of a frame would be gigabytes else."""
+_CAMERA_NUMBERS = ("width_px", "height_px", "fx_px", "near_m", "far_m")
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,8 @@ class GeneratorMetadata:
 
 
 def read(properties: Mapping[str, str], source: str) -> GeneratorMetadata:
-    """The metadata of a file with these metadata_props; UserError if it is no generator, or a later one.
+    """The metadata of a file with these metadata_props; UserError if it is no generator, a later one, or says
+    what none can be.
 
     Args:
       properties: onnxruntime's `get_modelmeta().custom_metadata_map`.
@@ -96,8 +100,50 @@ def read(properties: Mapping[str, str], source: str) -> GeneratorMetadata:
         metadata = GeneratorMetadata(**{key: value for key, value in raw.items() if key in known})
     except (AttributeError, TypeError, *DAMAGED_JSON) as error:
         raise UserError(f"{source} has damaged metadata ({error}): {REMEDY}.") from None
-    if metadata.format != FORMAT:
+    if type(metadata.format) is not int or metadata.format != FORMAT:
         raise UserError(
-            f"{source} is a generator of format {metadata.format}, this code reads {FORMAT}: {REMEDY}."
+            f"{source} is a generator of format {metadata.format!r}, this code reads {FORMAT}: {REMEDY}."
         )
+    _check_values(metadata, source)
     return metadata
+
+
+def validate_shapes(
+    metadata: GeneratorMetadata, shapes: Mapping[str, Sequence[int | str | None]], source: str
+) -> None:
+    """UserError unless the graph's inputs (name -> shape) are those of its metadata; `source` is its file.
+
+    The noise's planes may be a symbolic size: how many there are depends on the evaluations asked for.
+    """
+    takes = {INPUT_DEPTH, INPUT_NOISE} | (set() if metadata.fixed_steps else {INPUT_STEPS})
+    if shapes.keys() != takes:
+        raise UserError(
+            f"{source} has the inputs {', '.join(sorted(shapes))}, its metadata says "
+            f"{', '.join(sorted(takes))}: {REMEDY}."
+        )
+    there, planes = list(shapes[INPUT_NOISE]), metadata.planes(metadata.steps)
+    size = [planes, metadata.height_px, metadata.width_px]
+    free = len(there) == 4 and not isinstance(there[1], int)
+    if there[1:] != ([there[1], *size[1:]] if free else size):
+        raise UserError(
+            f"{source}: {INPUT_NOISE!r} has shape {there}, its metadata says {['batch', *size]}: {REMEDY}."
+        )
+
+
+def _check_values(metadata: GeneratorMetadata, source: str) -> None:
+    for name, most in (*_MOST.items(), ("steps", metadata.most_steps)):
+        value = getattr(metadata, name)
+        if type(value) is not int or not 1 <= value <= most:
+            raise UserError(f"{source}: {name} is {value!r}, expected 1 to {most}: {REMEDY}.")
+    for name in ("frame_correlation", "deviation_correlation"):
+        value = getattr(metadata, name)
+        if not is_number(value) or not 0 <= value <= 1:
+            raise UserError(f"{source}: {name} is {value!r}, expected 0 to 1: {REMEDY}.")
+    for name in ("stochastic", "knows_position"):
+        if not isinstance(value := getattr(metadata, name), bool):
+            raise UserError(f"{source}: {name} is {value!r}, expected true or false: {REMEDY}.")
+    if not isinstance(metadata.camera, dict):
+        raise UserError(f"{source}: camera is {metadata.camera!r}, expected what is known of it: {REMEDY}.")
+    for name in _CAMERA_NUMBERS:
+        if (value := metadata.camera.get(name)) is not None and not is_number(value):
+            raise UserError(f"{source}: camera's {name} is {value!r}, expected a number: {REMEDY}.")

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +10,7 @@ from ddgrasp import contract
 from ddgrasp.config import DEPTH_DTYPES, Config, ExportConfig, StudentConfig
 from ddgrasp.contract import CameraProfile
 from ddgrasp.errors import UserError
-from ddgrasp.files import DAMAGED_JSON, to_tuples
+from ddgrasp.files import DAMAGED_JSON, is_number, to_tuples
 
 POLICY_FILE = "policy.onnx"
 """As the stage `export` names it."""
@@ -212,7 +211,7 @@ def _check_values(metadata: PolicyMetadata, source: str) -> None:
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise UserError(f"{source}: {name} is {value!r}, expected a positive integer: {REMEDY}.")
     focal_px = metadata.camera.get("fx") if isinstance(metadata.camera, dict) else None
-    if not isinstance(focal_px, int | float) or not 0 < focal_px < math.inf:
+    if not is_number(focal_px) or not focal_px > 0:
         raise UserError(f"{source}: camera's fx is {focal_px!r}, expected pixels: {REMEDY}.")
     closing = metadata.closing_steps
     if not isinstance(closing, int) or isinstance(closing, bool) or closing < 0:
@@ -237,7 +236,7 @@ def _check_limits(metadata: PolicyMetadata, source: str) -> None:
         if (
             not isinstance(value, tuple)
             or len(value) != len(contract.ARM_JOINTS)
-            or not all(map(_finite, value))
+            or not all(map(is_number, value))
         ):
             raise UserError(
                 f"{source}: {name} is {value!r}, expected {len(contract.ARM_JOINTS)} numbers: {REMEDY}."
@@ -248,7 +247,3 @@ def _check_limits(metadata: PolicyMetadata, source: str) -> None:
             raise UserError(
                 f"{source}: {name} may be at {lower:g} to {upper:g} rad, and starts at {home:g}: {REMEDY}."
             )
-
-
-def _finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -65,6 +65,8 @@ class DepthGenerator:
         self._kind, self._device_number = _device(device)
         self._session = _open(self.path, self._kind, self._device_number, threads)
         self.info = names.read(self._session.get_modelmeta().custom_metadata_map, str(self.path))
+        inputs = {one.name: one.shape for one in self._session.get_inputs()}
+        names.validate_shapes(self.info, inputs, str(self.path))
         self._seed, self._normals, self._looked = seed, {}, False
 
     def __call__(self, depth_m: Array, noise: Array | None = None, *, steps: int | None = None) -> Array:

@@ -1,5 +1,6 @@
 """The exported generator behind one call: NumPy and PyTorch, what it refuses, noise that lasts an episode."""
 
+import json
 import subprocess
 import sys
 import warnings
@@ -7,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import onnx
 import pytest
 
 from ddg_jax.window import mixed
@@ -220,6 +222,70 @@ def test_files_that_are_no_generators_are_refused(tmp_path):
     for device in ("tpu", "cuda:one"):
         with pytest.raises(UserError, match=f"device is '{device}'; expected cpu"):
             DepthGenerator(FILE, device=device)
+
+
+def saying(path: Path, **changes) -> Path:
+    """The shipped generator with other metadata, at `path`."""
+    model = onnx.load(FILE)
+    for one in model.metadata_props:
+        if one.key == names.METADATA_KEY:
+            one.value = json.dumps(json.loads(one.value) | changes)
+    onnx.save(model, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"format": "1"}, "is a generator of format '1', this code reads 1"),
+        ({"format": True}, "is a generator of format True, this code reads 1"),
+        ({"height_px": 0}, "height_px is 0, expected 1 to 4096"),
+        ({"height_px": "180"}, "height_px is '180', expected 1 to 4096"),
+        ({"width_px": 320.0}, "width_px is 320.0, expected 1 to 4096"),
+        ({"channels": -1}, "channels is -1, expected 1 to 2"),
+        ({"most_steps": 10**9}, "most_steps is 1000000000, expected 1 to 1000"),
+        ({"steps": 51}, "steps is 51, expected 1 to 50"),
+        ({"steps": 0}, "steps is 0, expected 1 to 50"),
+        ({"frame_correlation": 1.5}, "frame_correlation is 1.5, expected 0 to 1"),
+        ({"deviation_correlation": float("nan")}, "deviation_correlation is nan, expected 0 to 1"),
+        ({"stochastic": "no"}, "stochastic is 'no', expected true or false"),
+        ({"camera": []}, r"camera is \[\], expected what is known of it"),
+        ({"camera": {"near_m": "a"}}, "camera's near_m is 'a', expected a number"),
+        ({"camera": {"far_m": float("inf")}}, "camera's far_m is inf, expected a number"),
+        ({"camera": {"fx_px": 10**400}}, "camera's fx_px is 10*, expected a number"),
+        (
+            {"height_px": 90, "width_px": 160},
+            r"'noise' has shape \['batch', 'planes', 180, 320\], its metadata says \['batch', 3, 90, 160\]",
+        ),
+        (
+            {"sampler": "progressive", "most_steps": 8},
+            "has the inputs depth, noise, steps, its metadata says depth, noise",
+        ),
+    ],
+    ids=str,
+)
+def test_a_generator_that_says_what_none_can_be_is_refused(tmp_path, changes, said):
+    """Correlations of 1.5 made NaN of the noise, and of the depth what nobody noticed."""
+    with pytest.raises(UserError, match=f"{said}: make one with `ddgrasp ddg export`") as refused:
+        DepthGenerator(saying(tmp_path / "generator.onnx", **changes), threads=1)
+    assert "generator.onnx" in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_what_a_generator_s_metadata_may_lack_or_have_besides(tmp_path):
+    """A camera of several focal lengths has none; later releases may say more, and correlations be whole."""
+    camera = {"name": "x", "fx_px": None, "near_m": 0, "far_m": 2, "firmware": "5.16"}
+    path = saying(tmp_path / "generator.onnx", camera=camera, frame_correlation=1, later="more")
+    assert DepthGenerator(path, threads=1).info.camera == camera
+
+
+@pytest.mark.parametrize("planes", [3, 4])
+def test_planes_that_a_graph_fixes_have_to_be_the_metadata_s(generator, planes):
+    shapes = {"depth": ["batch", "rows", "columns"], "noise": [None, planes, 180, 320], "steps": []}
+    if planes == generator.info.planes(generator.info.steps):
+        names.validate_shapes(generator.info, shapes, "x")
+        return
+    with pytest.raises(UserError, match=r"x: 'noise' has shape \[None, 4, 180, 320\], its metadata says"):
+        names.validate_shapes(generator.info, shapes, "x")
 
 
 def test_a_gpu_that_onnxruntime_cannot_load_is_no_cpu(monkeypatch):

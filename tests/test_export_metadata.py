@@ -58,6 +58,8 @@ def test_a_file_of_before_does_not_latch_a_closing():
         ({"joint_names": ["a"]}, "joint_names"),
         ({"camera": {"fx": "640"}}, "camera's fx is '640', expected pixels"),
         ({"camera": None}, "camera's fx is None, expected pixels"),
+        ({"camera": {"fx": 10**400}}, "camera's fx is 10*, expected pixels"),
+        ({"joint_lower_rad": 7 * [-(10**400)]}, "expected 7 numbers"),
         ({"closing_steps": -1}, "closing_steps is -1, expected 0 or more"),
         ({"joint_lower_rad": None}, "joint_lower_rad is None, expected 7 numbers"),
         ({"joint_lower_rad": GOOD.joint_lower_rad[:6]}, r"joint_lower_rad is \(.*\), expected 7 numbers"),
