@@ -17,7 +17,7 @@ from ddgrasp.config import Config
 from ddgrasp.config.checks import has_sections
 from ddgrasp.config_hash import check_same, config_hash
 from ddgrasp.errors import UserError
-from ddgrasp.files import atomic_write_json, read_json, to_json, to_tuples
+from ddgrasp.files import atomic_write_json, is_number, read_json, to_json, to_tuples
 from ddgrasp.stages import MADE_BY
 from ddgrasp.versions import library_versions
 
@@ -87,7 +87,7 @@ def read_manifest(directory: Path | str) -> Manifest:
     names = {field.name for field in dataclasses.fields(Manifest)}
     later = {"created", "machine", upgrades.VERSION_FIELD}
     absent = names - value.keys() - later if isinstance(value, dict) else names
-    if absent or not has_mappings(value, "config", "parents", "metrics") or value["origin"] not in _ORIGINS:
+    if absent or not _has_own_kinds(value):
         raise _damaged(path)
     if value["contract_version"] != contract.CONTRACT_VERSION:
         raise UserError(
@@ -98,6 +98,28 @@ def read_manifest(directory: Path | str) -> Manifest:
         raise _damaged(path)
     known = {name: value[name] for name in names & value.keys()}
     return Manifest(**known | {"config": config, upgrades.VERSION_FIELD: upgrades.VERSION})
+
+
+def _has_own_kinds(value: Mapping[str, Any]) -> bool:
+    """Whether a manifest's fields are of the kinds that `Manifest` has."""
+    return (
+        has_mappings(value, "config", "parents", "metrics", "versions")
+        and _is_machine(value.get("machine", {}))
+        and value["origin"] in _ORIGINS
+        and type(value["seed"]) is int
+        and is_number(value["seconds"])
+    )
+
+
+def _is_machine(value: Any) -> bool:
+    """Whether that is what `machine.describe` gives, or nothing."""
+    if value == {}:
+        return True
+    if not isinstance(value, dict):
+        return False
+    accelerators = value.get("accelerators")
+    listed = isinstance(accelerators, list) and all(isinstance(name, str) for name in accelerators)
+    return listed and isinstance(value.get("processor"), str) and is_number(value.get("cores"))
 
 
 def has_mappings(value: Any, *names: str) -> bool:

@@ -100,6 +100,11 @@ def test_a_run_of_before_machines_were_noted_has_a_page_too(run_dir):
     assert "Made on a machine that was not noted then." in render_html(report, run_dir)
 
 
+def test_a_seed_is_no_markup(run_dir):
+    page = render_html(build_report(run_dir) | {"seed": "<script>1</script>"}, run_dir)
+    assert "Seed &lt;script&gt;1&lt;/script&gt;." in page and "<script>" not in page
+
+
 def test_the_table_ends_with_the_student_in_the_rig(run_dir, capsys):
     print_summary(build_report(run_dir))
     lines = capsys.readouterr().out.splitlines()

@@ -150,6 +150,6 @@ def _origin(report: Mapping[str, Any]) -> list[str]:
     config = escape(json.dumps(report["config"], indent=2))
     return [
         heading(ORIGIN),
-        f"<p>Seed {report['seed']}. {escape(versions)}.</p>",
+        f"<p>Seed {escape(str(report['seed']))}. {escape(versions)}.</p>",
         f"<details><summary>Configuration</summary><pre>{config}</pre></details>",
     ]
