@@ -25,6 +25,8 @@ _IMAGE_CHUNK = 16
 _ROW_CHUNK = 4096
 _GONE = (FileNotFoundError, NotADirectoryError)
 """What of the operating system's errors says that a store is damaged: no full disk, no lack of rights."""
+_DAMAGED = (LookupError, ValueError, TypeError, ArithmeticError, RuntimeError, *_GONE)
+"""What Zarr raises of damaged files: of descriptions that say what none can, it checks few."""
 
 
 class EpisodeStore:
@@ -44,7 +46,7 @@ class EpisodeStore:
             self._root = zarr.open_group(str(path), mode="a" if create else "r")
             self._data = self._root.require_group("data") if create else _group(self._root, "data")
             self._meta = self._root.require_group("meta") if create else _group(self._root, "meta")
-        except (KeyError, ValueError, *_GONE) as error:
+        except _DAMAGED as error:
             raise UserError(
                 f"The episode store {path} is damaged ({error}): delete it and collect again."
             ) from None
@@ -59,6 +61,8 @@ class EpisodeStore:
                     raise ValueError("it is missing")
                 return np.zeros(0, np.int64)
             rows = _array(self._meta, _ENDS)
+            if rows.ndim != 1 or rows.dtype.kind not in "iu":
+                raise ValueError(f"it is {rows.dtype} {rows.shape}, no list of numbers of steps")
             # Who is killed before the first row of a file is written leaves that row without it.
             sure = rows.shape[0] - ((rows.shape[0] - 1) % rows.chunks[0] == 0)
             _check_chunks(self.path / "meta" / _ENDS, rows, 0, sure)
@@ -77,8 +81,7 @@ class EpisodeStore:
 
     def steps(self, field: str, first: int = 0, last: int | None = None) -> np.ndarray:
         """Per-step array of the complete episodes, or rows first..last of it."""
-        ends = self.ends
-        count = int(ends[-1]) if len(ends) else 0
+        count = _count(self.ends)
         return self._read("data", field, first, count if last is None else min(last, count))
 
     def episodes(self, field: str) -> np.ndarray:
@@ -87,12 +90,16 @@ class EpisodeStore:
 
     def reader(self, field: str) -> RowReader:
         """Rows of a per-step array at random; holds none of them. Raises UserError if it is damaged."""
+        count = _count(self.ends)
         with self._readable(f"data/{field}"):
-            return RowReader(self.path / "data" / field, _array(self._data, field))
+            rows = _array(self._data, field)
+            _check_length(rows, count)
+            return RowReader(self.path / "data" / field, rows)
 
     def _read(self, group: str, field: str, first: int, last: int) -> np.ndarray:
         with self._readable(f"{group}/{field}"):
             rows = _array(_group(self._root, group), field)
+            _check_length(rows, last)
             _check_chunks(self.path / group / field, rows, first, last)
             return np.asarray(rows[first:last])
 
@@ -101,7 +108,7 @@ class EpisodeStore:
         """UserError for what Zarr raises of damaged files."""
         try:
             yield
-        except (KeyError, ValueError, RuntimeError, *_GONE) as error:
+        except _DAMAGED as error:
             raise UserError(
                 f"{self.path}: {what} cannot be read ({error}). Delete {self.path.parent} and make it again."
             ) from None
@@ -114,7 +121,7 @@ class EpisodeStore:
         """
         self._check(steps)
         ends = self.ends
-        start, length = (int(ends[-1]) if len(ends) else 0), len(next(iter(steps.values())))
+        start, length = _count(ends), len(next(iter(steps.values())))
         if start and not self._is_whole:  # what is written into, by whoever opened it
             for name in steps:
                 self._read("data", name, start - 1, start)
@@ -131,7 +138,8 @@ class EpisodeStore:
         if len(self) and steps.keys() != set(self.fields):
             raise UserError(f"{self.path} has {', '.join(self.fields)}, not {', '.join(sorted(steps))}.")
         for name, rows in steps.items():
-            there = _array(self._data, name) if name in self._data else rows
+            with self._readable(f"data/{name}"):
+                there = _array(self._data, name) if name in self._data else rows
             if there.shape[1:] != rows.shape[1:] or there.dtype != rows.dtype:
                 raise UserError(
                     f"{self.path}: {name} is {there.dtype} {there.shape[1:]} per step, not {rows.dtype} "
@@ -150,7 +158,20 @@ def _array(group: zarr.Group, name: str) -> zarr.Array:
     node = group[name]
     if not isinstance(node, zarr.Array):
         raise ValueError(f"{name} is no array")
+    if node.chunks[0] < 1:
+        raise ValueError(f"{name} has chunks of {node.chunks[0]} rows")
     return node
+
+
+def _count(ends: np.ndarray) -> int:
+    """Steps of all episodes with these ends."""
+    return int(ends[-1]) if len(ends) else 0
+
+
+def _check_length(rows: zarr.Array, least: int) -> None:
+    """ValueError if there are fewer rows: Zarr would read those there are."""
+    if rows.shape[0] < least:
+        raise ValueError(f"it has {rows.shape[0]} rows of {least}")
 
 
 def _check_chunks(path: Path, rows: zarr.Array, first: int, last: int) -> None:

@@ -1,6 +1,7 @@
 """Episodes on disk survive interruption; what is whole stays readable."""
 
 import errno
+import json
 import os
 import shutil
 from unittest.mock import Mock
@@ -170,6 +171,43 @@ def test_a_damaged_description_of_a_field_is_one_line(tmp_path):
     (tmp_path / "s.zarr" / "data" / "action" / "zarr.json").write_text("")
     with pytest.raises(UserError, match="data cannot be read"):
         _ = EpisodeStore(tmp_path / "s.zarr").fields
+
+
+def _describe(path, **fields):
+    """Changes what Zarr knows of an array or a group."""
+    file = path / "zarr.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | fields))
+
+
+def _in_chunks(*shape):
+    return {"name": "regular", "configuration": {"chunk_shape": shape}}
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "said"),
+    [
+        ("data/action", {"shape": [5, 8]}, r"data/action cannot be read \(it has 5 rows of 8\)"),
+        ("data/action", {"chunk_grid": _in_chunks(0, 8)}, "action has chunks of 0 rows"),
+        ("data/action", {"shape": [], "chunk_grid": _in_chunks()}, "data/action cannot be read"),
+        ("meta/object_index", {"shape": [1]}, r"meta/object_index cannot be read \(it has 1 rows of 2\)"),
+        ("meta/episode_ends", {"data_type": "float64"}, "meta/episode_ends cannot be read .* no list of"),
+        ("meta/episode_ends", {"chunk_grid": _in_chunks(0)}, "episode_ends has chunks of 0 rows"),
+        ("data", {"attributes": 5}, "is damaged .* delete it and collect again"),
+        ("", {"attributes": [5]}, "is damaged .* delete it and collect again"),
+    ],
+)
+def test_descriptions_that_say_what_none_can_are_one_line(tmp_path, name, fields, said):
+    """Arrays shorter than episode_ends says were read short."""
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    for length in (3, 5):
+        store.append(*episode(length, 7))
+    _describe(tmp_path / "s.zarr" / name, **fields)
+    for read in (EpisodeStore.steps, EpisodeStore.reader) if name == "data/action" else (EpisodeStore.steps,):
+        with pytest.raises(UserError, match=said) as refused:
+            again = EpisodeStore(tmp_path / "s.zarr")
+            again.episodes("object_index")
+            read(again, "action")
+        assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES, errno.EIO])
