@@ -1,8 +1,9 @@
 """Which control unit answers at an address, if any, and whether its hand does.
 
-Where another program holds the arm, franky's own connection waits for ever, and stops every thread meanwhile;
-and it cannot tell a Panda from an unsuitable library. So one `Connect` of Franka's published protocol
-(libfranka-common, research_interface/robot/service_types.h and gripper/types.h) comes first.
+Where another program holds the arm, or what answers is no Franka, franky's own connection waits for ever, and
+stops every thread meanwhile; and it cannot tell a Panda from an unsuitable library. So one `Connect` of
+Franka's published protocol (libfranka-common, research_interface/robot/service_types.h and gripper/types.h)
+comes first.
 """
 
 import socket
@@ -18,7 +19,11 @@ _HEADER, _GRIPPER_HEADER = struct.Struct("<III"), struct.Struct("<HII")
 """Command, its number, size of the whole message."""
 _ANSWER = struct.Struct("<HH")
 """Status, server version."""
-_CONNECT, _OUR_VERSION, _OUR_GRIPPER_VERSION = 0, 10, 3
+_STATUSES = (0, 1)
+"""Success, incompatible version."""
+_LONGEST = 256
+"""Bytes of an answer to `Connect`; a control unit's has two dozen."""
+_CONNECT, _NUMBER, _OUR_VERSION, _OUR_GRIPPER_VERSION = 0, 0, 10, 3
 
 
 def check_arm(host: str, model: str) -> None:
@@ -36,21 +41,41 @@ def check_arm(host: str, model: str) -> None:
 
 
 def check_hand(host: str) -> None:
-    """Raises OSError unless the gripper of the control unit at `host` answers; given up at once as well."""
+    """Raises OSError unless the gripper of the control unit at `host` answers, UserError if what answers is
+    none; given up at once as well."""
     if len(_answer(host, GRIPPER_PORT, _GRIPPER_HEADER, _OUR_GRIPPER_VERSION)) < _ANSWER.size:
         raise OSError("it refuses connections")
 
 
 def _answer(host: str, port: int, header: struct.Struct, version: int) -> bytes:
-    """What the server at `port` answers to `Connect`, without its header. Raises OSError."""
+    """What the server at `port` answers to `Connect`, without its header; nothing if it hangs up.
+
+    Raises OSError; UserError for an answer that is none of a Franka's.
+    """
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as states,
         socket.create_connection((host, port), ANSWER_S) as connection,
     ):
         states.bind(("", 0))  # where the server sends its state
         request = struct.pack("<HH", version, states.getsockname()[1])
-        connection.sendall(header.pack(_CONNECT, 0, header.size + len(request)) + request)
-        return connection.makefile("rb").read(header.size + _ANSWER.size)[header.size :]
+        connection.sendall(header.pack(_CONNECT, _NUMBER, header.size + len(request)) + request)
+        said = connection.makefile("rb").read(header.size + _ANSWER.size)
+    if said and not _is_answer(said, header):
+        raise UserError(
+            f"what answers at {host}:{port} is no Franka (it said {said!r}): check --host, which "
+            "has to be the address of the arm's control unit."
+        )
+    return said[header.size :]
+
+
+def _is_answer(said: bytes, header: struct.Struct) -> bool:
+    """Whether it begins as an answer to our `Connect`: its command and number, a fitting size, a status."""
+    shortest = header.size + _ANSWER.size
+    if len(said) < shortest:
+        return False
+    command, number, size = header.unpack_from(said)
+    status, _ = _ANSWER.unpack_from(said, header.size)
+    return (command, number) == (_CONNECT, _NUMBER) and shortest <= size <= _LONGEST and status in _STATUSES
 
 
 def _server_version(host: str) -> int:
