@@ -16,8 +16,21 @@ from ddgrasp.files import DAMAGED_JSON
 PORT = 1339
 """Beside the protocol's own: 1337 is the robot's, 1338 the gripper's."""
 CONNECT_S, ANSWER_S = 2.0, 20.0
+LONGEST_REQUEST = 65536
+"""Bytes of a line that asks."""
 REFUSED = "refused"
 """The key of an answer that is none: what was asked, and why not."""
+
+
+def parsed(line: bytes) -> dict[str, Any]:
+    """The object that a line of JSON says. Raises ValueError for a line that says none."""
+    try:
+        said = json.loads(line.decode())
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    if not isinstance(said, dict):
+        raise ValueError("it is no object")
+    return said
 
 
 class ChannelLost(Exception):

@@ -22,6 +22,7 @@ from franky_sim.franka_server import BaseCommand
 from jaxtyping import Float
 
 from ddgrasp import contract
+from rig.fr3.strays import Guarded, check_numbers
 
 JOINT_REFLEX, CARTESIAN_REFLEX = 6, 7
 GENERATOR_POSITION_LIMITS = 12
@@ -49,7 +50,7 @@ class Thresholds:
     lower_force_n: tuple[float, ...] = (30.0,) * 6
 
 
-class ReflexServer(FrankaRobotServer):
+class ReflexServer(Guarded, FrankaRobotServer):
     """franky-sim's robot server with reflexes.
 
     Reaches into franky-sim 1.0.4 in the three places named `_Franka...` below: the extra pins that version.
@@ -61,6 +62,7 @@ class ReflexServer(FrankaRobotServer):
         commands = self._FrankaServer__command_class_map  # type: ignore[attr-defined]
         commands[protocol.RobotCommand.kSetCollisionBehavior] = _SetCollisionBehavior
         commands[protocol.RobotCommand.kAutomaticErrorRecovery] = _Recover
+        check_numbers(commands)
         self.thresholds = Thresholds()
         self.error: int | None = None
         """The number of the error that stopped the arm, None if it may move."""
@@ -143,13 +145,17 @@ class ReflexServer(FrankaRobotServer):
         self.error = error
         self.send_state()  # the client looks for the reason in the state that comes before the answer
         status, client = protocol.MoveStatus.kReflexAborted, self._tcp_socket
-        assert client is not None  # there is a motion, so somebody asked for it
-        BaseCommand.send_response(client, protocol.RobotCommand.kMove, motion, status)
+        if client is not None:  # it was dropped if its state did not reach it
+            BaseCommand.send_response(client, protocol.RobotCommand.kMove, motion, status)
         self.reset_current_motion_id()
 
 
-class GripperServer(FrankaGripperServer):
+class GripperServer(Guarded, FrankaGripperServer):
     """franky-sim's gripper, which answers the command that a stop aborts: its caller would wait for ever."""
+
+    def __init__(self, robot: BaseRobot, hostname: str):
+        super().__init__(robot, hostname)
+        check_numbers(self._FrankaServer__command_class_map)  # type: ignore[attr-defined]
 
     def stop(self, command_id: int, tcp_socket: socket.socket) -> None:
         """See franky-sim."""

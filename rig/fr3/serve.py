@@ -8,6 +8,7 @@ import contextlib
 import json
 import os
 import queue
+import reprlib
 import socketserver
 import sys
 import threading
@@ -28,6 +29,8 @@ COMMAND_WAIT_S = 0.05
 SLOW_TICK_S = 0.05
 """Wall-clock time of a tick while somebody takes a picture: time nearly stands still, and the client, which
 gives up after a second without a state, goes on hearing of the arm."""
+FURTHEST_M, LARGEST_RAD, LONGEST_AWAY_S = 100.0, 1e3, 3600.0
+"""What a request may ask for: MuJoCo begins a world anew in which something is far beyond that."""
 
 
 @dataclass(frozen=True)
@@ -94,15 +97,17 @@ class Rig:
             case "state":
                 return self._state()
             case "place":
-                return self._place(asked["x_m"], asked["y_m"], asked["yaw_rad"])
+                x_m, y_m = (_number(asked, name, FURTHEST_M) for name in ("x_m", "y_m"))
+                return self._place(x_m, y_m, _number(asked, "yaw_rad", LARGEST_RAD))
             case "slow":
-                self._slow = asked["on"]
+                self._slow = _truth(asked, "on")
                 return {}
             case "disconnect":
+                seconds = _number(asked, "seconds", LONGEST_AWAY_S)
                 self._server.disconnect()
-                self._away_until_s = time.monotonic() + asked["seconds"]
+                self._away_until_s = time.monotonic() + seconds
                 return {}
-        return {channel.REFUSED: f"{asked!r}, which it does not know"}
+        return {channel.REFUSED: f"{reprlib.repr(asked)}, which it does not know"}
 
     def _tick(self) -> None:
         while not self._requests.empty():
@@ -110,7 +115,7 @@ class Rig:
             try:
                 answer.put(self.answer(asked))
             except (KeyError, TypeError, ValueError) as error:  # a request may not take the arm down
-                answer.put({channel.REFUSED: f"{asked!r} ({error!r})"})
+                answer.put({channel.REFUSED: f"{reprlib.repr(asked)} ({error!r})"})
         if time.monotonic() < self._away_until_s:
             self._server.hold_once()
             return
@@ -198,20 +203,48 @@ def _drop_visuals(root: ET.Element) -> None:
         assets.remove(mesh)
 
 
+def _number(asked: dict[str, Any], name: str, largest: float) -> float:
+    """That field. Raises KeyError without it, ValueError unless it is a number of at most that size."""
+    value = asked[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= largest:
+        raise ValueError(f"{name} is {reprlib.repr(value)}, expected a number up to {largest:g}")
+    return float(value)
+
+
+def _truth(asked: dict[str, Any], name: str) -> bool:
+    """That field. Raises KeyError without it, ValueError unless it is true or false."""
+    if not isinstance(asked[name], bool):
+        raise ValueError(f"{name} is {reprlib.repr(asked[name])}, expected true or false")
+    return asked[name]
+
+
 def _listen(host: str, request: Any) -> socketserver.ThreadingTCPServer:
     """The side channel's listener, running; leaving its context ends it."""
 
     class Handler(socketserver.StreamRequestHandler):
+        slowed = False
+
         def handle(self) -> None:
-            slowed = False
             try:
-                for line in self.rfile:
-                    asked = json.loads(line)
-                    slowed = asked.get("on") if asked.get("ask") == "slow" else slowed
-                    self.wfile.write(json.dumps(request(asked)).encode() + b"\n")
+                with contextlib.suppress(OSError):  # whoever asked has gone
+                    self._serve()
             finally:
-                if slowed:  # who asked for it has gone
+                if self.slowed:  # who asked for it has gone
                     request({"ask": "slow", "on": False})
+
+        def _serve(self) -> None:
+            while line := self.rfile.readline(channel.LONGEST_REQUEST + 1):
+                self.wfile.write(json.dumps(self._answer(line)).encode() + b"\n")
+                if len(line) > channel.LONGEST_REQUEST:  # what follows is the rest of it
+                    return
+
+        def _answer(self, line: bytes) -> dict[str, Any]:
+            try:
+                asked = channel.parsed(line)
+            except ValueError as error:
+                return {channel.REFUSED: f"{line[:40]!r} ({error!r})"}
+            self.slowed = asked.get("on") if asked.get("ask") == "slow" else self.slowed
+            return request(asked)
 
     class Listener(socketserver.ThreadingTCPServer):
         allow_reuse_address, daemon_threads, block_on_close = True, True, False
