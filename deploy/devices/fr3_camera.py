@@ -131,8 +131,8 @@ class Fr3Camera:
                 state = self._channel.ask("state")
             except ChannelLost as error:
                 raise CameraError(str(error)) from error
-            self._judge(np.array(state["object_position_m"]))
-            self._picture.pose(np.array(state["qpos"]))
+            self._judge(np.array(state["object_position_m"], float))
+            self._picture.pose(np.array(state["qpos"], float))
             depth = self._sense(self._picture, self._T_world_cam, self._object)
             return Frame(depth, asked_s, self._colour() if self._in_colour else None)
 

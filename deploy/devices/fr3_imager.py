@@ -62,7 +62,7 @@ class Fr3Imager:
                 state = self._channel.ask("state")
             except ChannelLost as error:
                 raise CameraError(str(error)) from error
-            self._picture.pose(np.array(state["qpos"]))
+            self._picture.pose(np.array(state["qpos"], float))
             return look(self._picture, self._T_world_cam, self._rng)
 
     def truth(self) -> Pose:

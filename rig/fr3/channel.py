@@ -6,18 +6,23 @@ rig's camera, for judging success and for the tests.
 
 import contextlib
 import json
+import reprlib
 import socket
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeGuard
 
 from ddgrasp.errors import UserError
-from ddgrasp.files import DAMAGED_JSON
+from ddgrasp.files import is_number
 
 PORT = 1339
 """Beside the protocol's own: 1337 is the robot's, 1338 the gripper's."""
 CONNECT_S, ANSWER_S = 2.0, 20.0
 LONGEST_REQUEST = 65536
 """Bytes of a line that asks."""
+LONGEST_ANSWER = 2**24
+"""Bytes of a line that answers; the scene of a meshed object has some 150,000."""
+_LONGEST_REFUSAL = 300
+"""Letters of one that are repeated."""
 REFUSED = "refused"
 """The key of an answer that is none: what was asked, and why not."""
 
@@ -50,7 +55,7 @@ class Channel:
                 f"`ddgrasp rig fr3 --host {host}`."
             ) from error
         self._socket.settimeout(ANSWER_S)
-        self._file = self._socket.makefile("rw")
+        self._file = self._socket.makefile("rwb")
         self._holding = 0
 
     def scene(self) -> dict[str, Any]:
@@ -66,23 +71,20 @@ class Channel:
         Raises ChannelLost; UserError for a request that the rig refuses, or if what answers is no rig.
         """
         try:
-            self._file.write(json.dumps({"ask": what, **values}) + "\n")
+            self._file.write(json.dumps({"ask": what, **values}).encode() + b"\n")
             self._file.flush()
-            line = self._file.readline()
+            line = self._file.readline(LONGEST_ANSWER + 1)
         except OSError as error:
             raise ChannelLost(f"the FR3 rig does not answer ({error})") from error
         if not line:
             raise ChannelLost("the FR3 rig has gone")
-        try:
-            answer = json.loads(line)
-        except DAMAGED_JSON:
-            answer = None
-        if not isinstance(answer, dict):
+        answer = _answer(line)
+        if answer is not None and REFUSED in answer:
+            raise UserError(f"the FR3 rig refuses {_one_line(answer[REFUSED])}: is it of another version?")
+        if answer is None or not _is_whole(what, answer):
             raise UserError(
                 "What answers there is no FR3 rig: name its address, on this machine --host 127.0.0.1."
             )
-        if REFUSED in answer:
-            raise UserError(f"the FR3 rig refuses {answer[REFUSED]}: is it of another version?")
         return answer
 
     @contextlib.contextmanager
@@ -108,3 +110,34 @@ class Channel:
         with contextlib.suppress(OSError):
             self._file.close()  # which holds it open as well
         self._socket.close()
+
+
+def _answer(line: bytes) -> dict[str, Any] | None:
+    """What the line says, None if it is too long or says no object."""
+    if len(line) > LONGEST_ANSWER:
+        return None
+    try:
+        return parsed(line)
+    except ValueError:
+        return None
+
+
+def _one_line(refusal: Any) -> str:
+    text = refusal if isinstance(refusal, str) else reprlib.repr(refusal)
+    return " ".join(text.split())[:_LONGEST_REFUSAL]
+
+
+def _is_whole(what: str, answer: dict[str, Any]) -> bool:
+    """Whether the answer to `what` has what a camera looks for."""
+    match what:
+        case "scene":
+            return all(isinstance(answer.get(name), str) for name in ("xml", "object"))
+        case "state":
+            place = answer.get("object_position_m")
+            return _are_numbers(answer.get("qpos")) and _are_numbers(place) and len(place) == 3
+    return True
+
+
+def _are_numbers(values: Any) -> TypeGuard[list[float]]:
+    """Whether it is a list of numbers that a float can hold."""
+    return isinstance(values, list) and all(map(is_number, values))

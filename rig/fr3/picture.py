@@ -33,10 +33,26 @@ def prepare(root: ET.Element, largest_px: int = 2048) -> None:
 
 
 def of_scene(scene_xml: str, largest_px: int = 2048) -> "ScenePicture":
-    """Pictures of what the rig's side channel answers to `scene`, visual meshes included."""
+    """Pictures of what the rig's side channel answers to `scene`, visual meshes included.
+
+    Raises UserError for what MuJoCo does not read.
+    """
+    try:
+        model = _model(scene_xml, largest_px)
+    except (ET.ParseError, ValueError, RecursionError) as error:
+        said = " ".join(str(error).split())
+        raise UserError(
+            f"the FR3 rig's scene is none that MuJoCo reads ({said}): is it of another version?"
+        ) from error
+    return ScenePicture(model)
+
+
+def _model(scene_xml: str, largest_px: int) -> mujoco.MjModel:
     root = ET.fromstring(scene_xml)
+    if root.find("worldbody") is None:
+        raise ValueError("it has no worldbody")
     prepare(root, largest_px)
-    return ScenePicture(mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode")))
+    return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 
 
 class ScenePicture:
@@ -53,7 +69,12 @@ class ScenePicture:
         draw_without_display()
 
     def pose(self, qpos: Float64[np.ndarray, " nq"]) -> None:
-        """The scene from now on."""
+        """The scene from now on. Raises UserError for joints of another one."""
+        if len(qpos) != self.model.nq:
+            raise UserError(
+                f"the FR3 rig's state has {len(qpos)} joint values, its scene {self.model.nq}: is it of "
+                "another version?"
+            )
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
 
