@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,8 @@ STATE_LAYOUT = "q7 rad + gripper width m + its change since the control step bef
 REMEDY = "make one with `ddgrasp export`"
 _DIGITS = 12
 """Digits of a camera's scale: a quotient one unit in its last place off could round a side otherwise."""
+_LARGEST_FX_PX, _FURTHEST_M = 1e6, 100.0
+"""Beyond what any camera has, and any table."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +152,7 @@ def validate(properties: Mapping[str, str], source: str = "The ONNX file") -> Po
     ]
     if missing:
         raise UserError(f"{source} has metadata without {missing[0]!r}: {REMEDY}.")
-    values = {name: to_tuples(raw[name]) for name in names}
-    metadata = PolicyMetadata(**values)
+    metadata = PolicyMetadata(**{name: raw[name] for name in names})
     _check_values(metadata, source)
     return metadata
 
@@ -180,13 +182,14 @@ def validate_shapes(
 
 
 def _parse(text: str, source: str) -> dict[str, Any]:
+    """The fields, lists as tuples; UserError for text that has none."""
     try:
         raw = json.loads(text)
+        if isinstance(raw, dict):
+            return {name: to_tuples(value) for name, value in raw.items()}
     except DAMAGED_JSON as error:
         raise UserError(f"{source} has damaged metadata ({error}): {REMEDY}.") from None
-    if not isinstance(raw, dict):
-        raise UserError(f"{source} has metadata {text[:40]!r}, expected a JSON object: {REMEDY}.")
-    return raw
+    raise UserError(f"{source} has metadata {text[:40]!r}, expected a JSON object: {REMEDY}.")
 
 
 def _check_values(metadata: PolicyMetadata, source: str) -> None:
@@ -211,12 +214,13 @@ def _check_values(metadata: PolicyMetadata, source: str) -> None:
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise UserError(f"{source}: {name} is {value!r}, expected a positive integer: {REMEDY}.")
     focal_px = metadata.camera.get("fx") if isinstance(metadata.camera, dict) else None
-    if not is_number(focal_px) or not focal_px > 0:
-        raise UserError(f"{source}: camera's fx is {focal_px!r}, expected pixels: {REMEDY}.")
+    if not is_number(focal_px) or not 0 < focal_px < _LARGEST_FX_PX:
+        raise UserError(f"{source}: camera's fx is {reprlib.repr(focal_px)}, expected pixels: {REMEDY}.")
     closing = metadata.closing_steps
     if not isinstance(closing, int) or isinstance(closing, bool) or closing < 0:
         raise UserError(f"{source}: closing_steps is {closing!r}, expected 0 or more: {REMEDY}.")
     _check_limits(metadata, source)
+    _check_place(metadata.camera, source)
     seen = metadata.profile
     if (seen.height_px, seen.width_px) != (metadata.depth_height, metadata.depth_width):
         raise UserError(
@@ -247,3 +251,18 @@ def _check_limits(metadata: PolicyMetadata, source: str) -> None:
             raise UserError(
                 f"{source}: {name} may be at {lower:g} to {upper:g} rad, and starts at {home:g}: {REMEDY}."
             )
+
+
+def _check_place(camera: Mapping[str, Any], source: str) -> None:
+    """Where training's camera stood and what it looked at; the contract's where it says nothing."""
+    place = {"position": contract.CAMERA_POSITION_M, "look_at": contract.CAMERA_LOOK_AT_M}
+    place |= {name: camera[name] for name in place if name in camera}
+    for name, point in place.items():
+        is_point = isinstance(point, list | tuple) and len(point) == 3 and all(map(is_number, point))
+        if not is_point or max(map(abs, point)) > _FURTHEST_M:
+            raise UserError(
+                f"{source}: camera's {name} is {reprlib.repr(point)}, expected 3 numbers, metres up to "
+                f"{_FURTHEST_M:g}: {REMEDY}."
+            )
+    if list(place["position"]) == list(place["look_at"]):
+        raise UserError(f"{source}: camera's look_at is its position, {place['look_at']!r}: {REMEDY}.")

@@ -21,6 +21,10 @@ def properties(**changes) -> dict[str, str]:
     return {contract.ONNX_METADATA_KEY: json.dumps(json.loads(GOOD.to_json()) | changes)}
 
 
+def with_camera(**changes) -> dict[str, dict]:
+    return {"camera": GOOD.camera | changes}
+
+
 def test_what_is_written_is_read_back():
     read = metadata.validate(properties())
     assert read.joint_names == contract.ARM_JOINTS
@@ -58,8 +62,25 @@ def test_a_file_of_before_does_not_latch_a_closing():
         ({"joint_names": ["a"]}, "joint_names"),
         ({"camera": {"fx": "640"}}, "camera's fx is '640', expected pixels"),
         ({"camera": None}, "camera's fx is None, expected pixels"),
-        ({"camera": {"fx": 10**400}}, "camera's fx is 10*, expected pixels"),
-        ({"joint_lower_rad": 7 * [-(10**400)]}, "expected 7 numbers"),
+        (with_camera(fx=10**400), r"camera's fx is 10+\.\.\.0+, expected pixels"),
+        (with_camera(fx=sys.float_info.max), r"camera's fx is 1.79\S+, expected pixels"),
+        (with_camera(fx=float("nan")), r"camera's fx is nan, expected pixels"),
+        (with_camera(position="abc"), "camera's position is 'abc', expected 3 numbers"),
+        (with_camera(position=None), "camera's position is None, expected 3 numbers"),
+        (with_camera(position=[0.0, 0.0]), r"camera's position is \[0.0, 0.0\], expected 3 numbers"),
+        (
+            with_camera(position=[0.0, float("nan"), 0.0]),
+            r"position is \[0.0, nan, 0.0\], expected 3 numbers",
+        ),
+        (with_camera(look_at=[0.0, "1", None]), r"camera's look_at is \[.*\], expected 3 numbers"),
+        (
+            with_camera(look_at=[0, 0, 10**400]),
+            r"camera's look_at is \[0, 0, 10+\.\.\.0+\], expected 3 numbers",
+        ),
+        (with_camera(look_at=[0, 0, 1e300]), "expected 3 numbers, metres up to 100"),
+        (with_camera(look_at=contract.CAMERA_POSITION_M), "camera's look_at is its position"),
+        ({"joint_upper_rad": (*GOOD.joint_upper_rad[:6], 10**400)}, "expected 7 numbers"),
+        ({"joint_upper_rad": (*GOOD.joint_upper_rad[:6], float("inf"))}, "expected 7 numbers"),
         ({"closing_steps": -1}, "closing_steps is -1, expected 0 or more"),
         ({"joint_lower_rad": None}, "joint_lower_rad is None, expected 7 numbers"),
         ({"joint_lower_rad": GOOD.joint_lower_rad[:6]}, r"joint_lower_rad is \(.*\), expected 7 numbers"),
@@ -83,12 +104,22 @@ def test_files_of_others_and_damaged_ones():
         metadata.validate({"author": "someone"}, "yolo.onnx")
     with pytest.raises(UserError, match="damaged metadata"):
         metadata.validate({contract.ONNX_METADATA_KEY: "{"})
+    deep = f'{{"joint_names": {"[" * 700}{"]" * 700}}}'
+    for text in ("[" * 100_000, "1" * 5000, deep):
+        with pytest.raises(UserError, match="damaged metadata") as caught:
+            metadata.validate({contract.ONNX_METADATA_KEY: text})
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
     with pytest.raises(UserError, match="expected a JSON object"):
         metadata.validate({contract.ONNX_METADATA_KEY: "[]"})
     short = dataclasses.asdict(GOOD)
     del short["chunk"]
     with pytest.raises(UserError, match="metadata without 'chunk'"):
         metadata.validate({contract.ONNX_METADATA_KEY: json.dumps(short)})
+
+
+def test_a_file_that_does_not_say_where_its_camera_stood_is_read():
+    camera = {name: GOOD.camera[name] for name in ("fx", "fy", "cx", "cy")}
+    assert metadata.validate(properties(camera=camera)).camera == camera
 
 
 def test_graph_shapes_must_be_those_promised():
