@@ -605,6 +605,13 @@ def test_a_calibration_of_another_robot_is_not_taken(tmp_path, monkeypatch):
         standing.standing(CONFIG, named)
 
 
+def written(**changes) -> str:
+    """A calibration file with something else in it."""
+    T = nominal_pose().tolist()
+    right = {"version": 1, "created": "", "camera": "rig", "host": "", "T_base_cam": T, "rms_px": 0.1}
+    return json.dumps(right | changes)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -613,14 +620,22 @@ def test_a_calibration_of_another_robot_is_not_taken(tmp_path, monkeypatch):
         ("{}", r"is no calibration \('version'\)"),
         ('{"version": 9}', "has version 9, 1 is read"),
         ('{"version": 1, "T_base_cam": [[1, 2]], "rms_px": 1}', "no rigid transform"),
+        (
+            f'{{"version": 1, "T_base_cam": [[1{"0" * 400}]], "rms_px": 1}}',
+            r"is no calibration \(.*too large",
+        ),
+        (written(rms_px=10**400), r"is no calibration \(.*too large"),
+        ("[" * 100_000, "is not valid JSON"),
+        (f'{{"version": {"1" * 5000}}}', "is not valid JSON"),
     ],
 )
 def test_files_that_are_no_calibration(tmp_path, text, said):
     path = tmp_path / "mine.json"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=said) as refused:
         standing.load(path)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("wrong", ["by columns", "mirrored", "no number"])

@@ -172,7 +172,7 @@ def load(path: Path) -> Calibration:
             raise ValueError("T_base_cam is no rigid transform")
         created, camera, host = (str(values[name]) for name in ("created", "camera", "host"))
         return Calibration(created, camera, host, T, float(values["rms_px"]), str(values.get("serial") or ""))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{path} is no calibration ({error}): `ddgrasp calibrate` writes one.") from None
 
 
