@@ -52,7 +52,7 @@ def add_noisy_demos(
     def read(i: int) -> Clip:
         rows = rows_of(chosen[i])
         rgb = demos.steps("rgb", *rows) if source.needs_rgb else None
-        views = _views(demos, chosen[i], rows) if source.needs_views else None
+        views = views_of(demos, chosen[i], rows) if source.needs_views else None
         return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb, views)
 
     done = int(np.sum(~keep_clean[: len(frames)]))
@@ -72,7 +72,7 @@ def add_noisy_demos(
             task.advance()
 
 
-def _views(demos: EpisodeStore, number: int, rows: tuple[int, int]) -> Views:
+def views_of(demos: EpisodeStore, number: int, rows: tuple[int, int]) -> Views:
     """What `rows` of demo `number` show."""
     observation = demos.steps("observation", *rows)
     fixed = (np.repeat(demos.episodes(name)[[number]], len(observation), axis=0) for name in VIEWED)

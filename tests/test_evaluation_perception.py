@@ -16,11 +16,13 @@ from ddgrasp.contract import GRIPPER_MAX_WIDTH_M, HOME_RAD
 from ddgrasp.layout import OBSERVATION, QPOS
 from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.presets import PRESETS
+from ddgrasp.scaling import with_values
+from demos.store import STORE, EpisodeStore
 from deploy.calibration.poses import reach
 from deploy.safety import SafetyLimits
 from deploy.trials import drawn
 from deploy_support import constant_bias, describe, write_policy
-from evaluation import perception, perception_table, rig_trials
+from evaluation import perception, perception_table, rig_trials, training_perception
 from learning.params import save_params
 from rig.world import RigWorld, make_world
 from student_jax.data import YAW_MULTIPLE, aux_targets
@@ -217,3 +219,36 @@ def test_what_was_touched_and_lies_where_it_lay_has_been_touched():
     seen = _seen([0.05, 0.0, 0.05], [0, 0.01, 0])
     made = perception.errors(seen, _reported(seen, np.zeros(3), 0.0, [False] * 3))
     assert made.touched.tolist() == [False, True, True]
+
+
+def test_a_student_is_measured_on_its_run_s_demonstrations_with_errors_on_their_depth(run_dir, monkeypatch):
+    run = with_values(PRESETS["debug"], {"student.depth_source": "dextrah"})
+    for stage in ("student", "export"):
+        artifacts.finish(run_dir / stage, stage, run, seconds=1.0, metrics={})
+    (run_dir / "demos").mkdir()
+    store, profile = EpisodeStore(run_dir / "demos" / STORE, create=True), run.world.profile
+    clean_mm = np.full((3, profile.height_px, profile.width_px), 900, np.uint16)
+    for number, index in enumerate((0, 4, 0, 0)):  # apples and a cube, ever farther from where it is seen
+        observation = np.stack(_seen([0.05] * 3, [0.0] * 3).observation).astype(np.float32)
+        observation[:, OBSERVATION.grasp_pos] = np.array(POSITION_CENTER_M) + [0.01 * number, 0, 0]
+        observation[:, OBSERVATION.grip_pos] = observation[:, OBSERVATION.grasp_pos] + [0, 0, 0.05]
+        steps = {
+            "depth_mm": clean_mm, "state": np.zeros((3, 8), np.float32),
+            "action": np.zeros((3, 8), np.float32), "observation": observation, "held": np.zeros(3, bool),
+        }  # fmt: skip
+        store.append(steps, {"object_index": np.int32(index), "variant": np.int32(index)})
+    artifacts.finish(run_dir / "demos", "demos", run, seconds=1.0, metrics={})
+    given, perceive = [], training_perception.perceive
+
+    def seen(config, profile, params, depth, state):
+        given.append(depth)
+        return perceive(config, profile, params, depth, state)
+
+    monkeypatch.setattr(training_perception, "perceive", seen)
+    assert cli.main(["student", "perception", str(run_dir), "--camera", "training", "--trials", "2"]) == 0
+    rows = {row["trials"]: row for row in perception_table.load(run_dir / "student") if row["hand"] == "near"}
+    assert {row["camera"] for row in rows.values()} == {"training"} and rows["all"]["n_trials"] == 3
+    assert (rows["cube"]["n_trials"], rows["cube"]["mean_x_mm"]) == (1, -10.0)
+    assert (rows["apple"]["n_trials"], rows["apple"]["mean_x_mm"]) == (2, -10.0)  # 0 and 20 mm, not 30
+    assert len(given) == 3 and all(depth.shape == (3, 3, *clean_mm.shape[1:]) for depth in given)
+    assert all(0.01 < np.mean(depth != 900) for depth in given)

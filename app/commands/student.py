@@ -86,17 +86,18 @@ class StudentPerception:
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run, with the stages student and export."""
-    camera: Literal["stereo", "ideal", "generator"] = "stereo"
-    """stereo (the rig's own), ideal (without errors), or generator (depth without errors, with those that a
-    generator draws)."""
+    camera: Literal["stereo", "ideal", "generator", "training"] = "stereo"
+    """stereo (the rig's own), ideal (without errors), generator (depth without errors, with those that a
+    generator draws), or training: no trials on the rig, but the run's own demonstrations with the errors that
+    the student was trained on."""
     generator: Path = Path("pretrained/ddg/generator.onnx")
     """What `ddgrasp ddg export` wrote, for camera generator."""
     objects: tuple[str, ...] = ("all",)
-    """Names (`ddgrasp objects list`), or all: the paper's twelve."""
+    """Names (`ddgrasp objects list`), or all: the paper's twelve (camera training: the run's, always)."""
     trials: Count = 6
     """How many with every object."""
     number: Annotated[int, Range(0, 999)] = 0
-    """Which development seed."""
+    """Which development seed (not of camera training)."""
 
     def run(self) -> None:
         """Runs the trials and prints a row for each part of them."""
@@ -104,7 +105,7 @@ class StudentPerception:
         from ddgrasp.progress import Progress
         from deploy.changes import Change
         from deploy.generated_camera import digest
-        from evaluation import perception, perception_table
+        from evaluation import perception, perception_table, training_perception
         from evaluation.rig_trials import Series
 
         series = Series("development", self.objects, self.trials, number=self.number)
@@ -112,10 +113,13 @@ class StudentPerception:
         check_folder("RUN-DIR", self.run_dir / "student")
         progress = Progress(name="student perception")
         camera = self.camera
-        if camera == "generator":
-            camera = f"generator {digest(self.generator, config.world.profile)[:8]}"
-        change = Change(sight=self.camera, generator=self.generator)
-        rows = perception.measure(config, self.run_dir, series, change, progress)
+        if self.camera == "training":
+            rows = training_perception.measure(config, self.run_dir, self.trials, progress)
+        else:
+            if self.camera == "generator":
+                camera = f"generator {digest(self.generator, config.world.profile)[:8]}"
+            change = Change(sight=self.camera, generator=self.generator)
+            rows = perception.measure(config, self.run_dir, series, change, progress)
         print(perception_table.describe(rows))
         print(perception_table.save(self.run_dir / "student", camera, rows))
 
