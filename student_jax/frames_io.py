@@ -1,7 +1,7 @@
 """Demos and DAgger episodes as the student sees them, on disk, so that a resumed stage finds them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,7 +52,7 @@ def add_noisy_demos(
     def read(i: int) -> Clip:
         rows = rows_of(chosen[i])
         rgb = demos.steps("rgb", *rows) if source.needs_rgb else None
-        views = views_of(demos, chosen[i], rows) if source.needs_views else None
+        views = _views(demos, chosen[i], rows) if source.needs_views else None
         return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb, views)
 
     done = int(np.sum(~keep_clean[: len(frames)]))
@@ -72,11 +72,28 @@ def add_noisy_demos(
             task.advance()
 
 
-def views_of(demos: EpisodeStore, number: int, rows: tuple[int, int]) -> Views:
+def _views(demos: EpisodeStore, number: int, rows: tuple[int, int]) -> Views:
     """What `rows` of demo `number` show."""
     observation = demos.steps("observation", *rows)
     fixed = (np.repeat(demos.episodes(name)[[number]], len(observation), axis=0) for name in VIEWED)
     return observed(observation, *fixed)
+
+
+def demos_with_errors(demos: EpisodeStore, source: DepthSource, chosen: Sequence[int]) -> Iterator[Frames]:
+    """Some demos as a student sees them, by their numbers: an episode each, whole, the source's artefacts
+    on all of their depth. They must have what the source needs (`depth_source.check_demos`)."""
+    begins = [0, *demos.ends.tolist()]
+    rows = [(begins[number], begins[number + 1]) for number in chosen]
+
+    def read(i: int) -> Clip:
+        rgb = demos.steps("rgb", *rows[i]) if source.needs_rgb else None
+        views = _views(demos, chosen[i], rows[i]) if source.needs_views else None
+        return Clip(chosen[i], demos.steps("depth_mm", *rows[i]), rgb, views)
+
+    seen = source.episodes([stop - start for start, stop in rows], read)
+    for place, depth_mm in zip(rows, seen, strict=True):
+        columns = (demos.steps(name, *place) for name in _COLUMNS)
+        yield make_frames([depth_mm], *([column] for column in columns))
 
 
 def useful_steps(held: Bool[np.ndarray, " T"], held_steps: int) -> int:

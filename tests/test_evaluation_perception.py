@@ -22,9 +22,10 @@ from deploy.calibration.poses import reach
 from deploy.safety import SafetyLimits
 from deploy.trials import drawn
 from deploy_support import constant_bias, describe, write_policy
-from evaluation import perception, perception_table, rig_trials, training_perception
+from evaluation import perception, perception_table, rig_trials
 from learning.params import save_params
 from rig.world import RigWorld, make_world
+from student_jax import act
 from student_jax.data import YAW_MULTIPLE, aux_targets
 from student_jax.policy import (
     AUX_BESIDE,
@@ -238,13 +239,13 @@ def test_a_student_is_measured_on_its_run_s_demonstrations_with_errors_on_their_
         }  # fmt: skip
         store.append(steps, {"object_index": np.int32(index), "variant": np.int32(index)})
     artifacts.finish(run_dir / "demos", "demos", run, seconds=1.0, metrics={})
-    given, perceive = [], training_perception.perceive
+    given, perceive = [], act.perceive
 
     def seen(config, profile, params, depth, state):
         given.append(depth)
         return perceive(config, profile, params, depth, state)
 
-    monkeypatch.setattr(training_perception, "perceive", seen)
+    monkeypatch.setattr(act, "perceive", seen)
     assert cli.main(["student", "perception", str(run_dir), "--camera", "training", "--trials", "2"]) == 0
     rows = {row["trials"]: row for row in perception_table.load(run_dir / "student") if row["hand"] == "near"}
     assert {row["camera"] for row in rows.values()} == {"training"} and rows["all"]["n_trials"] == 3
