@@ -361,7 +361,7 @@ KEPT = PRETRAINED / "table2" / "trials"
         ("development-9", {"sim_gt": (499, 3), "rand_noise": (62, 37), "inpaint": (141, 28),
                            "ddg_no_graft": (26, 34), "upper_bound": (24, 42)}),
         ("fr3-test-10", {"sim_gt": (51, 1), "rand_noise": (5, 3), "inpaint": (8, 3),
-                         "ddg_no_graft": (0, 1)}),
+                         "ddg_no_graft": (0, 1), "upper_bound": (4, 3)}),
         ("fr3-test-3", {"sim_gt": (51, 3), "rand_noise": (4, 3), "inpaint": (10, 5),
                         "ddg_no_graft": (9, 3), "upper_bound": (7, 3)}),
     ],
