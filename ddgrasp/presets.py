@@ -119,8 +119,8 @@ DEMO = Config(
     evaluation=EvalConfig(student_trials=30),
     score=ScoreConfig(trajectories=24, kid_subset_size=150, tsne_maps=3000),
 )
-"""For two cores; the student starts from the pretrained one. 28 minutes on two Intel Xeon cores, 19 on two
-AMD EPYC ones (docs/results.md)."""
+"""For two cores; the student starts from the pretrained one. 28 to 35 minutes on two Intel Xeon cores, 19 on
+two AMD EPYC ones (docs/results.md)."""
 
 LAPTOP = Config(
     preset="laptop",

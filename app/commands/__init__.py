@@ -221,7 +221,7 @@ def _described(name: str) -> str:
 
 _PRESET_HELP = (
     "Presets (--preset): debug (tests; teacher from the pretrained one), demo (teacher from the scripted",
-    "guide, student from the pretrained one; 19 to 28 minutes on two cores), laptop (random first weights,",
+    "guide, student from the pretrained one; 19 to 35 minutes on two cores), laptop (random first weights,",
     "teacher from the guide, twelve training objects; 50 to 81 minutes), ppo and ppo_paper (laptop with a",
     "teacher by PPO from nothing, six), camera (laptop, the generator for a real camera that moves),",
     "student_paper (laptop with the paper's own student, six), paper (PPO from nothing, one GPU).",
