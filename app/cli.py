@@ -26,12 +26,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         atexit.register(_leave, interrupted)
     # JAX's GPU build takes most of the device's memory at its start unless told otherwise.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    # Compiled programs are kept: the second run of a stage starts in seconds.
-    from ddgrasp.files import user_cache
-
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(user_cache("jax")))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     try:
+        _keep_programs()
         return _printed(list(sys.argv[1:] if argv is None else argv))
     except KeyboardInterrupt as interrupt:
         interrupted.append(True)
@@ -44,6 +40,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _give_up_output()
         return _fail(message, 2 if type(error).__name__ == "UserError" else 1)
+
+
+def _keep_programs() -> None:
+    """Compiled programs are kept: the second run of a stage starts in seconds."""
+    from ddgrasp.files import user_cache
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(user_cache("jax"))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 
 
 def _leave(interrupted: Sequence[bool]) -> None:

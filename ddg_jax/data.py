@@ -104,7 +104,8 @@ def held_out_count(lengths: Int[np.ndarray, " R"], holdout_fraction: float) -> i
 
 def frames_bytes(config: DDGConfig, count: int) -> int:
     """Bytes of the arrays of `Frames` with `count` frames, and of the priors a second time as they are put
-    together. To read them takes no more, with a built-in prior."""
+    together. To read them takes no more, with a built-in prior, but for a recording or two in each process
+    that helps."""
     return count * config.depth.height_px * config.depth.width_px * (4 + 4 + 2 + 2)
 
 

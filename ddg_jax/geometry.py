@@ -50,14 +50,16 @@ def understand(
     shape = noisy_m.shape if len(read) > 1 else (0, 0, 0)  # one recording's are taken as they come
     surface, c = np.empty(shape, np.float32), np.empty(shape, np.float16)
     useless = []
-    workers = 0 if prior.needs_rgb or kind == PIECEWISE else worth(len(noisy_m) // FRAMES_A_PROCESS)
+    in_jax = prior.needs_rgb or kind == PIECEWISE
+    workers = 0 if in_jax else worth(len(noisy_m) // FRAMES_A_PROCESS, len(read))
     by_number = {r.number: r for r in read}
     with progress.task("surfaces and priors", len(noisy_m)) as task:
         for number, made in spread(partial(_Geometer, kind, prior, seed), read, workers):
             rows = by_number[number].rows
             if isinstance(made, UserError):
                 useless.append((number, made))
-                progress.note(f"left out: {made}")
+                if len(read) > 1:
+                    progress.note(f"left out: {made}")
             elif len(read) == 1:
                 surface, c = made
             else:

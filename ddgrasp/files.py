@@ -135,9 +135,10 @@ def user_cache(name: str) -> Path:
 def _own(folder: Path) -> Path:
     """`folder` of a place that everybody writes to, made if it is not there: compiled programs of others are
     not to be run. UserError if others may write to it."""
-    folder.mkdir(mode=0o700, exist_ok=True)
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
     known = folder.lstat()
-    if known.st_uid != os.getuid() or known.st_mode & 0o022 or not stat.S_ISDIR(known.st_mode):
+    if known.st_uid != os.getuid() or known.st_mode & 0o002 or not stat.S_ISDIR(known.st_mode):
         raise UserError(f"{folder} may be written to by others: delete it, or set DDGRASP_CACHE to a folder.")
     return folder
 

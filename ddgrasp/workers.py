@@ -33,10 +33,10 @@ class Worker(Protocol[_Item, _Result]):
         ...
 
 
-def worth(pieces: int) -> int:
-    """Processes for work that has so many pieces of which each is worth a process: at most one a core, and 0
-    where there would be one alone, for which `spread` needs no other process."""
-    count = min(machine.cores(), pieces)
+def worth(pieces: int, items: int) -> int:
+    """Processes for work that has so many pieces of which each is worth a process, in so many `items`: at
+    most one a core, and 0 where there would be one alone, for which `spread` needs no other process."""
+    count = min(machine.cores(), pieces, items)
     return count if count > 1 else 0
 
 

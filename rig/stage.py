@@ -57,7 +57,8 @@ def record_all(config: Config, teacher: Path, trajectories: Sequence[tuple[int, 
     from ppo import policy as teacher_policy
 
     started = partial(Recorder, config, teacher_policy.load(teacher))
-    return spread(started, trajectories, worth(len(trajectories) * config.record.frames // FRAMES_A_PROCESS))
+    count = len(trajectories)
+    return spread(started, trajectories, worth(count * config.record.frames // FRAMES_A_PROCESS, count))
 
 
 class Recorder:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.cli import main
 from ddgrasp import artifacts, attempts, contract
 from ddgrasp.config import Config, ExportConfig, WorldConfig
 from ddgrasp.config_hash import config_hash
@@ -148,7 +149,7 @@ def test_a_folder_that_cannot_be_synced_costs_no_file(tmp_path, monkeypatch):
     assert [there.name for there in tmp_path.iterdir()] == ["file"]
 
 
-def test_programs_that_others_may_have_written_are_not_run(tmp_path, monkeypatch):
+def test_programs_that_others_may_have_written_are_not_run(tmp_path, monkeypatch, capsys):
     for name in ("DDGRASP_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
 
@@ -161,6 +162,10 @@ def test_programs_that_others_may_have_written_are_not_run(tmp_path, monkeypatch
     assert cache == tmp_path / f"ddgrasp-{os.getuid()}"
     with pytest.raises(UserError, match="may be written to by others: delete it, or set DDGRASP_CACHE"):
         user_cache("jax")
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    assert main(["objects", "list"]) == 2 and "set DDGRASP_CACHE" in capsys.readouterr().err
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "mine"))
+    assert main(["objects", "list"]) == 0
     cache.chmod(0o700)
     assert user_cache("jax") == cache / "jax"
     monkeypatch.setattr(os, "getuid", lambda: cache.lstat().st_uid + 1)

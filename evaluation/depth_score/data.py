@@ -108,7 +108,8 @@ def _recorded(
     from rig.stage import FRAMES_A_PROCESS
 
     started = partial(_RigRecorder, config, teacher_policy.load(teacher), with_rgb)
-    return spread(started, missing, worth(len(missing) * config.score.frames // FRAMES_A_PROCESS))
+    count = len(missing)
+    return spread(started, missing, worth(count * config.score.frames // FRAMES_A_PROCESS, count))
 
 
 class _RigRecorder:
