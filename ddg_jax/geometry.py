@@ -1,6 +1,6 @@
 """What recordings show of their scenes: the surface that errors are counted from, and the prior."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -54,7 +54,8 @@ def understand(
     workers = 0 if in_jax else worth(len(noisy_m) // FRAMES_A_PROCESS, len(read))
     by_number = {r.number: r for r in read}
     with progress.task("surfaces and priors", len(noisy_m)) as task:
-        for number, made in spread(partial(_Geometer, kind, prior, seed), read, workers):
+        here = None if workers else task.advance  # other processes tell of whole recordings
+        for number, made in spread(partial(_Geometer, kind, prior, seed, here), read, workers):
             rows = by_number[number].rows
             if isinstance(made, UserError):
                 useless.append((number, made))
@@ -64,15 +65,16 @@ def understand(
                 surface, c = made
             else:
                 surface[rows], c[rows] = made
-            task.advance(rows.stop - rows.start)
+            if workers or isinstance(made, UserError):  # of those that are refused no frame was told
+                task.advance(len(by_number[number].depth_m))
     return surface, c, useless
 
 
 class _Geometer:
     """Makes surfaces and priors of recordings."""
 
-    def __init__(self, kind: str, prior: Prior, seed: int):
-        self._kind, self._prior, self._seed = kind, prior, seed
+    def __init__(self, kind: str, prior: Prior, seed: int, advance: Callable[[], None] | None):
+        self._kind, self._prior, self._seed, self._advance = kind, prior, seed, advance
 
     def run(self, read: UsableFrames) -> tuple[int, tuple[np.ndarray, np.ndarray] | UserError]:
         """Its number and (T, H, W) surface in metres and prior in float16, or why it cannot be used."""
@@ -81,15 +83,17 @@ class _Geometer:
             c = self._prior.from_recording(read.depth_m, read.rgb, rng, read.consecutive)
         except UserError as error:
             return read.number, error
-        return read.number, (surfaces(read.depth_m, self._kind), c.astype(np.float16))
+        return read.number, (surfaces(read.depth_m, self._kind, self._advance), c.astype(np.float16))
 
     def close(self) -> None:
         """See `ddgrasp.workers.Worker`."""
 
 
-def surfaces(depth_m: Float[np.ndarray, "N H W"], kind: str) -> Float[np.ndarray, "N H W"]:
-    """Recorded depth (N, H, W) metres -> the same with holes filled and noise smoothed away, frame by frame;
-    `kind` as in `ddg.depth.surface`.
+def surfaces(
+    depth_m: Float[np.ndarray, "N H W"], kind: str, advance: Callable[[], None] | None = None
+) -> Float[np.ndarray, "N H W"]:
+    """Recorded depth (N, H, W) metres -> the same with holes filled and noise smoothed away, frame by frame,
+    each told by `advance`; `kind` as in `ddg.depth.surface`.
     """
     made = np.empty(depth_m.shape, np.float32)  # a list of them would take as much again
     for i, frame in enumerate(depth_m):
@@ -98,4 +102,6 @@ def surfaces(depth_m: Float[np.ndarray, "N H W"], kind: str) -> Float[np.ndarray
         else:
             smooth = smooth_surface(fill_from_background(inverse_depth(frame)))
         made[i] = inverse_depth(on_planes(smooth) if kind == PLANES else smooth)
+        if advance is not None:
+            advance()
     return made

@@ -54,9 +54,7 @@ def run(job: Job) -> Artifact:
 def record_all(config: Config, teacher: Path, trajectories: Sequence[tuple[int, Path]]) -> Iterator[None]:
     """Records trajectories, each by its number into a folder, on all cores where that is worth it; comes back
     after each. `teacher` is the folder of the stage."""
-    from ppo import policy as teacher_policy
-
-    started = partial(Recorder, config, teacher_policy.load(teacher))
+    started = partial(Recorder, config, teacher)
     count = len(trajectories)
     return spread(started, trajectories, worth(count * config.record.frames // FRAMES_A_PROCESS, count))
 
@@ -64,8 +62,10 @@ def record_all(config: Config, teacher: Path, trajectories: Sequence[tuple[int, 
 class Recorder:
     """World and camera, made once, and the teacher that moves one episode after the other before them."""
 
-    def __init__(self, config: Config, policy: Policy):
-        self._config, self._policy = config, policy
+    def __init__(self, config: Config, teacher: Path):
+        from ppo import policy as teacher_policy
+
+        self._config, self._policy = config, teacher_policy.load(teacher)
         self._world = make_world(config.world)
         self._camera = make_camera(config, self._world)
 

@@ -16,7 +16,7 @@ from ddgrasp.config import DDGConfig, DDGDepthConfig, DDGTrainingConfig, PriorCo
 from ddgrasp.depth import crop_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.presets import PRESETS
-from ddgrasp.progress import Progress
+from ddgrasp.progress import Progress, Task
 from learning import memory
 from recording_support import flat, set_meta, write_depth
 from sensors.recordings.writer import RecordingWriter
@@ -412,6 +412,18 @@ def test_priors_of_several_processes_are_those_of_one(recordings, monkeypatch):
     spread, _ = load(recordings, config)
     for name in ("depth_m", "surface_m", "prior", "recording"):
         np.testing.assert_array_equal(getattr(spread, name), getattr(here, name))
+
+
+@pytest.mark.parametrize("frames_a_process", [500, 2])
+def test_the_bar_counts_every_frame_wherever_it_is_made(recordings, monkeypatch, frames_a_process):
+    """In this process one by one: a recording of minutes is not silent."""
+    monkeypatch.setattr(machine, "cores", lambda: 2)
+    monkeypatch.setattr(geometry, "FRAMES_A_PROCESS", frames_a_process)
+    progress, told = Progress(quiet=True), []
+    monkeypatch.setattr(Task, "advance", lambda self, n=1: told.append((self.label, n)))
+    count = len(data.load_frames(recordings, WIDE, prior.make_prior(WIDE), 0, progress))
+    frames = [n for label, n in told if label == "surfaces and priors"]
+    assert sum(frames) == count and (len(frames) == count) == (frames_a_process == 500)
 
 
 def test_one_long_recording_takes_what_is_said_of_it(tmp_path):

@@ -159,7 +159,7 @@ def test_what_is_scored_is_no_trajectory_that_a_stage_records(monkeypatch, tmp_p
         def reset(self, seed, name):
             raise LookupError(seed)
 
-    recorder = score_data._RigRecorder(PRESETS["debug"], lambda observation: observation[:8], False)
+    recorder = score_data._RigRecorder(PRESETS["debug"], PRETRAINED / "teacher", False)
     monkeypatch.setattr(recorder, "_world", World())
 
     def world_of(number: int) -> int:

@@ -5,7 +5,7 @@ geometry, on which every method draws its depth; what the camera itself would ha
 it is the real-vs-real floor, and the reference of paired measures. No method sees it.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -104,10 +104,9 @@ def _check_colour(files: Sequence[Path], with_rgb: bool) -> None:
 def _recorded(
     config: Config, teacher: Path, with_rgb: bool, missing: Sequence[tuple[int, str, Path]]
 ) -> Iterator[None]:
-    from ppo import policy as teacher_policy
     from rig.stage import FRAMES_A_PROCESS
 
-    started = partial(_RigRecorder, config, teacher_policy.load(teacher), with_rgb)
+    started = partial(_RigRecorder, config, teacher, with_rgb)
     count = len(missing)
     return spread(started, missing, worth(count * config.score.frames // FRAMES_A_PROCESS, count))
 
@@ -115,11 +114,12 @@ def _recorded(
 class _RigRecorder:
     """World and camera, made once, and the teacher that moves one episode after the other before them."""
 
-    def __init__(self, config: Config, policy: Callable[[np.ndarray], np.ndarray], with_rgb: bool):
+    def __init__(self, config: Config, teacher: Path, with_rgb: bool):
+        from ppo import policy as teacher_policy
         from rig.camera import make_camera
         from rig.world import make_world
 
-        self._config, self._policy, self._with_rgb = config, policy, with_rgb
+        self._config, self._policy, self._with_rgb = config, teacher_policy.load(teacher), with_rgb
         self._world = make_world(config.world)
         self._camera = make_camera(config, self._world)
 
