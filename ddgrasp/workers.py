@@ -1,11 +1,13 @@
 """Work spread over fresh processes, which leave Ctrl-C to the one that began them and go when it has gone."""
 
 import atexit
+import contextlib
 import os
 import signal
+import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
@@ -52,7 +54,8 @@ def spread(
     goes on.
 
     Args:
-        make: called once in every process, for what does the work there; is sent there, as items are.
+        make: called once in every process, for what does the work there; is sent there, as items are, and
+            like them is of a module, not of the script that calls this.
         remedy: what needs less memory, for whoever reads that a process was killed.
 
     Raises UserError if a process was killed, and whatever `make` and the worker raise.
@@ -70,7 +73,7 @@ def spread(
     )
     waiting: set[Future] = set()
     try:
-        with held_back(signal.SIGINT, signal.SIGHUP):  # workers leave them to this process
+        with held_back(signal.SIGINT, signal.SIGHUP), _script_hidden():  # workers leave them to this process
             # multiprocessing's tracker, whose start would let them through, came with the executor
             waiting |= {executor.submit(_run, item) for item in items}
         for future in as_completed(waiting):
@@ -88,6 +91,20 @@ def spread(
         raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _script_hidden() -> Iterator[None]:
+    """Processes that the block starts do not run the script that this one was started with, as
+    multiprocessing has them do: nothing of it is used there, and one that has no `if __name__ == "__main__"`
+    would begin its own work in each of them."""
+    script = sys.modules["__main__"]
+    kept = {name: vars(script).pop(name) for name in ("__file__", "__spec__") if name in vars(script)}
+    script.__spec__ = None
+    try:
+        yield
+    finally:
+        vars(script).update(kept)
 
 
 def _here(make: Callable[[], Worker[Item, Result]], items: Sequence[Item]) -> Generator[Result, None, None]:

@@ -101,8 +101,10 @@ def states():
         lambda port: message(port, CONNECT, b"", size=3),
         lambda port: message(port, CONNECT, b"xxxx", size=2**32 - 1),
         lambda port: message(port, 99, b""),
+        lambda port: b"",
+        lambda port: message(port, CONNECT, b"")[:5],
     ],
-    ids=["http", "tls", "zeros", "short", "no-port", "small", "large", "unknown"],
+    ids=["http", "tls", "zeros", "short", "no-port", "small", "large", "unknown", "silent", "half"],
 )
 def test_a_stray_connection_is_dropped(rig, serves_on, port, said):
     with socket.create_connection((HOST, port), 5.0) as client:

@@ -7,6 +7,7 @@ what is no number reaches the simulation. A server that is `Guarded` drops such 
 import logging
 import socket
 import struct
+import time
 from collections.abc import MutableMapping
 from typing import Any
 
@@ -17,6 +18,8 @@ LARGEST = 1e9
 """In any unit: nothing that an arm is told has more, and the simulation begins anew from about 1e10."""
 LONGEST = 1024
 """Bytes of a message; the longest request, of all thresholds, has 416."""
+GREETED_S = 3.0
+"""A client says within this that it is one of a Franka's; franky does at once. There is one place."""
 _NONSENSE = (OSError, LookupError, ValueError, ArithmeticError, struct.error)
 
 logger = logging.getLogger(__name__)
@@ -37,10 +40,13 @@ class Guarded(FrankaServer):
         except OSError as error:
             self._drop(error)
 
+    _silent_since_s: float | None = None
+
     def _FrankaServer__process_tcp_commands(self) -> None:
         try:
             super()._FrankaServer__process_tcp_commands()  # type: ignore[misc]
             self._check_length()
+            self._check_greeting()
         except _NONSENSE as error:
             self._drop(error)
 
@@ -58,6 +64,16 @@ class Guarded(FrankaServer):
         header = receiver and receiver._MessageReceiver__current_header
         if header and not 0 < header.payload_size <= LONGEST:
             raise ValueError(f"a message of {header.payload_size} bytes")
+
+    def _check_greeting(self) -> None:
+        """Raises ValueError if whoever is connected has not said for `GREETED_S` where states go."""
+        if not self.tcp_connected or self.udp_connected:
+            self._silent_since_s = None
+        elif self._silent_since_s is None:
+            self._silent_since_s = time.monotonic()
+        elif time.monotonic() - self._silent_since_s > GREETED_S:
+            self._silent_since_s = None
+            raise ValueError(f"nothing said in {GREETED_S:g} s")
 
     def _drop(self, error: Exception) -> None:
         logger.warning("dropped a client that is none of a Franka's: %r", error)
