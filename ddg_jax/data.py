@@ -110,7 +110,12 @@ def frames_bytes(config: DDGConfig, count: int) -> int:
 
 
 def load_frames(
-    root: Path, config: DDGConfig, prior: Prior, seed: int, progress: Progress, max_frames: int | None = None
+    root: Path | str,
+    config: DDGConfig,
+    prior: Prior,
+    seed: int,
+    progress: Progress,
+    max_frames: int | None = None,
 ) -> Frames:
     """The usable frames of the recordings at or below `root`, with their priors.
 
@@ -119,6 +124,7 @@ def load_frames(
     is no recording, none can be used, they are of another contract version
     (sensors/recordings/recording.py), or memory is too small for them, before any is read.
     """
+    root = Path(root)
     return _loaded(root, _folders(root), config, prior, seed, progress, max_frames)
 
 

@@ -9,9 +9,9 @@ from jaxtyping import Float, Float32
 
 from ddg_jax.piecewise import piecewise_smooth
 from ddg_jax.prior import Prior
-from ddgrasp.config import PIECEWISE, PLANES
+from ddgrasp.config import PIECEWISE, PLANES, SURFACES
 from ddgrasp.depth import inverse_depth
-from ddgrasp.errors import UserError
+from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.progress import Progress
 from ddgrasp.workers import spread, worth
 from sensors.statistics.holes import fill_from_background, smooth_surface
@@ -93,8 +93,12 @@ def surfaces(
     depth_m: Float[np.ndarray, "N H W"], kind: str, advance: Callable[[], None] | None = None
 ) -> Float[np.ndarray, "N H W"]:
     """Recorded depth (N, H, W) metres -> the same with holes filled and noise smoothed away, frame by frame,
-    each told by `advance`; `kind` as in `ddg.depth.surface`.
+    each told by `advance`; `kind` as in `ddg.depth.surface`. UserError for another one, or no metres.
     """
+    if kind not in SURFACES:
+        raise unknown_name("surface", kind, SURFACES)
+    if depth_m.ndim != 3 or depth_m.dtype.kind != "f":
+        raise UserError(f"Depth is {depth_m.dtype} {depth_m.shape}; expected metres (N, H, W), float32.")
     made = np.empty(depth_m.shape, np.float32)  # a list of them would take as much again
     for i, frame in enumerate(depth_m):
         if kind == PIECEWISE:

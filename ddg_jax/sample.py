@@ -24,7 +24,7 @@ from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.depth import resize_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.generator_metadata import ASPECT_TOLERANCE, FARTHEST_SANE_M
-from ddgrasp.shipped import shipped
+from ddgrasp.shipped import holding, shipped
 from learning import diffusion
 from learning.convolutions import compiler_options
 from learning.params import Params, load_params, save_params
@@ -45,7 +45,7 @@ class Generator:
 
     @classmethod
     def load(cls, directory: Path | str, sampler: str = "", steps: int = 0) -> "Generator":
-        """The generator in a finished `ddg` stage directory; UserError if there is none.
+        """The generator in a finished `ddg` stage directory, or in a run's; UserError if there is none.
 
         Args:
           sampler: instead of the one it was made with; dpm_solver takes quadratic steps then, since those of
@@ -53,7 +53,7 @@ class Generator:
           steps: the same for network evaluations per map; for sampler progressive a number to which the stage
             distilled on its way.
         """
-        directory = shipped(directory)
+        directory = holding(directory, artifacts.MANIFEST, "ddg") or shipped(directory)
         manifest = artifacts.read_manifest(directory)
         if manifest.stage != "ddg":
             raise UserError(f"{directory} holds a {manifest.stage!r} artifact; expected one of stage 'ddg'.")

@@ -186,7 +186,8 @@ def step_keys(state: TrainState) -> Key[Array, "3"]:
 def train_step(
     config: DDGConfig, state: TrainState, x_0: Float[AnyArray, "B H W C"], c: Float[AnyArray, "B H W"]
 ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-    """One optimiser step on x_0 (B, H, W, C), c (B, H, W). Pure: its noise comes from `step_keys`."""
+    """One optimiser step on x_0 (B, H, W, C), c (B, H, W). Pure: its noise comes from `step_keys`. `state` is
+    donated: its arrays are gone afterwards."""
     eps_key, step_key, prior_key = step_keys(state)
     eps = jax.random.normal(eps_key, x_0.shape)
     k = jax.random.randint(step_key, x_0.shape[:1], 0, config.diffusion.steps)

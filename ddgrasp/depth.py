@@ -17,6 +17,7 @@ from jaxtyping import Float, Float32, Int, Real, Shaped, UInt16
 
 from ddgrasp.arrays import AnyArray
 from ddgrasp.contract import DEPTH_UNIT_M, CameraProfile
+from ddgrasp.errors import UserError
 
 MAX_MM = 65535
 """The farthest depth that fits: 65.535 m."""
@@ -26,7 +27,10 @@ def to_metres(depth_mm: Int[AnyArray, "*any"]) -> Float32[AnyArray, "*any"]:
     """uint16 millimetres to float32 metres, any shape, NumPy or JAX: float32(mm) * float32(0.001).
 
     The exported graph has the same two operations (export/graph.py), so that all see the same numbers.
+    Raises UserError for what is no whole number: metres, most likely.
     """
+    if depth_mm.dtype.kind not in "iu":
+        raise UserError(f"Depth is {depth_mm.dtype}; expected whole millimetres (uint16).")
     return depth_mm.astype(np.float32) * np.float32(DEPTH_UNIT_M)
 
 
@@ -34,11 +38,13 @@ def to_millimetres(depth_m: Float[AnyArray, "*any"], xp: ModuleType = np) -> UIn
     """Floating metres to uint16 millimetres, any shape: the nearest, half a millimetre to the even one.
 
     What is no depth, or does not fit, is no reading: 0 for NaN, infinities, negative values and everything
-    that rounds to more than 65.535 m.
+    that rounds to more than 65.535 m. Raises UserError for whole numbers: millimetres, most likely.
 
     Args:
       xp: the array's own namespace, numpy or jax.numpy.
     """
+    if depth_m.dtype.kind in "iu":
+        raise UserError(f"Depth is {depth_m.dtype}; expected metres (float32).")
     return _whole(xp.round(depth_m / DEPTH_UNIT_M), xp)
 
 

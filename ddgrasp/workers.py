@@ -2,7 +2,9 @@
 
 import atexit
 import contextlib
+import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -37,7 +39,10 @@ class Worker(Protocol[_Item, _Result]):
 
 def worth(pieces: int, items: int) -> int:
     """Processes for work that has so many pieces of which each is worth a process, in so many `items`: at
-    most one a core, and 0 where there would be one alone, for which `spread` needs no other process."""
+    most one a core, and 0 where there would be one alone, for which `spread` needs no other process, or in a
+    worker of multiprocessing's, which may have none."""
+    if multiprocessing.current_process().daemon:
+        return 0
     count = min(machine.cores(), pieces, items)
     return count if count > 1 else 0
 
@@ -54,8 +59,8 @@ def spread(
     goes on.
 
     Args:
-        make: called once in every process, for what does the work there; is sent there, as items are, and
-            like them is of a module, not of the script that calls this.
+        make: called once in every process, for what does the work there; is sent there, as items are. Where
+            what it makes is of the script that runs, that needs its `if __name__ == "__main__"`.
         remedy: what needs less memory, for whoever reads that a process was killed.
 
     Raises UserError if a process was killed, and whatever `make` and the worker raise.
@@ -72,14 +77,21 @@ def spread(
         initargs=(make, os.getpid()),
     )
     waiting: set[Future] = set()
+    of_script = b"__main__" in pickle.dumps(make)
+    hidden = contextlib.nullcontext() if of_script else _script_hidden()
     try:
-        with held_back(signal.SIGINT, signal.SIGHUP), _script_hidden():  # workers leave them to this process
+        with held_back(signal.SIGINT, signal.SIGHUP), hidden:  # workers leave them to this process
             # multiprocessing's tracker, whose start would let them through, came with the executor
             waiting |= {executor.submit(_run, item) for item in items}
         for future in as_completed(waiting):
             waiting.discard(future)  # a result may be megabytes
             yield future.result()
     except BrokenProcessPool:
+        if of_script:
+            raise Trouble(
+                "workers did not start, or were killed: what they need is of the script or notebook that "
+                'runs, so put it into a module, or the script\'s work under `if __name__ == "__main__":`.'
+            ) from None
         raise Trouble(
             "a worker was killed, often for want of memory: what is finished is kept, and the same command "
             f"(with --resume where it has one) goes on; {remedy}."

@@ -34,8 +34,14 @@ class RowReader:
         """(N, ...)."""
         return self._array.shape
 
+    def __len__(self) -> int:
+        return self._array.shape[0]
+
     def read(self, index: Int[np.ndarray, " n"]) -> Shaped[np.ndarray, "n ..."]:
-        """Rows `index` (n,) in that order; UserError if a file of them is gone or cut short."""
+        """Rows `index` (n,) in that order; UserError if a file of them is gone or cut short, IndexError for a
+        row that there is none of."""
+        if len(index) and not 0 <= index.min() <= index.max() < len(self):
+            raise IndexError(f"rows {index.min()} to {index.max()} of {len(self)}")
         made = np.empty((len(index), *self._array.shape[1:]), self._array.dtype)
         for first, last in self._runs(index):
             row = int(index[first])

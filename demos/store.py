@@ -14,12 +14,16 @@ import zarr
 from numpy.typing import ArrayLike
 from zarr.codecs import BloscCodec
 
+from ddgrasp.artifacts import MANIFEST
+from ddgrasp.attempts import STARTED
 from ddgrasp.errors import UserError
 from demos.row_reader import RowReader
 
 _CODEC = BloscCodec(cname="zstd", clevel=3)
 STORE = "episodes.zarr"
 """In the folder of stage `demos`."""
+_INSIDE = (STORE, f"demos/{STORE}")
+"""Where one lies in a stage's folder, and in a run's."""
 _ENDS = "episode_ends"
 _IMAGE_CHUNK = 16
 _ROW_CHUNK = 4096
@@ -39,9 +43,11 @@ class EpisodeStore:
 
     def __init__(self, path: Path | str, *, create: bool = False, compressed: bool = True):
         path = Path(path)
-        self._codecs, self._is_whole = [_CODEC] if compressed else None, False
+        self._codecs, self._is_whole, self._may_append = [_CODEC] if compressed else None, False, create
         if not create and not (path / "zarr.json").exists():
-            raise UserError(f"{path} is no episode store: collect one with `ddgrasp demos collect`.")
+            inside = next((path / name for name in _INSIDE if (path / name / "zarr.json").exists()), None)
+            remedy = f"open {inside}" if inside else "collect one with `ddgrasp demos collect`"
+            raise UserError(f"{path} is no episode store: {remedy}.")
         try:
             self._root = zarr.open_group(str(path), mode="a" if create else "r")
             self._data = self._root.require_group("data") if create else _group(self._root, "data")
@@ -80,12 +86,18 @@ class EpisodeStore:
             return tuple(sorted(self._data.array_keys()))
 
     def steps(self, field: str, first: int = 0, last: int | None = None) -> np.ndarray:
-        """Per-step array of the complete episodes, or rows first..last of it."""
+        """Per-step array of the complete episodes, or rows first..last of it, from 0 on.
+
+        Raises UserError for a field that the store lacks, or if it is damaged.
+        """
         count = _count(self.ends)
+        if first < 0 or (last is not None and last < first):
+            end = "the end" if last is None else last
+            raise UserError(f"{self.path}: no rows {first} to {end}; expected 0 to {count}.")
         return self._read("data", field, first, count if last is None else min(last, count))
 
     def episodes(self, field: str) -> np.ndarray:
-        """Per-episode array."""
+        """Per-episode array. Raises UserError for a field that the store lacks, or if it is damaged."""
         return self._read("meta", field, 0, len(self))
 
     def reader(self, field: str) -> RowReader:
@@ -108,16 +120,34 @@ class EpisodeStore:
         """UserError for what Zarr raises of damaged files."""
         try:
             yield
+        except KeyError:
+            group, _, field = what.partition("/")
+            there = ", ".join(self._names(group)) or "nothing"
+            raise UserError(
+                f"{self.path} has no {field or group}: it has {there}. If it had, its files are gone: delete "
+                f"{self._made_as()} and make it again."
+            ) from None
         except _DAMAGED as error:
             raise UserError(
-                f"{self.path}: {what} cannot be read ({error}). Delete {self.path.parent} and make it again."
+                f"{self.path}: {what} cannot be read ({error}). Delete {self._made_as()} and make it again."
             ) from None
+
+    def _names(self, group: str) -> list[str]:
+        try:
+            return sorted(_group(self._root, group).array_keys())
+        except _DAMAGED:
+            return []
+
+    def _made_as(self) -> Path:
+        """What is made again as a whole: the stage that the store is of, or the store itself."""
+        stage = self.path.parent
+        return stage if any((stage / name).exists() for name in (MANIFEST, STARTED)) else self.path
 
     def append(self, steps: Mapping[str, np.ndarray], episode: Mapping[str, ArrayLike]) -> None:
         """Adds one episode: arrays (T, ...) per step and (...) per episode.
 
-        Raises UserError, and leaves what is there, for steps of other fields, sizes or types than it has, and
-        where the file that they go into is damaged.
+        Raises UserError, and leaves what is there, for steps of other fields, sizes or types than it has, for
+        arrays of several lengths, and where the file that they go into is damaged.
         """
         self._check(steps)
         ends = self.ends
@@ -135,6 +165,11 @@ class EpisodeStore:
         _put(self._meta, _ENDS, len(ends), np.array([start + length], np.int64))
 
     def _check(self, steps: Mapping[str, np.ndarray]) -> None:
+        if not self._may_append:
+            raise UserError(f"{self.path} was opened to be read: open it with create=True to add to it.")
+        lengths = {name: len(rows) for name, rows in steps.items()}
+        if len(set(lengths.values())) != 1:
+            raise UserError(f"{self.path}: an episode's arrays are of one length, these are of {lengths}.")
         if len(self) and steps.keys() != set(self.fields):
             raise UserError(f"{self.path} has {', '.join(self.fields)}, not {', '.join(sorted(steps))}.")
         for name, rows in steps.items():

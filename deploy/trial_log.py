@@ -69,6 +69,13 @@ def _as_had(header: dict[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
     return header | {CONFIG_HASH: had if had in hashes else hashes[0]}
 
 
+def load(path: Path | str) -> tuple[dict[str, Any], list[TrialResult]]:
+    """`read_log` of a log that is to be there; UserError without one."""
+    if not Path(path).is_file():
+        raise UserError(f"{path} is no log of trials: name a trials.jsonl, of `ddgrasp deploy trials`.")
+    return read_log(Path(path))
+
+
 def read_own(path: Path, header: dict[str, Any]) -> list[TrialResult]:
     """The finished trials in a log. Raises UserError, which says what differs, if they belong to something
     else than `header` says."""

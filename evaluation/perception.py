@@ -53,9 +53,8 @@ def measure(
 
     Raises UserError where the run has no exported policy, or that of an earlier student.
     """
-    from learning.params import load_params
     from student_jax.act import perceive
-    from student_jax.policy import PARAMS_FILE
+    from student_jax.policy import load
 
     exported, student = (artifacts.read_artifact(run_dir / name) for name in ("export", "student"))
     if exported.manifest.parents.get("student", student.hash) != student.hash:
@@ -65,7 +64,7 @@ def measure(
     policy = exported.directory / POLICY_FILE
     config = series.configured(config, policy)
     rig = Rig(config, policy, change)
-    params = load_params(run_dir / "student" / PARAMS_FILE)
+    _, params = load(run_dir)
     outcomes, parts = [], []
     plan = series.plan()
     with progress.task("perception", len(plan)) as task:

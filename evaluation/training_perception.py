@@ -25,16 +25,15 @@ def measure(config: Config, run_dir: Path, trials: int, progress: Progress) -> l
     Raises UserError where the run has no demonstrations, or they lack what the student's depth source needs.
     """
     from demos.store import STORE, EpisodeStore
-    from learning.params import load_params
     from mjx_envs.randomize import ObjectTable
     from student_jax.depth_source import check_demos, make_source
     from student_jax.frames_io import demos_with_errors
-    from student_jax.policy import PARAMS_FILE
+    from student_jax.policy import load
 
     demos = EpisodeStore(artifacts.read_artifact(run_dir / "demos").directory / STORE)
     source = make_source(config, run_dir / "ddg")
     check_demos(source, demos)
-    params = load_params(run_dir / "student" / PARAMS_FILE)
+    _, params = load(run_dir)
     table, variants = ObjectTable(config.world.objects), demos.episodes("variant")
     chosen = _first_of_each(demos.episodes("object_index"), trials)
     parts = []

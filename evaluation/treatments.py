@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from jaxtyping import UInt8
 
 from ddgrasp.config import Config, DDGConfig
 from ddgrasp.depth import to_metres, to_millimetres
+from ddgrasp.errors import unknown_name
 from deploy.interfaces import Depth
 from deploy.treatment import Inpaint, Treatment
 
@@ -44,7 +45,10 @@ class Monocular:
 
 
 def make_treatment(name: TreatmentName, config: Config) -> Treatment | None:
-    """The treatment of that name, None for depth as recorded. UserError if its weights are missing."""
+    """The treatment of that name, None for depth as recorded. UserError if its weights are missing, or for
+    another name."""
+    if name not in get_args(TreatmentName):
+        raise unknown_name("treatment of depth", name, get_args(TreatmentName))
     if name == RECORDED:
         return None
     if name == "inpaint":

@@ -10,7 +10,7 @@ from ddgrasp.files import atomic_write_bytes
 from ddgrasp.policy_metadata import POLICY_FILE
 from ddgrasp.progress import Progress
 from ddgrasp.shipped import PRETRAINED
-from export.stage import export_policy, load_student, measure
+from export.stage import export_policy, measure
 
 
 def write(student: Path = PRETRAINED / "student") -> Path:
@@ -18,10 +18,10 @@ def write(student: Path = PRETRAINED / "student") -> Path:
 
     UserError if there is none, or the file does not do what the student does.
     """
-    artifact = artifacts.read_artifact(student)
-    config = artifacts.config_from_json(artifact.manifest.config)
-    params = load_student(student)
-    model = export_policy(config, params, artifact.hash)
+    from student_jax.policy import load
+
+    config, params = load(student)
+    model = export_policy(config, params, artifacts.read_artifact(student).hash)
     measure(config, params, model, None, Progress(name="export"))
     atomic_write_bytes(student / POLICY_FILE, model)
     return student / POLICY_FILE

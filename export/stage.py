@@ -28,22 +28,16 @@ def run(job: Job) -> Artifact:
         UserError: no finished student, or ONNX and JAX disagree by more than config.export.max_abs_diff
             (the file is then not written).
     """
+    from student_jax.policy import load
+
     config, student = job.config, job.parents["student"]
-    params = load_student(student.directory)
+    _, params = load(student.directory)
     model = export_policy(config, params, student.hash)
     job.progress.note(f"{POLICY_FILE}: {len(model) / 1e6:.1f} MB")
     frames = demo_frames(student.directory.parent / "demos", config)
     metrics = measure(config, params, model, frames, job.progress)
     atomic_write_bytes(job.directory / POLICY_FILE, model)
     return job.finish(metrics)
-
-
-def load_student(directory: Path) -> dict:
-    """The student's parameters: nested dicts of NumPy arrays."""
-    from learning.params import load_params
-    from student_jax.policy import PARAMS_FILE
-
-    return load_params(directory / PARAMS_FILE)
 
 
 def export_policy(config: Config, params: dict, student_manifest_hash: str = "") -> bytes:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt16
 from ddgrasp import contract
 from ddgrasp.arrays import AnyArray
 from ddgrasp.config import StudentConfig
+from ddgrasp.errors import UserError
 from ddgrasp.layout import ACTION, OBSERVATION, STATE, closes
 from student_jax.policy import Aux, position_from_world
 
@@ -183,9 +184,15 @@ def make_frames(
 ) -> Frames:
     """Frames of whole episodes; each argument has one array (T, ...) per episode.
 
-    `depth_mm` is empty for episodes without pictures.
+    `depth_mm` is empty for episodes without pictures. Raises UserError for depth that is no uint16, or arrays
+    of one episode that differ in length.
     """
     lengths = [len(s) for s in states]
+    for given in (*([depth_mm] if len(depth_mm) else []), actions, observations, held):
+        if [len(episode) for episode in given] != lengths:
+            raise UserError(f"episodes have {lengths} states and {[len(e) for e in given]} other rows")
+    if other := {str(depth.dtype) for depth in depth_mm} - {"uint16"}:
+        raise UserError(f"Depth is {min(other)}; expected millimetres (uint16).")
     return Frames(
         depth_mm=DepthInMemory(np.concatenate(depth_mm)) if len(depth_mm) else None,
         state=np.concatenate([with_change(episode) for episode in states]).astype(np.float32),

@@ -6,10 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt16
 
 from ddg_jax.generate import Clip
 from ddgrasp.config import Config
+from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
 from demos.rollout import Episodes
 from demos.spool import Spool
@@ -55,6 +56,7 @@ def add_noisy_demos(
         views = _views(demos, chosen[i], rows) if source.needs_views else None
         return Clip(int(chosen[i]), demos.steps("depth_mm", *rows), rgb, views)
 
+    size_px = demos.reader("depth_mm").shape[1:]
     done = int(np.sum(~keep_clean[: len(frames)]))
     noisy = source.episodes([len(pictured[i]) for i in chosen], read, done)
     with progress.task("artefacts on the demos", len(demos)) as task:
@@ -64,12 +66,26 @@ def add_noisy_demos(
             steps = {name: demos.steps(name, *rows) for name in _COLUMNS}
             number = np.arange(pictured[i].start, pictured[i].start + rows[1] - rows[0])
             steps[_DRAWN] = (number >= stretches[i].start) & (number < stretches[i].stop)
-            depth = demos.steps("depth_mm", *rows_of(i)) if keep_clean[i] else next(noisy)
+            if keep_clean[i]:
+                depth = demos.steps("depth_mm", *rows_of(i))
+            else:
+                depth = checked(next(noisy), (len(pictured[i]), *size_px))
             depth = depth if window is None else window.cut(depth)
             unseen = np.zeros((len(number) - len(depth), *depth.shape[1:]), depth.dtype)
             steps["depth_mm"] = np.concatenate([depth, unseen])
             frames.append(steps, {"from_demo": np.bool_(True)})
             task.advance()
+
+
+def checked(noisy_mm: UInt16[np.ndarray, "T H W"], shape: tuple[int, ...]) -> UInt16[np.ndarray, "T H W"]:
+    """What a depth source gave for frames of that shape. Raises UserError unless it is as many, as large, and
+    in uint16 millimetres: a source may be somebody's own."""
+    if noisy_mm.dtype != np.uint16 or noisy_mm.shape != shape:
+        raise UserError(
+            f"The depth source gave {noisy_mm.dtype} {noisy_mm.shape} for uint16 {shape}: expected as many "
+            "frames, as large, in millimetres."
+        )
+    return noisy_mm
 
 
 def _views(demos: EpisodeStore, number: int, rows: tuple[int, int]) -> Views:

@@ -9,6 +9,7 @@
 """
 
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple, TypeVar, cast
 
 import jax
@@ -17,12 +18,15 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Float, Int, Key
 
-from ddgrasp import contract
+from ddgrasp import artifacts, contract
 from ddgrasp.arrays import AnyArray
-from ddgrasp.config import StudentConfig
+from ddgrasp.config import Config, StudentConfig
 from ddgrasp.contract import CameraProfile
+from ddgrasp.errors import UserError
 from ddgrasp.layout import POLICY_STATE, Layout
+from ddgrasp.shipped import holding
 from learning import diffusion
+from learning.params import load_params
 from mjx_envs import kinematics
 from student_jax.denoiser import Denoiser, StateStream, normalise_state
 from student_jax.encoder import POSITION_CENTER_M, POSITION_SCALE_M, DepthEncoder
@@ -63,6 +67,17 @@ class Seen(NamedTuple):
     features: Float[Numbers, "B F"]
     """The encoder's vector."""
     aux: Aux
+
+
+def load(directory: Path | str) -> tuple[Config, dict]:
+    """(configuration, parameters) of the student in a stage's folder, a run's or `pretrained/student`.
+
+    The parameters are nested dicts of NumPy arrays. Raises UserError if there is none.
+    """
+    folder = holding(directory, artifacts.MANIFEST, "student")
+    if folder is None or (manifest := artifacts.read_manifest(folder)).stage != "student":
+        raise UserError(f"{directory} holds no finished student: train one with `ddgrasp student train`.")
+    return artifacts.config_from_json(manifest.config), load_params(folder / PARAMS_FILE)
 
 
 def position_from_world(position_m: Positions) -> Positions:

@@ -170,7 +170,11 @@ def prepare_depth(
         (B, h, w, 3 * channels) float32, channels of the oldest frame first. relief is in
         [RELIEF_MIN, RELIEF_MAX] and 0 where invalid; valid is 0 or 1; depth is in metres, 0 where invalid.
         With `fill_holes` all of a frame is valid, unless none of it is.
+
+    Raises UserError for frames of another size, or of whole numbers: millimetres, most likely.
     """
+    if depth_m.dtype.kind in "iu":
+        raise UserError(f"Depth is {depth_m.dtype}; expected metres (float32).")
     window = plan_window(profile, config)
     expected = (contract.DEPTH_FRAMES, profile.height_px, profile.width_px)
     seen = (contract.DEPTH_FRAMES, window.rows.length, window.columns.length)

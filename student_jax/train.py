@@ -161,7 +161,8 @@ def aux_losses(seen: Aux, target: Aux) -> dict[str, Float[Array, ""]]:
 def train_step(
     config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, frozen: dict, batch: Batch
 ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-    """One optimiser step on pictures. Pure: noise comes from `step_key`."""
+    """One optimiser step on pictures. Pure: noise comes from `step_key`. `state` is donated: its arrays are
+    gone afterwards."""
     policy = StudentPolicy(config, profile)
     key, k_noise, k_unseen = jax.random.split(step_key(state), 3)
     depth_m, first_px = _seen_part(config, profile, batch.depth_mm, batch.crop_rc)
@@ -213,7 +214,7 @@ def head_step(
     config: StudentConfig, profile: CameraProfile, steps: int, state: TrainState, seen: Seen,
     joints: Float[Array, "B 9"], action: Float[Array, "B chunk 8"],
 ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:  # fmt: skip
-    """One optimiser step on the head's parameters alone; `state.params` is `head_of` all."""
+    """One optimiser step on the head alone; `state.params` is `head_of` all. `state` is donated."""
     key = step_key(state)
     policy = StudentPolicy(config, profile)
 

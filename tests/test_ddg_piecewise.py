@@ -63,3 +63,8 @@ def test_prior_and_surface_of_the_generator_take_it(scene):
     assert np.median(np.abs(c - made.from_sim(inverse_depth(truth[None]), None))) < 2 * 0.25 * NOISE_PER_M
     with pytest.raises(UserError, match="Unknown ddg.depth.surface 'piecewice'. Did you mean 'piecewise'"):
         make_prior(DDGConfig(depth=DDGDepthConfig(surface="piecewice")))
+
+
+def test_another_name_of_a_surface_is_refused():
+    with pytest.raises(UserError, match="Unknown surface 'plane'. Did you mean 'planes'"):
+        surfaces(np.ones((1, 8, 8), np.float32), "plane")

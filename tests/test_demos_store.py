@@ -222,3 +222,56 @@ def test_a_full_disk_and_a_lack_of_rights_are_not_called_damage(tmp_path, monkey
     monkeypatch.setattr("demos.store.zarr.open_group", failing)
     with pytest.raises(OSError, match=os.strerror(number)):
         EpisodeStore(tmp_path / "s.zarr")
+
+
+def test_arrays_of_several_lengths_are_refused_and_spoil_nothing(tmp_path):
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    steps, about = episode(3, 7)
+    with pytest.raises(UserError, match=r"of one length, these are of \{'depth_mm': 3, 'action': 2\}"):
+        store.append(steps | {"action": steps["action"][:2]}, about)
+    store.append(steps, about)
+    assert store.steps("action").shape == (3, 8)
+
+
+def test_a_mistyped_field_is_named_and_nothing_of_the_user_s_is_to_be_deleted(tmp_path):
+    store = EpisodeStore(tmp_path / "s.zarr", create=True)
+    store.append(*episode(3, 7))
+    for read in (store.steps, store.reader):
+        with pytest.raises(
+            UserError, match=r"has no depth: it has action, depth_mm\. .*delete \S+/s\.zarr and"
+        ):
+            read("depth")
+    with pytest.raises(UserError, match=r"has no object: it has episode_ends, object_index"):
+        store.episodes("object")
+    (tmp_path / "manifest.json").touch()  # a stage, which is made again as a whole
+    with pytest.raises(UserError, match=rf"delete {tmp_path} and make it again"):
+        store.steps("depth")
+
+
+def test_rows_that_there_are_none_of_are_refused(tmp_path):
+    for compressed in (True, False):
+        path = tmp_path / f"{compressed}.zarr"
+        store = EpisodeStore(path, create=True, compressed=compressed)
+        store.append(*episode(3, 7))
+        reader = store.reader("depth_mm")
+        assert len(reader) == 3 and reader.read(np.array([2, 0])).shape == (2, 6, 8)
+        for rows in ([3], [2, 3], [-1]):
+            with pytest.raises(IndexError, match="of 3"):
+                reader.read(np.array(rows))
+    with pytest.raises(UserError, match="no rows -5 to the end; expected 0 to 3"):
+        store.steps("action", -5)
+
+
+def test_a_store_that_is_read_is_not_added_to(tmp_path):
+    EpisodeStore(tmp_path / "s.zarr", create=True).append(*episode(3, 7))
+    with pytest.raises(UserError, match="create=True"):
+        EpisodeStore(tmp_path / "s.zarr").append(*episode(3, 7))
+
+
+def test_the_folder_of_a_stage_or_a_run_says_where_its_store_is(tmp_path):
+    EpisodeStore(tmp_path / "demos" / "episodes.zarr", create=True)
+    for folder in (tmp_path, tmp_path / "demos"):
+        with pytest.raises(
+            UserError, match=f"{folder} is no episode store: open {tmp_path}/demos/episodes.zarr"
+        ):
+            EpisodeStore(folder)

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from ddgrasp.errors import UserError
+from ddgrasp.presets import PRESETS
 from deploy.interfaces import Camera, Frame
 from deploy.treatment import Inpaint, TreatedCamera, treated
+from evaluation.treatments import make_treatment
 from rig.fr3.channel import Channel
 from sensors.inpainting import inpainted
 
@@ -124,3 +126,8 @@ def test_colour_comes_with_the_frame_or_is_asked_for():
     assert red.calls == 2
     with pytest.raises(UserError, match="AddRed needs a camera with colour"):
         TreatedCamera(Still(frame(plane())), AddRed())
+
+
+def test_another_name_is_no_network_on_colour():
+    with pytest.raises(UserError, match="Unknown treatment of depth 'inpain'. Did you mean 'inpaint'"):
+        make_treatment("inpain", PRESETS["debug"])

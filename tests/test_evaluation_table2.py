@@ -101,6 +101,8 @@ def test_rows_differ_in_the_student_s_section_alone_so_that_they_share_what_come
     assert all(len(hashes) == 1 for hashes in by_student.values())
     assert len(set().union(*by_student.values())) == len(by_student) == len(ROWS) - 1
     assert ROWS["inpaint"].student == ROWS["sim_gt"].student
+    farther = replace(ROWS["rand_noise_normal"], dextrah_normal_m=0.02)
+    assert farther.student != ROWS["rand_noise_normal"].student
 
 
 def test_rows_with_holes_cut_by_hand_differ_in_them_alone():

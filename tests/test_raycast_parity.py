@@ -218,3 +218,9 @@ def test_a_type_that_cannot_be_drawn_is_named() -> None:
     )
     with pytest.raises(UserError, match="'egg'.*mjGEOM_ELLIPSOID"):
         visible_geoms(model)
+
+
+def test_poses_of_bodies_are_refused() -> None:
+    model, data = _every_type(0)
+    with pytest.raises(UserError, match=f"{model.nbody} poses; expected those of {model.ngeom} geoms"):
+        raycast.Geoms.of_model(model, data.xpos, data.xmat)

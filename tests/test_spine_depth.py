@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ddgrasp import depth
+from ddgrasp.errors import UserError
 
 NAN, INF = np.nan, np.inf
 
@@ -122,3 +123,11 @@ def test_shrinking_what_was_enlarged_gives_it_back():
         np.testing.assert_array_equal(
             depth.resize_nearest(depth.resize_nearest(frames, larger), size), frames
         )
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_depth_in_the_other_unit_is_refused(xp):
+    with pytest.raises(UserError, match=r"float32; expected whole millimetres"):
+        depth.to_metres(xp.full((2, 2), 0.9, xp.float32))
+    with pytest.raises(UserError, match=r"uint16; expected metres"):
+        depth.to_millimetres(xp.full((2, 2), 900, xp.uint16), xp)

@@ -152,3 +152,8 @@ def test_wrong_frames_and_channels_are_refused_by_name():
         preprocess.prepare_depth(jnp.zeros((1, 3, 90, 160)), None, PROFILE, CONFIG)
     with pytest.raises(UserError, match="Did you mean 'relief'"):
         replace(CONFIG.picture, channels=("releif",))
+
+
+def test_millimetres_are_refused():
+    with pytest.raises(UserError, match="uint16; expected metres"):
+        preprocess.prepare_depth(frames_of(TABLE).astype(np.uint16), None, PROFILE, CONFIG)

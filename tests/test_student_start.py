@@ -11,11 +11,12 @@ from ddgrasp import artifacts
 from ddgrasp.config import Config, EncoderConfig, HandViewConfig, HeadConfig, StudentConfig
 from ddgrasp.errors import UserError
 from ddgrasp.progress import Progress
+from ddgrasp.shipped import PRETRAINED
 from learning.params import save_params
 from student_jax import dagger, start
 from student_jax.dagger import Trainer
 from student_jax.depth_source import make_source
-from student_jax.policy import PARAMS_FILE, init_params, param_shapes
+from student_jax.policy import PARAMS_FILE, init_params, load, param_shapes
 from teacher_support import still_teacher
 
 STUDENT = StudentConfig(
@@ -113,3 +114,16 @@ def test_a_start_whose_numbers_mean_something_else_is_refused(finished, section,
     other = replace(finished, **{section: replace(getattr(finished, section), **{name: here})})
     with pytest.raises(UserError, match=rf"student\.{section}\.{name} .*, this configuration .*: use"):
         start._check_meaning(other)
+
+
+@pytest.mark.parametrize("name", ["pretrained", "pretrained/student", PRETRAINED / "student"])
+def test_a_student_is_loaded_with_its_configuration(name):
+    config, params = load(name)
+    shapes = param_shapes(config.student, config.world.profile)
+    assert jax.tree.map(np.shape, params) == jax.tree.map(lambda leaf: leaf.shape, shapes)
+
+
+def test_what_is_no_student_is_not_loaded(tmp_path):
+    for name in (tmp_path, "pretrained/ddg"):
+        with pytest.raises(UserError, match="holds no finished student"):
+            load(name)

@@ -241,3 +241,18 @@ def test_what_the_student_cannot_see_is_not_kept_and_changes_nothing(tmp_path):
         ends.append(jax.tree.leaves(state.params))
     for a, b in zip(*ends, strict=True):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+def test_frames_in_metres_and_rows_that_do_not_fit_are_refused():
+    depth, state, action, *others = columns(4, 0).values()
+    others = [[rows] for rows in others]
+    with pytest.raises(UserError, match=r"Depth is float32; expected millimetres \(uint16\)"):
+        make_frames([depth / np.float32(1000)], [state], [action], *others)
+    with pytest.raises(UserError, match=r"\[4\] states and \[3\] other rows"):
+        make_frames([depth], [state], [action[:3]], *others)
+
+
+@pytest.mark.parametrize("made", [np.zeros((4, 6, 8), np.float32), np.zeros((3, 6, 8), np.uint16)])
+def test_what_a_depth_source_of_one_s_own_gives_is_looked_at(made):
+    with pytest.raises(UserError, match=r"The depth source gave \S+ \(\d, 6, 8\) for uint16 \(4, 6, 8\)"):
+        frames_io.checked(made, (4, 6, 8))

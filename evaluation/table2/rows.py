@@ -61,10 +61,15 @@ class Row:
             "ripple" * self.ripple,
             "filled" * self.filled,
             f"x{self.dextrah_scale:g}" * (self.dextrah_scale != 1),
-            "normal" * (self.dextrah_normal_m != 0),
+            _normal(self.dextrah_normal_m),
             "ellipses" * self.ellipses,
         )
         return "_".join(part for part in parts if part)
+
+
+def _normal(metres: float) -> str:
+    """The one of `rand_noise_normal` without its number."""
+    return "normal" * (metres != 0) + f"{metres:g}" * (metres not in (0.0, 0.01))
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ class PickEnv(gymnasium.Env):
         self, world: WorldConfig | None = None, observation: str = "state", render_mode: str | None = None
     ):
         check_render_mode(render_mode)
-        self._simulator = simulator(world or WorldConfig())
+        self._simulator = simulator(world)
         self.observation_space, self._kind = self._simulator.space(observation), observation
         self.action_space = action_space()
         self.render_mode = render_mode

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8, UInt32
 from mujoco_playground import State
 
 from ddgrasp.config import WorldConfig
-from ddgrasp.errors import unknown_name
+from ddgrasp.errors import UserError, unknown_name
 from ddgrasp.layout import OBSERVATION
 from mjx_envs import randomize, rewards
 from mjx_envs.camera import nominal_camera
@@ -129,9 +129,16 @@ class Simulator:
         return jax.jit(make_renderer(self.env.config.renderer, camera, depth_only=True, far_m=FAR_M))
 
 
+def simulator(world: WorldConfig | None) -> Simulator:
+    """The simulator of `world`, by default `WorldConfig()`: environments of one configuration share what is
+    compiled. UserError for what is none."""
+    if not isinstance(world, WorldConfig | None):
+        raise UserError(f"world is a {type(world).__name__}; expected a ddgrasp.config.WorldConfig.")
+    return _simulator(world or WorldConfig())
+
+
 @lru_cache(maxsize=8)
-def simulator(world: WorldConfig) -> Simulator:
-    """The simulator of `world`: environments of one configuration share what is compiled."""
+def _simulator(world: WorldConfig) -> Simulator:
     return Simulator(world)
 
 

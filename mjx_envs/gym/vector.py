@@ -48,7 +48,7 @@ class PickVectorEnv(VectorEnv):
         if num_envs < 1:
             raise UserError(f"num_envs is {num_envs}; expected 1 or more.")
         check_render_mode(render_mode)
-        self._simulator = simulator(world or WorldConfig())
+        self._simulator = simulator(world)
         self._mode = AutoresetMode(autoreset_mode)
         self.metadata = PickEnv.metadata | {"autoreset_mode": self._mode}
         self.num_envs, self.render_mode = num_envs, render_mode

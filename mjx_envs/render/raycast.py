@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from ddgrasp.errors import UserError
 from mjx_envs.camera import Buffers, Camera
 from mjx_envs.render import ray_geometry
 from mjx_envs.render.ray_geometry import Vector, vector
@@ -57,7 +58,12 @@ class Geoms:
 
     @classmethod
     def of_model(cls, model: mujoco.MjModel, pos_w: Any, rot_w: Any) -> "Geoms":
-        """The model's visible geoms; poses are those of all geoms, as in `data.geom_xpos`, `geom_xmat`."""
+        """The model's visible geoms; poses are those of all geoms, as in `data.geom_xpos`, `geom_xmat`.
+
+        Raises UserError for another number of them, as that of bodies.
+        """
+        if len(pos_w) != model.ngeom:
+            raise UserError(f"There are {len(pos_w)} poses; expected those of {model.ngeom} geoms.")
         table = visible_geoms(model)
         ids = tuple(int(i) for i in table.ids)
         return cls(
