@@ -1,8 +1,10 @@
 """An exported file on the robot side: checks at loading, frame buffer, chunks, noise."""
 
 import os
+import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,12 @@ import pytest
 from onnx import TensorProto, helper
 
 from ddgrasp import contract
+from ddgrasp.contract import D455_STREAM, FR3, PANDA
+from ddgrasp.depth import at_profile
 from ddgrasp.errors import UserError
 from deploy.policy import OnnxPolicy
 from deploy_support import HOME_RAD, SHAPE, constant_bias, depth_mm, describe, write_policy
-from tutorial_support import code
+from tutorial_support import TUTORIALS, code
 
 STATE = np.zeros(8, np.float32)
 
@@ -254,31 +258,47 @@ def test_what_cannot_be_used_is_refused_and_the_next_frame_goes_on(tmp_path):
 
 
 def test_the_page_s_first_lines_run(monkeypatch):
-    (lines,) = (block for block in code("../data.md") if "target_rad = state" in block)
+    first, known, *_ = code("../onnx.md")
     monkeypatch.chdir(Path(__file__).parents[1])
     made: dict = {}
-    exec(lines, made)
+    exec(first, made)
+    assert made["start_rad"] == list(HOME_RAD)
     info = OnnxPolicy("pretrained/student/policy.onnx").info
     assert (info.execute_steps, info.action_scale_rad) == (1, 0.1)
     assert (round(info.camera["fx"], 1), info.camera["position"]) == (168.6, [0.94, 0.0, 0.56])
     assert np.isfinite(made["target_rad"]).all() and made["action"].shape == (1, info.chunk, 8)
+    exec(known, made)
+    np.testing.assert_allclose(made["action"][0, 0], made["expected"], atol=5e-4)
 
 
-def test_the_page_s_lines_do_what_the_policy_class_does(tmp_path, monkeypatch):
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    """The page's own lines, and the class that the loop calls, on one file."""
     rng = np.random.default_rng(0)
     gain, state_gain = rng.normal(0, 1e-3, (3, 4, 8)), rng.normal(0, 1, (9, 4, 8))
     info = describe(execute_steps=2, closing_steps=3)
     path = write_policy(tmp_path / "policy.onnx", info, depth_gain=gain, state_gain=state_gain)
     monkeypatch.chdir(tmp_path)
-    (lines,) = (block for block in code("../data.md") if "def act" in block)
-    page: dict = {}
-    exec(lines, page)
-    policy, closed, depth = OnnxPolicy(path), [], depth_mm()
-    for _ in range(12):
+    made: dict = {}
+    for lines in (block for block in code("../onnx.md") if "\ndef " in block or block.startswith("def ")):
+        exec(lines, made)
+    return made, OnnxPolicy(path)
+
+
+def test_the_page_s_lines_do_what_the_policy_class_does(page):
+    rng, (lines, policy) = np.random.default_rng(1), page
+    info, closed, depth = policy.info, [], depth_mm()
+    for step in range(20):
         depth[:], width_m = rng.integers(400, 900), float(rng.uniform(0, 0.08))  # a camera's own buffer
         q_rad = HOME_RAD + rng.normal(0, 0.1, 7)
-        action = policy.act(depth, np.append(q_rad, width_m).astype(np.float32))
-        target_rad, close = page["act"](depth, q_rad, width_m)
+        state = np.append(q_rad, width_m).astype(np.float32)
+        if step % 7 == 5:  # something is over the lens
+            policy.forget()
+            policy.wait(state)
+            assert lines["act"](np.zeros_like(depth), q_rad, width_m) is None
+            continue
+        action = policy.act(depth, state)
+        target_rad, close = lines["act"](depth, q_rad, width_m)
         wanted = q_rad + info.action_scale_rad * np.clip(action[:7], -1, 1)
         np.testing.assert_allclose(
             target_rad, np.clip(wanted, info.joint_lower_rad, info.joint_upper_rad), atol=1e-6
@@ -286,6 +306,33 @@ def test_the_page_s_lines_do_what_the_policy_class_does(tmp_path, monkeypatch):
         assert close == (action[7] > 0)
         closed.append(close)
     assert True in closed and False in closed
+    for broken in ((np.full(7, np.nan), 0.08), (HOME_RAD, np.nan)):
+        assert lines["act"](depth, *broken) is None
+
+
+def test_the_page_s_picture_is_the_driver_s(page):
+    lines, policy = page
+    had, wanted = D455_STREAM, policy.info.profile
+    assert (wanted.height_px, wanted.width_px) == depth_mm().shape
+    counts = np.random.default_rng(0).integers(0, 2000, (had.height_px, had.width_px)).astype(np.uint16)
+    for cx_px in (had.cx_px, had.cx_px + 150.0):  # the second sees less than all of it
+        stream = replace(had, cx_px=cx_px)
+        taken = lines["at_policy"](counts, stream.fx_px, stream.fy_px, stream.cx_px, stream.cy_px)
+        np.testing.assert_array_equal(taken, at_profile(counts, stream, wanted))
+
+
+def test_the_page_s_limits_are_within_both_arms():
+    (line,) = (
+        line
+        for line in (TUTORIALS / "../onnx.md").read_text().splitlines()
+        if "An FR3's are narrower" in line
+    )
+    low, high = (
+        np.array([getattr(arm, name) for arm in (PANDA, FR3)])
+        for name in ("joint_lower_rad", "joint_upper_rad")
+    )
+    told = np.array(re.findall(r"(-?\d\.\d+) to (-?\d\.\d+)", line), float)
+    np.testing.assert_allclose(told, np.stack([low.max(0), high.min(0)], axis=1))
 
 
 @pytest.mark.parametrize(
