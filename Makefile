@@ -22,7 +22,7 @@ DOCS := .venv-docs
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*##' '{printf "%-20s%s\n", $$1, $$2}'
 
 setup: $(STAMP)  ## create .venv and install the locked dependencies
 

@@ -184,7 +184,8 @@ def _open_gl(error: BaseException) -> str | None:
     """One line if MuJoCo, as it is imported, cannot draw by what the environment names."""
     asked = os.environ.get("MUJOCO_GL")
     if asked and "invalid value for environment variable MUJOCO_GL" in str(error):
-        return f"MUJOCO_GL is {asked!r}, which MuJoCo does not know: unset it, or set it to egl or osmesa."
+        others = ", or set it to egl or osmesa" if sys.platform == "linux" else ""
+        return f"MUJOCO_GL is {asked!r}, which MuJoCo does not know here: unset it{others}."
     if asked and isinstance(error, AttributeError) and getattr(error, "name", "") in _OPEN_GL:
         return f"MUJOCO_GL is {asked!r}, whose library is not here (Debian: libegl1, libosmesa6): unset it."
     return None

@@ -1,6 +1,7 @@
 """How what an installation lacks is installed: the command, for the Python that runs this."""
 
 import os
+import platform
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -15,7 +16,10 @@ FR3 = ("franky_sim", "franky", "trimesh")
 
 def check_fr3(what: str, needed: Sequence[str] = FR3) -> None:
     """UserError unless all that `what`, the FR3 rig or a part of it, takes is installed."""
-    if missing := lacks_fr3(needed):
+    missing = lacks_fr3(needed)
+    if missing and (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        raise UserError(f"{what} needs x86-64 Linux: take the development rig (--rig development).")
+    if missing:
         raise UserError(f"{what} needs {' and '.join(missing)}: {pip_install('fr3')}.")
 
 

@@ -4,6 +4,7 @@ import contextlib
 import math
 import os
 import platform
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,7 +69,10 @@ def _processor() -> str:
     except OSError:
         lines = []
     names = [line.split(":", 1)[1].strip() for line in lines if "model name" in line]
-    return names[0] if names else platform.processor() or platform.machine()
+    if sys.platform == "darwin":  # where platform says "arm"
+        command = ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"]
+        names = [subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()]
+    return next(filter(None, names), "") or platform.processor() or platform.machine()
 
 
 def _accelerators() -> list[str]:

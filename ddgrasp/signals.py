@@ -10,7 +10,8 @@ from collections.abc import Iterator
 def ending() -> list[signal.Signals]:
     """Those that end what runs: Ctrl-C, SIGTERM, and the end of the terminal, but for what runs under nohup
     and goes on without it."""
-    hangs_up = signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+    hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
+    hangs_up = hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN
     return [signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hangs_up else [])]
 
 
@@ -28,7 +29,7 @@ def held_back(*numbers: signal.Signals) -> Iterator[None]:
 def forget_terminal(number: int) -> None:
     """After a hang-up what would be printed on the terminal goes nowhere: it would be an error in the midst
     of what saves the work. Does nothing for other signals, or where output goes to a file."""
-    if number != signal.SIGHUP:
+    if number != getattr(signal, "SIGHUP", None):
         return
     for stream in (1, 2):
         with contextlib.suppress(OSError):

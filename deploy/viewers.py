@@ -189,7 +189,7 @@ class MujocoWindow:
                 model, data, key_callback=self._key, show_left_ui=False, show_right_ui=False
             )
         except RuntimeError as error:  # on macOS it wants mjpython
-            raise UserError(f"--viewer mujoco: {error}: choose web.") from error
+            raise UserError(f"--viewer mujoco: {error}: choose web or film.") from error
         self._model = model
         with self._handle.lock():
             self._handle.cam.lookat[:] = _LOOK_AT_M

@@ -11,7 +11,8 @@ COPY . .
 RUN ${VERSION:+env SETUPTOOLS_SCM_PRETEND_VERSION_FOR_DDGRASP="$VERSION"} \
     pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
 
-FROM python:3.12-slim-bookworm
+# franky has builds for x86-64 alone
+FROM --platform=linux/amd64 python:3.12-slim-bookworm
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 # hadolint ignore=DL3008
 RUN apt-get update && apt-get install --yes --no-install-recommends libusb-1.0-0 && rm -rf /var/lib/apt/lists/*

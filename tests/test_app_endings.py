@@ -144,7 +144,7 @@ def test_devices_that_are_not_here_are_named_by_their_variable(platforms):
 
 @pytest.mark.parametrize(
     ("value", "why"),
-    [("foo", "which MuJoCo does not know"), ("osmesa", "whose library is not here")],
+    [("foo", "which MuJoCo does not know here"), ("osmesa", "whose library is not here")],
 )
 def test_what_mujoco_cannot_draw_by_is_named_by_its_variable(value, why):
     if value == "osmesa" and ctypes.util.find_library("OSMesa"):

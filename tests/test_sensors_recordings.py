@@ -65,7 +65,11 @@ def test_contents_change_with_what_is_there_and_not_with_where_it_is(tmp_path):
     assert first.startswith("2 recordings of 8 pictures, ")
     shutil.copytree(tmp_path / "all", tmp_path / "elsewhere")
     shutil.copytree(tmp_path / "all/a", tmp_path / "elsewhere/.unfinished")
+    for name in ("depth/.DS_Store", "depth/._000000.png"):  # macOS lays them there
+        (tmp_path / "elsewhere/b" / name).write_bytes(b"\0")
     assert contents(tmp_path / "elsewhere") == first
+    seen = Recording.open(tmp_path / "elsewhere/b")
+    assert len(seen) == depth_picture_count([seen.path]) == 4 and not seen.skipped
     assert contents(tmp_path / "all/a") == contents(tmp_path / "elsewhere/a")
     _write(tmp_path / "elsewhere" / "c", frames=1)
     assert contents(tmp_path / "elsewhere").startswith("3 recordings of 9 pictures, ")

@@ -1,11 +1,13 @@
 """What of a machine a process may use, by files as Linux has them."""
 
 import os
+import subprocess
 
 import psutil
 import pytest
 
-from ddgrasp import machine
+from ddgrasp import install, machine
+from ddgrasp.errors import UserError
 from learning import memory
 
 GB = 1_000_000_000
@@ -84,3 +86,22 @@ def test_without_files_of_linux_a_machine_is_described_all_the_same(tmp_path, mo
     described = machine.describe()
     assert described["cores"] >= 1 and isinstance(described["processor"], str)
     assert described["accelerators"] == []
+
+
+def test_a_mac_is_named_by_its_processor(tmp_path, monkeypatch):
+    monkeypatch.setattr(machine, "_CPUINFO", tmp_path / "absent")
+    monkeypatch.setattr(machine.sys, "platform", "darwin")
+    said = subprocess.CompletedProcess([], 0, "Apple M4\n", "")
+    monkeypatch.setattr(machine.subprocess, "run", lambda *_, **__: said)
+    assert machine._processor() == "Apple M4"
+
+
+def test_what_cannot_be_installed_here_is_not_advised(monkeypatch):
+    monkeypatch.setattr(install, "find_spec", lambda _: None)
+    for system, cpu, remedy in (
+        ("linux", "x86_64", "fr3"), ("linux", "aarch64", "x86-64 Linux"), ("darwin", "arm64", "x86-64 Linux"),
+    ):  # fmt: skip
+        monkeypatch.setattr(install.sys, "platform", system)
+        monkeypatch.setattr(install.platform, "machine", lambda cpu=cpu: cpu)
+        with pytest.raises(UserError, match=f"the rig needs .*{remedy}"):
+            install.check_fr3("the rig")

@@ -72,8 +72,7 @@ def folder_source(folder: Path, depth_unit_m: float, meta: dict[str, Any]) -> So
     Raises:
         UserError: no depth pictures, two files of one name, or a meta.json that is none.
     """
-    pictures = (p for p in (folder / "depth").iterdir() if p.suffix.lower() in DEPTH_SUFFIXES)
-    files = _named_once(sorted(pictures, key=in_time))
+    files = _named_once(sorted(_pictures(folder / "depth", DEPTH_SUFFIXES), key=in_time))
     if not files:
         raise UserError(f"{folder / 'depth'}: no depth pictures; expected {', '.join(DEPTH_SUFFIXES)}.")
     own = _own_meta(folder / META_FILE) or _own_meta(folder / BEGUN_FILE)
@@ -154,12 +153,16 @@ def is_pair(folder: Path) -> bool:
     return (folder / "depth").is_dir() and any((folder / name).is_dir() for name in COLOR_FOLDERS)
 
 
+def _pictures(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
+    """Those of these kinds, but what macOS lays beside each on a drive of another system (`._000000.png`)."""
+    names = (p for p in folder.iterdir() if not p.name.startswith("."))
+    return (p for p in names if p.suffix.lower() in suffixes)
+
+
 def _colors(folder: Path) -> list[Path]:
     """The pictures of the first colour folder that has any."""
     inside = (
-        sorted(p for p in (folder / name).iterdir() if p.suffix.lower() in COLOR_SUFFIXES)
-        for name in COLOR_FOLDERS
-        if (folder / name).is_dir()
+        sorted(_pictures(folder / name, COLOR_SUFFIXES)) for name in COLOR_FOLDERS if (folder / name).is_dir()
     )
     return next((found for found in inside if found), [])
 

@@ -23,7 +23,8 @@ _MOST_PIXELS = 64_000_000
 def find_depth(path: Path) -> list[Path]:
     """The depth pictures of the recording in `path`, in time order; UserError for none, or other files."""
     folder = path / "depth"
-    files = sorted((p for p in folder.iterdir() if p.is_file()), key=in_time) if folder.is_dir() else []
+    inside = folder.iterdir() if folder.is_dir() else ()
+    files = sorted((p for p in inside if p.is_file() and not p.name.startswith(".")), key=in_time)
     for file in files:
         if file.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".exr", ".pfm"):
             raise UserError(

@@ -8,6 +8,7 @@ camera is in `realsense_live.py`. Run on files of synthetic frames that pyrealse
 import contextlib
 import importlib
 import math
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,10 @@ def load_pyrealsense2() -> Any:
     try:
         return importlib.import_module("pyrealsense2")
     except ModuleNotFoundError as error:
-        raise UserError(f"RealSense needs pyrealsense2 ({error}): {pip_install('realsense')}.") from error
+        remedy = pip_install("realsense")
+        if sys.platform == "darwin":
+            remedy = "it has no build for macOS; `ddgrasp record import` takes folders of pictures"
+        raise UserError(f"RealSense needs pyrealsense2 ({error}): {remedy}.") from error
     except ImportError as error:
         raise UserError(
             f"pyrealsense2 cannot be loaded ({error}): install the library it names, for libusb on Debian or "

@@ -230,7 +230,7 @@ def contents(root: str | os.PathLike) -> str:
     root = Path(root)
     folders, digest, pictures = recording_folders(root), hashlib.sha256(), 0
     for folder in folders:
-        count = sum(1 for _ in (folder / "depth").iterdir())
+        count = sum(not file.name.startswith(".") for file in (folder / "depth").iterdir())  # Finder's
         name, meta = os.fsencode(folder.relative_to(root)), folder / META_FILE
         digest.update(name + f"\0{count}\0".encode() + (meta.read_bytes() if meta.is_file() else b""))
         pictures += count
@@ -255,7 +255,7 @@ def unfinished(root: Path) -> list[Path]:
 
 def depth_picture_count(folders: Iterable[Path]) -> int:
     """Depth pictures in recordings, by their names: none is opened."""
-    files = (file for folder in folders for file in (folder / "depth").glob("*"))
+    files = (file for folder in folders for file in (folder / "depth").glob("[!.]*"))
     return sum(file.suffix.lower() == ".png" for file in files)
 
 
