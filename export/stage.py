@@ -28,10 +28,11 @@ def run(job: Job) -> Artifact:
         UserError: no finished student, or ONNX and JAX disagree by more than config.export.max_abs_diff
             (the file is then not written).
     """
-    from student_jax.policy import load
+    from learning.params import load_params
+    from student_jax.policy import PARAMS_FILE
 
     config, student = job.config, job.parents["student"]
-    _, params = load(student.directory)
+    params = load_params(student.directory / PARAMS_FILE)
     model = export_policy(config, params, student.hash)
     job.progress.note(f"{POLICY_FILE}: {len(model) / 1e6:.1f} MB")
     frames = demo_frames(student.directory.parent / "demos", config)
