@@ -12,13 +12,14 @@ from ddgrasp.errors import UserError
 PROJECT = "ddgrasp"
 FR3 = ("franky_sim", "franky", "trimesh")
 """Modules of the extra [fr3] that the FR3 rig takes: its arm, the arm's driver, its objects."""
+_OF_X86 = FR3[:2]
 
 
 def check_fr3(what: str, needed: Sequence[str] = FR3) -> None:
     """UserError unless all that `what`, the FR3 rig or a part of it, takes is installed."""
     missing = lacks_fr3(needed)
-    if missing and (sys.platform, platform.machine()) != ("linux", "x86_64"):
-        raise UserError(f"{what} needs x86-64 Linux: take the development rig (--rig development).")
+    if set(missing) & set(_OF_X86) and (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        raise UserError(f"{what} needs {' and '.join(missing)}, which have builds for x86-64 Linux alone.")
     if missing:
         raise UserError(f"{what} needs {' and '.join(missing)}: {pip_install('fr3')}.")
 

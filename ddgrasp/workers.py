@@ -39,10 +39,7 @@ class Worker(Protocol[_Item, _Result]):
 
 def worth(pieces: int, items: int) -> int:
     """Processes for work that has so many pieces of which each is worth a process, in so many `items`: at
-    most one a core, and 0 where there would be one alone, for which `spread` needs no other process, or in a
-    worker of multiprocessing's, which may have none."""
-    if multiprocessing.current_process().daemon:
-        return 0
+    most one a core, and 0 where there would be one alone, for which `spread` needs no other process."""
     count = min(machine.cores(), pieces, items)
     return count if count > 1 else 0
 
@@ -55,19 +52,20 @@ def spread(
 ) -> Generator[Result, None, None]:
     """Results of `items` as they come, from `workers` fresh processes (0: all in this one, in their order).
 
-    After Ctrl-C or a UserError those that run come to their end, and their results still come, before it
-    goes on.
+    In a daemonic process, as a worker of multiprocessing's pool, all are made in this one: it may have none.
+    The script that runs is not run again in the others, unless what is sent there is of it. After Ctrl-C or a
+    UserError those that run come to their end, and their results still come, before it goes on.
 
     Args:
-        make: called once in every process, for what does the work there; is sent there, as items are. Where
-            what it makes is of the script that runs, that needs its `if __name__ == "__main__"`.
+        make: called once in every process, for what does the work there; is sent there, as items are. If it,
+            or an item, is of the script that runs, that needs its `if __name__ == "__main__"`.
         remedy: what needs less memory, for whoever reads that a process was killed.
 
     Raises UserError if a process was killed, and whatever `make` and the worker raise.
     """
     if not items:
         return
-    if workers == 0:
+    if workers == 0 or multiprocessing.current_process().daemon:
         yield from _here(make, items)
         return
     executor = ProcessPoolExecutor(
@@ -77,7 +75,7 @@ def spread(
         initargs=(make, os.getpid()),
     )
     waiting: set[Future] = set()
-    of_script = b"__main__" in pickle.dumps(make)
+    of_script = b"__main__" in pickle.dumps((make, items[0]))
     hidden = contextlib.nullcontext() if of_script else _script_hidden()
     try:
         with held_back(signal.SIGINT, signal.SIGHUP), hidden:  # workers leave them to this process
@@ -89,8 +87,9 @@ def spread(
     except BrokenProcessPool:
         if of_script:
             raise Trouble(
-                "workers did not start, or were killed: what they need is of the script or notebook that "
-                'runs, so put it into a module, or the script\'s work under `if __name__ == "__main__":`.'
+                "workers did not start, or were killed. What is sent to them is of the script or notebook "
+                'that runs: put it into a module, or the script\'s work under `if __name__ == "__main__":`. '
+                f"If it is there, memory was short: {remedy}."
             ) from None
         raise Trouble(
             "a worker was killed, often for want of memory: what is finished is kept, and the same command "
@@ -105,18 +104,22 @@ def spread(
         executor.shutdown(wait=True, cancel_futures=True)
 
 
+_hiding = threading.Lock()
+
+
 @contextlib.contextmanager
 def _script_hidden() -> Iterator[None]:
     """Processes that the block starts do not run the script that this one was started with, as
     multiprocessing has them do: nothing of it is used there, and one that has no `if __name__ == "__main__"`
     would begin its own work in each of them."""
     script = sys.modules["__main__"]
-    kept = {name: vars(script).pop(name) for name in ("__file__", "__spec__") if name in vars(script)}
-    script.__spec__ = None
-    try:
-        yield
-    finally:
-        vars(script).update(kept)
+    with _hiding:
+        kept = {name: vars(script).pop(name) for name in ("__file__", "__spec__") if name in vars(script)}
+        script.__spec__ = None
+        try:
+            yield
+        finally:
+            vars(script).update(kept)
 
 
 def _here(make: Callable[[], Worker[Item, Result]], items: Sequence[Item]) -> Generator[Result, None, None]:

@@ -70,6 +70,6 @@ class RowReader:
                 os.close(file)
         except OSError as error:
             raise UserError(
-                f"{path} cannot be read ({error.strerror or error}): delete the stage's directory and make "
-                "it again."
+                f"{path} cannot be read ({error.strerror or error}): delete the store, or the stage that "
+                "it is of, and make it again."
             ) from None

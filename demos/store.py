@@ -91,7 +91,7 @@ class EpisodeStore:
         Raises UserError for a field that the store lacks, or if it is damaged.
         """
         count = _count(self.ends)
-        if first < 0 or (last is not None and last < first):
+        if not 0 <= first <= count or (last is not None and last < first):
             end = "the end" if last is None else last
             raise UserError(f"{self.path}: no rows {first} to {end}; expected 0 to {count}.")
         return self._read("data", field, first, count if last is None else min(last, count))

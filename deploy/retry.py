@@ -1,6 +1,6 @@
 """What a hand that stands still or closes on nothing does: it closes, lifts what it has, or looks again.
 
-A policy sees three frames, 0.3 s. Nothing tells it that it has stood for a second around something taller
+A policy sees three frames, 0.2 s. Nothing tells it that it has stood for a second around something taller
 than it believes, waiting to get lower, or that it closes beside the object again and again, where its own
 hand hides what it looks for. Nor does it know that it has done what it was trained for, in episodes of 6 s:
 it goes on, its elbow drifts, and after a minute it is where no training was. Time, the fingers' opening

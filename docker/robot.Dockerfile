@@ -12,6 +12,7 @@ RUN ${VERSION:+env SETUPTOOLS_SCM_PRETEND_VERSION_FOR_DDGRASP="$VERSION"} \
     pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
 
 # franky has builds for x86-64 alone
+# hadolint ignore=DL3029
 FROM --platform=linux/amd64 python:3.12-slim-bookworm
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 # hadolint ignore=DL3008

@@ -189,8 +189,13 @@ def make_frames(
     """
     lengths = [len(s) for s in states]
     for given in (*([depth_mm] if len(depth_mm) else []), actions, observations, held):
-        if [len(episode) for episode in given] != lengths:
-            raise UserError(f"episodes have {lengths} states and {[len(e) for e in given]} other rows")
+        if len(given) != len(lengths):
+            raise UserError(
+                f"{len(lengths)} episodes have states, {len(given)} other rows; expected as many."
+            )
+        for number, (length, episode) in enumerate(zip(lengths, given, strict=True)):
+            if len(episode) != length:
+                raise UserError(f"Episode {number} has {length} states and {len(episode)} other rows.")
     if other := {str(depth.dtype) for depth in depth_mm} - {"uint16"}:
         raise UserError(f"Depth is {min(other)}; expected millimetres (uint16).")
     return Frames(

@@ -69,7 +69,7 @@ def add_noisy_demos(
             if keep_clean[i]:
                 depth = demos.steps("depth_mm", *rows_of(i))
             else:
-                depth = checked(next(noisy), (len(pictured[i]), *size_px))
+                depth = checked(next(noisy, None), (len(pictured[i]), *size_px))
             depth = depth if window is None else window.cut(depth)
             unseen = np.zeros((len(number) - len(depth), *depth.shape[1:]), depth.dtype)
             steps["depth_mm"] = np.concatenate([depth, unseen])
@@ -77,9 +77,13 @@ def add_noisy_demos(
             task.advance()
 
 
-def checked(noisy_mm: UInt16[np.ndarray, "T H W"], shape: tuple[int, ...]) -> UInt16[np.ndarray, "T H W"]:
-    """What a depth source gave for frames of that shape. Raises UserError unless it is as many, as large, and
-    in uint16 millimetres: a source may be somebody's own."""
+def checked(
+    noisy_mm: UInt16[np.ndarray, "T H W"] | None, shape: tuple[int, ...]
+) -> UInt16[np.ndarray, "T H W"]:
+    """What a depth source gave for frames of that shape, None where it gave nothing. Raises UserError unless
+    it is as many, as large, and in uint16 millimetres: a source may be somebody's own."""
+    if noisy_mm is None:
+        raise UserError("The depth source gave fewer episodes than it was asked for.")
     if noisy_mm.dtype != np.uint16 or noisy_mm.shape != shape:
         raise UserError(
             f"The depth source gave {noisy_mm.dtype} {noisy_mm.shape} for uint16 {shape}: expected as many "

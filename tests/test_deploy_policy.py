@@ -325,7 +325,7 @@ def test_the_page_s_limits_are_within_both_arms():
     (line,) = (
         line
         for line in (TUTORIALS / "../onnx.md").read_text().splitlines()
-        if "An FR3's are narrower" in line
+        if "within both arms' are" in line
     )
     low, high = (
         np.array([getattr(arm, name) for arm in (PANDA, FR3)])

@@ -105,3 +105,5 @@ def test_what_cannot_be_installed_here_is_not_advised(monkeypatch):
         monkeypatch.setattr(install.platform, "machine", lambda cpu=cpu: cpu)
         with pytest.raises(UserError, match=f"the rig needs .*{remedy}"):
             install.check_fr3("the rig")
+        with pytest.raises(UserError, match="a row needs trimesh: .*fr3"):
+            install.check_fr3("a row", install.FR3[2:])

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ddgrasp.workers import worth
+from ddgrasp.workers import spread
+from workers_support import Doubler
 
 UNGUARDED = """
 import sys
@@ -21,6 +22,16 @@ print("done")
 """
 
 
+ITEMS = """
+from ddgrasp.workers import spread
+from workers_support import Doubler
+
+class Number(int):
+    pass
+
+if __name__ == "__main__":
+    print(sorted(map(int, spread(Doubler, [Number(1), Number(2)], 2))))
+"""
 OWN = """
 from ddgrasp.workers import spread
 
@@ -60,6 +71,15 @@ def test_a_worker_of_the_script_s_own_needs_the_guard(tmp_path: Path, guard: str
     assert said in (told.stdout if "main" in guard else told.stderr.splitlines()[-1])
 
 
-def test_a_worker_of_multiprocessing_begins_no_others():
+def test_items_of_the_script_s_own_arrive(tmp_path: Path):
+    told = run(tmp_path / "items.py", ITEMS)
+    assert told.stdout == "[2, 4]\n", told.stderr
+
+
+def doubled(numbers: list[int]) -> list[int]:
+    return list(spread(Doubler, numbers, 2))
+
+
+def test_in_a_worker_of_multiprocessing_all_is_done_there():
     with get_context("spawn").Pool(1) as pool:
-        assert pool.apply(worth, (10, 10)) == 0
+        assert pool.apply(doubled, ([1, 2],)) == [2, 4]

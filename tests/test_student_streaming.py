@@ -95,7 +95,7 @@ def test_a_chunk_that_is_damaged_is_one_line_with_the_file(tmp_path, damage):
         chunk.write_bytes(whole[:100])
     frames = frames_io.load(tmp_path / "frames.zarr")
     frames.depth_stack(np.array([2]))
-    with pytest.raises(UserError, match=r"depth_mm/c/1/0/0 cannot be read .*: delete the stage's directory"):
+    with pytest.raises(UserError, match=r"depth_mm/c/1/0/0 cannot be read .*: delete the store"):
         frames.depth_stack(np.array([18]))
 
 
@@ -248,7 +248,7 @@ def test_frames_in_metres_and_rows_that_do_not_fit_are_refused():
     others = [[rows] for rows in others]
     with pytest.raises(UserError, match=r"Depth is float32; expected millimetres \(uint16\)"):
         make_frames([depth / np.float32(1000)], [state], [action], *others)
-    with pytest.raises(UserError, match=r"\[4\] states and \[3\] other rows"):
+    with pytest.raises(UserError, match="Episode 0 has 4 states and 3 other rows"):
         make_frames([depth], [state], [action[:3]], *others)
 
 

@@ -196,7 +196,7 @@ def trial_run(report: Mapping[str, Any]) -> str:
 
 def print_summary(report: Mapping[str, Any]) -> None:
     """Prints verdict and table of `summary_rows` to standard output, a trial run's with a warning above."""
-    console = tables.console(width=140)
+    console = tables.console(width=160)
     if warning := trial_run(report):
         console.print(warning, style="bold", highlight=False)
     judged = targets(report)

@@ -72,10 +72,10 @@ class Guarded(FrankaServer):
         elif self._silent_since_s is None:
             self._silent_since_s = time.monotonic()
         elif time.monotonic() - self._silent_since_s > GREETED_S:
-            self._silent_since_s = None
             raise ValueError(f"nothing said in {GREETED_S:g} s")
 
     def _drop(self, error: Exception) -> None:
+        self._silent_since_s = None
         logger.warning("dropped a client that is none of a Franka's: %r", error)
         self.reset_state()
 
