@@ -20,7 +20,7 @@ from ddg_jax.train import config_schedule, init_params, predict_noise
 from ddg_jax.window import mixed
 from ddgrasp import artifacts
 from ddgrasp.arrays import AnyArray
-from ddgrasp.config import DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
+from ddgrasp.config import DDIM, DDPM, DPM_SOLVER, PROGRESSIVE, DDGConfig
 from ddgrasp.depth import resize_nearest
 from ddgrasp.errors import UserError
 from ddgrasp.generator_metadata import ASPECT_TOLERANCE, FARTHEST_SANE_M
@@ -163,10 +163,12 @@ def sample(
             x = diffusion.ddpm_step(made, x, k, previous, eps, fresh(), X_LIMIT)
         elif config.sampling.sampler == PROGRESSIVE:
             x = diffusion.ddim_step(diffusion.ddim_coefficients(made, k, previous, x), x, eps, None)
-        else:
+        elif config.sampling.sampler == DDIM:
             extra = fresh() if config.sampling.eta else 0.0
             step = diffusion.ddim_coefficients(made, k, previous, x, config.sampling.eta)
             x = diffusion.ddim_step(step, x, eps, X_LIMIT, noise=extra)
+        else:
+            raise ValueError(f"sampler {config.sampling.sampler!r} has no step")
         return (x, x_0), None
 
     start = noise(start_key)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, assert_never
 
 import numpy as np
 from jaxtyping import Float
@@ -60,7 +60,10 @@ class Change:
 
                 stiffness = config.deploy.franka.stiffness_nm_rad * WEIGHTS
                 return other_worlds.SpringWorld(objects, random, stiffness, DAMPING_S)
-        return make_world(config.world)
+            case "as it is" | "other tables":
+                return make_world(config.world)
+            case _:
+                assert_never(self.world)
 
     def make_camera(self, config: Config, world: "RigWorld") -> "RigCamera":
         """The camera before `world`."""
@@ -82,6 +85,8 @@ class Change:
             return PartlyWrongCamera(*before, seen)
         if seen in GENERATED:
             return GeneratedCamera(*before, seen, self.generator or SHIPPED)
+        if seen not in ("stereo", "ideal"):
+            raise ValueError(f"no camera sees {seen!r}")
         if self.world == "meshes":
             from rig.mesh_world import MeshCamera
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, assert_never, get_args
 
 import numpy as np
 from jaxtyping import UInt8
@@ -49,10 +49,13 @@ def make_treatment(name: TreatmentName, config: Config) -> Treatment | None:
     another name."""
     if name not in get_args(TreatmentName):
         raise unknown_name("treatment of depth", name, get_args(TreatmentName))
-    if name == RECORDED:
-        return None
-    if name == "inpaint":
-        return Inpaint()
-    monocular = Monocular(config.ddg)
-    _ = monocular.network
-    return Monocular(config.ddg)  # a fresh one: it goes to other processes, where networks cannot follow
+    match name:
+        case "recorded":
+            return None
+        case "inpaint":
+            return Inpaint()
+        case "monocular":
+            _ = Monocular(config.ddg).network
+            return Monocular(config.ddg)  # a fresh one: it goes to processes where networks cannot follow
+        case _:
+            assert_never(name)

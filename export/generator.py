@@ -85,7 +85,8 @@ def export_generator(
     if not (measured.share <= MOST_SHARE and measured.inverse_depth_per_m <= MOST_DIFFERENCE_PER_M):
         raise UserError(
             f"The ONNX generator differs from JAX: {measured.share:.2%} of the pixels grafted otherwise, "
-            f"inverse depth by {measured.inverse_depth_per_m:.1e} 1/m; nothing was written: fit for longer."
+            f"inverse depth by {measured.inverse_depth_per_m:.1e} 1/m; nothing was written: fit for longer "
+            "(or, if the sampler is new, mend export/sampler_tables.py)."
         )
     atomic_write_bytes(out, model)
     return measured

@@ -80,6 +80,8 @@ def _rows(config: DDGConfig, k: np.ndarray, previous: np.ndarray, before: np.nda
         )
         variance = np.asarray(diffusion.posterior_variance(made, k, previous, one))
         return Row(k, own, x, none, clipped, none, np.where(previous < 0, 0, np.sqrt(variance)))
+    if sampler not in (DDIM, PROGRESSIVE):
+        raise ValueError(f"sampler {sampler!r} has no row")
     c = diffusion.ddim_coefficients(made, k, previous, one, config.sampling.eta if sampler == DDIM else 0.0)
     next_eps, next_x_0, sigma = (np.broadcast_to(v, k.shape) for v in (c.next_eps, c.next_x_0, c.sigma))
     x = next_eps * np.asarray(diffusion.eps_from_x_0(made, one, k, none))

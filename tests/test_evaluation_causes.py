@@ -2,16 +2,19 @@
 
 import hashlib
 import json
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 
+from app.commands import parse
 from ddgrasp.errors import UserError
 from ddgrasp.layout import QPOS
 from ddgrasp.presets import get_preset
-from deploy.changes import Change, SightName
+from deploy.changes import Change, SightName, WorldName
 from deploy.fr3_trials import Fr3Bench, Fr3Runner
 from deploy.generated_camera import GENERATED
 from deploy.trial_log import read_log
@@ -45,6 +48,23 @@ def test_every_row_is_one_change_of_what_it_is_compared_with():
             assert sum(getattr(row.bench, f) != getattr(reference, f) for f in fields) == 1, name
     fr3 = causes.ROWS["fr3"]
     assert fr3.bench == Fr3Bench("primitive", "ideal", bare=True, paired=True) and fr3.against == "ideal"
+
+
+def test_help_and_page_name_every_row(capsys):
+    with pytest.raises(SystemExit):
+        parse("study causes", ["--help"])
+    told = re.split(r"[ ,.│\n]+", capsys.readouterr().out)
+    assert [name for name in causes.ROWS if name not in told] == []
+    page = (ROOT / "docs" / "test_rig.md").read_text()
+    assert [name for name in causes.ROWS if f"`{name}`" not in page] == [causes.REFERENCE]
+
+
+def test_no_name_of_a_world_or_a_sight_stands_for_another_s():
+    config = replace(CONFIG, world=replace(CONFIG.world, objects=("cube",)))
+    worlds = {name: type(Change(world=name).make_world(config)) for name in get_args(WorldName)}
+    assert len({*worlds.values()}) == len(worlds) - 1, worlds  # other tables are the camera's
+    with pytest.raises(ValueError, match="no camera sees 'foggy'"):
+        Change(sight="foggy")._camera(config, make_world(config.world))  # type: ignore[arg-type]
 
 
 def test_rows_bring_what_they_are_compared_with():

@@ -1,6 +1,7 @@
 """The generator's ONNX file computes what JAX computes, whatever its prior, sampler and representation."""
 
 from dataclasses import replace
+from typing import get_args
 
 import cv2
 import jax
@@ -19,6 +20,7 @@ from ddgrasp.config import (
     DDGTrainingConfig,
     GraftConfig,
     PriorConfig,
+    Sampler,
     SamplingConfig,
     UNetConfig,
 )
@@ -81,6 +83,10 @@ def finished(generator: Generator, directory) -> None:
     if generator.config.sampling.sampler == "progressive":
         (directory / "params.msgpack").rename(directory / "distilled_2.msgpack")
     finish(directory, "ddg", Config(preset="debug", ddg=generator.config), seconds=1, metrics={})
+
+
+def test_every_sampler_is_compared():
+    assert {config.sampling.sampler for config in OPTIONS.values()} == {*get_args(Sampler)}
 
 
 @pytest.mark.parametrize("name", OPTIONS)

@@ -74,6 +74,10 @@ def test_what_a_version_lacked_is_taken_away_and_comes_back(version):
     assert (upgrades.without(newer, version) is None) == (version < 14)
 
 
+def test_a_field_more_is_a_version_more():
+    assert upgrades.VERSION == max(upgrades._ADDED_AFTER) + 1, "raise VERSION with its table"
+
+
 def test_fields_named_by_hand_arrive_where_they_belong():
     flat = {
         "preset": "mine",

@@ -201,9 +201,11 @@ _TASKS = {
 
 def describe_commands(group: str = "") -> str:
     """The list that `ddgrasp --help` (or `ddgrasp teacher`) prints."""
+    listed = {word for words in _TASKS.values() for word in words}
+    others = tuple(sorted({name.split()[0] for name in COMMANDS} - listed))
     lines = [
         line
-        for task, words in _TASKS.items()
+        for task, words in (_TASKS | {"others": others}).items()
         if (
             names := [
                 name for name in COMMANDS if name.split()[0] in words and group in ("", name.split()[0])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal, assert_never, cast
 
 import tyro
 
@@ -220,9 +220,15 @@ class _ChosenNoise:
 
     def replace(self, depth: "Depth", clean_mm: "CleanDepth") -> "Depth":
         """See `Replacement`."""
-        if self.controls.noise == "camera":
-            return depth
-        return clean_mm() if self.controls.noise == "none" else self.generator(clean_mm())
+        match self.controls.noise:
+            case "camera":
+                return depth
+            case "none":
+                return clean_mm()
+            case "generator":
+                return self.generator(clean_mm())
+            case other:
+                assert_never(other)
 
 
 def _watched(bench: "Bench", trial: "Trial", viewer: "Viewer", noise: "_ChosenNoise") -> bool:
