@@ -1,9 +1,14 @@
 """Words of a command line that no command can use: refused in one line before anything is done."""
 
+import ast
 import contextlib
+import dataclasses
+import inspect
 import io
+import itertools
 import subprocess
 import sys
+import textwrap
 import typing
 from pathlib import Path
 from typing import Annotated, Literal, Optional
@@ -25,6 +30,31 @@ def refused(args: list[str], capsys) -> str:
     told = capsys.readouterr()
     assert told.err.startswith("ddgrasp: ") and told.err.count("\n") == 1 and told.out == ""
     return told.err.removeprefix("ddgrasp: ")
+
+
+# --- help ----------------------------------------------------------------------------------------
+
+DECLARED = sorted(
+    {base for command in COMMANDS.values() for base in command.__mro__ if dataclasses.is_dataclass(base)},
+    key=lambda base: base.__qualname__,
+)
+"""The dataclasses whose fields are the options of commands."""
+
+
+@pytest.mark.parametrize("declared", DECLARED, ids=lambda base: base.__qualname__)
+def test_every_option_of_a_command_s_own_is_described(declared):
+    (body,) = ast.parse(textwrap.dedent(inspect.getsource(declared))).body
+    silent = [
+        field.target.id
+        for field, behind in itertools.zip_longest(body.body, body.body[1:])
+        if isinstance(field, ast.AnnAssign) and not isinstance(behind, ast.Expr)
+    ]
+    groups = {name for name, kind in kinds(declared).items() if dataclasses.is_dataclass(_bare(kind))}
+    assert set(silent) - groups - {"stage"} == set()  # a stage's name is no option
+
+
+def _bare(kind: typing.Any) -> typing.Any:
+    return typing.get_args(kind)[0] if typing.get_origin(kind) is Annotated else kind
 
 
 # --- bounds --------------------------------------------------------------------------------------
