@@ -291,14 +291,14 @@ def test_an_arm_without_its_hand_is_told_from_no_arm(monkeypatch, answers):
 
 
 def ask_once(monkeypatch, port_name: str, said: bytes, ask):
-    """What `ask` makes of a server at 127.0.0.73 that says `said` to a connection and hangs up."""
+    """What `ask` makes of a server at 127.0.0.1 that says `said` to a connection and hangs up."""
 
     def answer(server: socket.socket) -> None:
         with server.accept()[0] as client:
             client.recv(64)
             client.sendall(said)
 
-    with socket.create_server(("127.0.0.73", 0)) as server:
+    with socket.create_server(("127.0.0.1", 0)) as server:
         monkeypatch.setattr(franka_probe, port_name, server.getsockname()[1])
         threading.Thread(target=answer, args=(server,), daemon=True).start()
         return ask()
@@ -319,28 +319,28 @@ def ask_once(monkeypatch, port_name: str, said: bytes, ask):
 )
 def test_what_does_not_answer_as_a_franka_does_is_none(monkeypatch, said):
     """franky would wait for its answer for ever, and hear no Ctrl-C meanwhile."""
-    expected = r"^what answers at 127\.0\.0\.73:\d+ is no Franka .*check --host"
+    expected = r"^what answers at 127\.0\.0\.1:\d+ is no Franka .*check --host"
     with pytest.raises(UserError, match=expected) as refused:
-        ask_once(monkeypatch, "ROBOT_PORT", said, lambda: franka_probe.check_arm("127.0.0.73", "fr3"))
+        ask_once(monkeypatch, "ROBOT_PORT", said, lambda: franka_probe.check_arm("127.0.0.1", "fr3"))
     assert "\n" not in str(refused.value)
 
 
 def test_a_hand_s_port_that_something_else_has_is_no_hand(monkeypatch):
     said = b"HTTP/1.1 400 Bad Request\r\n\r\n"
-    with pytest.raises(UserError, match=r"^what answers at 127\.0\.0\.73:\d+ is no Franka "):
-        ask_once(monkeypatch, "GRIPPER_PORT", said, lambda: franka_probe.check_hand("127.0.0.73"))
+    with pytest.raises(UserError, match=r"^what answers at 127\.0\.0\.1:\d+ is no Franka "):
+        ask_once(monkeypatch, "GRIPPER_PORT", said, lambda: franka_probe.check_hand("127.0.0.1"))
 
 
 @pytest.mark.parametrize(("status", "size"), [(0, 16), (0, 20), (1, 20)])
 def test_an_fr3_s_answer_passes(monkeypatch, status, size):
     """Padded or not; that the versions do not fit franky finds out, and says so."""
     said = struct.pack("<IIIHH", 0, 0, size, status, 9) + bytes(size - 16)
-    ask_once(monkeypatch, "ROBOT_PORT", said, lambda: franka_probe.check_arm("127.0.0.73", "fr3"))
+    ask_once(monkeypatch, "ROBOT_PORT", said, lambda: franka_probe.check_arm("127.0.0.1", "fr3"))
 
 
 def test_a_control_unit_that_hangs_up_refuses(monkeypatch):
     with pytest.raises(UserError, match="refuses connections: activate FCI"):
-        ask_once(monkeypatch, "ROBOT_PORT", b"", lambda: franka_probe.check_arm("127.0.0.73", "fr3"))
+        ask_once(monkeypatch, "ROBOT_PORT", b"", lambda: franka_probe.check_arm("127.0.0.1", "fr3"))
 
 
 def test_a_mistyped_address_is_no_franka():
