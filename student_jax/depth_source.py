@@ -22,7 +22,7 @@ from ddg_jax.monocular import MonocularDepth
 from ddg_jax.sample import Generator, filled_up, generate
 from ddg_jax.sensor import make_sensor
 from ddgrasp.arrays import AnyArray
-from ddgrasp.config import BY_COLOUR, Config, DextrahConfig, SensorConfig
+from ddgrasp.config import BY_COLOUR, SENSORS, Config, DextrahConfig, SensorConfig
 from ddgrasp.depth import to_metres, to_millimetres
 from ddgrasp.errors import UserError
 from demos.store import EpisodeStore
@@ -244,6 +244,8 @@ def _named_source(config: Config, ddg: Path) -> DepthSource:
         return MonocularSource(MonocularDepth(config.ddg))
     if name == "rig":
         return RigSource(config)
+    if name not in SENSORS:
+        raise ValueError(f"depth source {name!r} has no line here")
     student = config.student
     formulas = DextrahConfig(normal_m=student.dextrah_normal_m).scaled(student.dextrah_scale)
     sensor = SensorConfig(name=name, stereo=config.record.stereo, dextrah=formulas)

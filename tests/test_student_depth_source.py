@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from app.commands.checks import check_config_values
+from config_support import unchecked
 from ddg_jax import generate, sample, train
 from ddg_jax.generate import Clip
 from ddg_jax.prior import make_prior
@@ -350,3 +351,9 @@ def test_missing_colour_is_refused_before_the_first_stage():
         check_config_values(wanting)
     assert "\n" not in str(error.value)
     check_config_values(replace(coloured, demos=replace(preset.demos, rgb=True)))
+
+
+def test_a_source_with_a_name_and_nothing_behind_it_is_no_camera_model(tmp_path):
+    named = unchecked(CONFIG.student, depth_source="flat")
+    with pytest.raises(ValueError, match="'flat' has no line here"):
+        make_source(replace(CONFIG, student=named), tmp_path)
