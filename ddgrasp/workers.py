@@ -75,7 +75,7 @@ def spread(
         initargs=(make, os.getpid()),
     )
     waiting: set[Future] = set()
-    of_script = b"__main__" in pickle.dumps((make, items[0]))
+    of_script = _is_of_script((make, items[0]))
     hidden = contextlib.nullcontext() if of_script else _script_hidden()
     try:
         with held_back(signal.SIGINT, signal.SIGHUP), hidden:  # workers leave them to this process
@@ -102,6 +102,12 @@ def spread(
         raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _is_of_script(sent: Any) -> bool:
+    """Whether a part of it is of the script that runs, by its name as it is sent; arrays, which may be
+    gigabytes, are not copied for that."""
+    return b"__main__" in pickle.dumps(sent, protocol=5, buffer_callback=lambda _: None)
 
 
 _hiding = threading.Lock()

@@ -31,6 +31,8 @@ class Guarded(FrankaServer):
     Reaches into franky-sim 1.0.4 in the four places named `_Franka...` and `_Message...` below.
     """
 
+    _silent_since_s: float | None = None
+
     def send_state(self) -> None:
         """See franky-sim; a client that cannot be told is dropped."""
         try:
@@ -39,8 +41,6 @@ class Guarded(FrankaServer):
             pass
         except OSError as error:
             self._drop(error)
-
-    _silent_since_s: float | None = None
 
     def _FrankaServer__process_tcp_commands(self) -> None:
         try:
